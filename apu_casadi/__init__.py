@@ -1,0 +1,1 @@
+"""Joint fault models of all-electric auxiliary power units."""

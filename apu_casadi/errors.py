@@ -1,0 +1,57 @@
+"""The errors of the package.
+
+Every message says what is wrong, where, by how much where that is a number, and what to do.
+All derive from :class:`ApuError`, so that a campaign can catch the family.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ApuError(Exception):
+    """Base of every error that the package raises on purpose."""
+
+
+class SignalError(ApuError, ValueError):
+    """A vector was packed with unknown or missing names, a wrong shape or a non-finite value."""
+
+
+class ParameterError(ApuError, ValueError):
+    """A parameter has an unknown name, or a value outside its physical range."""
+
+
+class MapError(ApuError, ValueError):
+    """A component map is malformed, or cannot be scaled to the design point asked for."""
+
+
+class OperatingPointError(ApuError, RuntimeError):
+    """No operating point satisfies the equations: beyond surge, off the map, no power balance."""
+
+
+class SimulationError(ApuError, RuntimeError):
+    """An integration or an implicit step failed, or its re-evaluated residual is too large."""
+
+
+class ScenarioError(ApuError, ValueError):
+    """A scenario description has an unknown key or an impossible value."""
+
+
+class DataError(ApuError, ValueError):
+    """A file is missing, damaged, or lacks a column."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Return ``"(did you mean X?)"`` for the valid name nearest to ``name``, or the list of all.
+
+    Case is ignored, because ``WF`` for ``Wf`` is the commonest slip.
+    """
+    names = list(valid)
+    by_lower: dict[str, str] = {}
+    for n in names:
+        by_lower.setdefault(n.lower(), n)
+    close = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.55)
+    if close:
+        return f"(did you mean {by_lower[close[0]]!r}?)"
+    return f"(valid: {', '.join(names)})"
