@@ -1,0 +1,107 @@
+"""The wound-rotor synchronous generator on the rotor's axes: flux, voltage, torque (5)-(7).
+
+Stator currents leave the machine (generator convention), rotor currents enter it (motor
+convention).  All stator currents here are *effective* ones, ibar = i - T(:,k) mu i_fault: written
+with them the faulty machine has the healthy machine's equations (see :mod:`.ttsc`), and without a
+fault ibar is the terminal current.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from apu_casadi.machine.park import Qd0, speed_voltage
+from apu_casadi.machine.parameters import MachineParameters
+
+
+class Windings(NamedTuple):
+    """One quantity (flux linkage Wb, current A, or its rate) of all windings, in (7)'s order."""
+
+    sq: Any
+    sd: Any
+    s0: Any
+    fd: Any
+    kd: Any
+    kq: Any
+
+    @property
+    def stator(self) -> Qd0:
+        """The stator's three entries."""
+        return Qd0(self.sq, self.sd, self.s0)
+
+
+def inductance(p: MachineParameters) -> np.ndarray:
+    """Return L of (7), H, shape (6, 6), rows and columns ordered q, d, 0, fd, kd, kq.
+
+    The last entry is L_mq + L_lkq; the paper prints L_md + L_lkq, with which the q axis would not
+    be the derivative of an energy.  L_s of the zero sequence is the leakage L_ls.
+    """
+    L = np.zeros((6, 6))
+    L[0, 0], L[0, 5] = -(p.L_mq + p.L_ls), p.L_mq
+    L[1, 1], L[1, 3], L[1, 4] = -(p.L_md + p.L_ls), p.L_md, p.L_md
+    L[2, 2] = -p.L_ls
+    L[3, 1], L[3, 3], L[3, 4] = -p.L_md, p.L_md + p.L_lfd, p.L_md
+    L[4, 1], L[4, 3], L[4, 4] = -p.L_md, p.L_md, p.L_md + p.L_lkd
+    L[5, 0], L[5, 5] = -p.L_mq, p.L_mq + p.L_lkq
+    return L
+
+
+def flux_linkages(p: MachineParameters, i: Windings) -> Windings:
+    """Return lambda = L ibar, (7), in Wb, from effective stator and rotor currents in A."""
+    L = inductance(p)
+    return Windings(*(_combine(row, i) for row in L))
+
+
+def currents(p: MachineParameters, lam: Windings) -> Windings:
+    """Return ibar = L^-1 lambda, (7) inverted, in A; linear, so it also maps rates to rates."""
+    L = inductance(p)
+    inverse = np.zeros((6, 6))
+    for axis in ([0, 5], [1, 3, 4], [2]):  # block by block: the axes stay exactly decoupled
+        inverse[np.ix_(axis, axis)] = np.linalg.inv(L[np.ix_(axis, axis)])
+    return Windings(*(_combine(row, lam) for row in inverse))
+
+
+def _combine(row: np.ndarray, x: Windings) -> Any:
+    return sum(float(a) * v for a, v in zip(row, x, strict=True) if a != 0.0)
+
+
+def flux_rates(
+    p: MachineParameters,
+    *,
+    lam: Windings,
+    i: Windings,
+    v: Qd0,
+    V_fd: Any,
+    w_r: Any,
+    w1: Qd0,
+    w2: tuple[Any, Any, Any],
+) -> Windings:
+    """Return d lambda/dt in V, from (5) and (6) solved for the rates.
+
+    Parameters
+    ----------
+    lam, i : flux linkages (Wb) and effective currents (A).
+    v : winding voltages, terminal to machine neutral, V.
+    V_fd : field voltage referred to the stator, V; the dampers are short-circuited.
+    w_r : electrical speed, rad/s.
+    w1, w2 : process noise of (5) and (6), V; w2 in the order fd, kd, kq.
+    """
+    e = speed_voltage(w_r, lam.stator)
+    return Windings(
+        sq=v.q - e.q + p.r_s * i.sq - w1.q,
+        sd=v.d - e.d + p.r_s * i.sd - w1.d,
+        s0=v.zero + p.r_s * i.s0 - w1.zero,
+        fd=V_fd - p.r_fd * i.fd - w2[0],
+        kd=-p.r_kd * i.kd - w2[1],
+        kq=-p.r_kq * i.kq - w2[2],
+    )
+
+
+def torque(p: MachineParameters, *, lam: Windings, i: Windings) -> Any:
+    """Return the electromagnetic torque on the shaft of one machine, N m, positive when braking.
+
+    T_e = 3/2 n_pp (lambda_d ibar_q - lambda_q ibar_d), with the effective currents.
+    """
+    return 1.5 * p.n_pp * (lam.sd * i.sq - lam.sq * i.sd)

@@ -1,0 +1,384 @@
+"""Component maps: smooth surfaces from tables, scaled to a design point.
+
+**Surface.**  The logarithms of W, PR - 1 and eta are interpolated by a tensor product of natural
+cubic splines (de Boor, A Practical Guide to Splines, 2001, ch. IV) in N and beta, which passes
+through every table point and is twice continuously differentiable.  Outside the table the natural
+spline goes on as the straight line that it ends with, so all three change at a constant relative
+rate there: W and eta stay above 0 and PR above 1 wherever a solver looks, and no derivative up to
+the second jumps at the table's edge.  The continuation is a defined answer, not a measured one: how
+far outside a point lies is the output ``off``.
+
+A natural spline with its straight continuation is itself a cubic spline on the table's knots plus
+one far knot on each side, so one B-spline holds table and continuation, without branches.  The far
+knots lie ``REACH`` table spans away (at 5 % of the lowest speed below the table's speeds, since
+speeds are positive); beyond them everything is held at its value there.
+
+**Stability margin.**  At constant corrected flow, as in GasTurb: SM = PR_surge(W)/PR - 1.  The
+surge line is a natural cubic spline of ln(PR - 1) over ln W with the same continuation: a power
+law.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import BSpline
+
+from apu_casadi.errors import MapError
+from apu_casadi.mapfiles import MapTable
+from apu_casadi.parameters import Parameters, par
+
+REACH = 2.0  # table spans from the table's edge to where everything is held
+LOWEST = 0.05  # held below this fraction of the table's lowest speed
+_MARGIN = 1e-9  # of the whole range: bspline is 0 at and beyond its last knot, stay inside
+
+
+class MapPoint(NamedTuple):
+    """What a map says at a point.
+
+    W : corrected flow, in the unit of the design value.
+    PR : pressure ratio, > 1.
+    eta : isentropic efficiency.
+    SM : stability margin PR_surge/PR - 1 at constant corrected flow; None for a turbine.
+    off : distance outside the table in table spans, the larger of N and beta; 0 inside.
+    """
+
+    W: Any
+    PR: Any
+    eta: Any
+    SM: Any
+    off: Any
+
+
+class OffMap(NamedTuple):
+    """Signed distance outside the table along each axis, in table spans; 0 inside.
+
+    Negative below the lowest line, positive above the highest.
+    """
+
+    N: Any
+    beta: Any
+
+
+def spline_operator(x: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return knots and the matrix from data to B-spline coefficients of a natural cubic spline.
+
+    Parameters
+    ----------
+    x : data sites, shape (n,), rising.
+    lo, hi : ends of the straight continuation, lo < x[0] and hi > x[-1].
+
+    Returns
+    -------
+    knots, shape (n + 8,): x with lo and hi fourfold.
+    P, shape (n + 4, n): coefficients are P @ data.
+
+    The n values at x and the four conditions S'' = 0 at lo, x[0], x[-1], hi fix the n + 4
+    coefficients.  S'' is piecewise linear, so the outer pieces are straight.
+    """
+    knots = np.concatenate([[lo] * 4, x, [hi] * 4])
+    n = x.size
+    basis = BSpline(knots, np.eye(n + 4), 3)
+    sites = np.array([lo, x[0], x[-1], hi])
+    A = np.vstack([basis(x), basis.derivative(2)(sites)])
+    return knots, np.linalg.solve(A, np.eye(n + 4)[:, :n])
+
+
+def _ends(x: np.ndarray) -> tuple[float, float]:
+    reach = REACH * float(x[-1] - x[0])
+    return float(x[0]) - reach, float(x[-1]) + reach
+
+
+def _clamp(x: Any, knots: np.ndarray) -> Any:
+    """Hold a query just inside the knots, where ``bspline`` is not yet zero."""
+    margin = _MARGIN * float(knots[-1] - knots[0])
+    return ca.fmin(ca.fmax(x, knots[0] + margin), knots[-1] - margin)
+
+
+@lru_cache(maxsize=64)
+def _log_map(table: MapTable) -> ca.Function:
+    """(N, beta) -> N as held, and (ln W, ln(PR - 1), ln eta) stacked."""
+    lo, hi = _ends(table.N)
+    knots_N, P_N = spline_operator(table.N, max(lo, LOWEST * float(table.N[0])), hi)
+    knots_b, P_b = spline_operator(table.beta, *_ends(table.beta))
+    logs = np.log(np.stack([table.W, table.PR - 1, table.eta]))
+    C = np.einsum("ai,kij,bj->kab", P_N, logs, P_b)
+    N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
+    held = _clamp(N, knots_N)
+    # CasADi wants the output index fastest, then the first axis
+    y = ca.bspline(
+        ca.vertcat(held, _clamp(beta, knots_b)),
+        ca.DM(C.ravel(order="F")),
+        [knots_N.tolist(), knots_b.tolist()],
+        [3, 3],
+        3,
+        {},
+    )
+    return ca.Function("log_map", [N, beta], [held, y], ["N", "beta"], ["N_held", "logs"])
+
+
+@lru_cache(maxsize=64)
+def map_function(table: MapTable) -> ca.Function:
+    """Return the unscaled surface as a CasADi function (N, beta) -> (W, PR, eta).
+
+    N, beta : scalars in the table's units.  W, PR, eta : scalars in the table's units.
+    """
+    N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
+    _, y = _log_map(table)(N, beta)
+    out = [ca.exp(y[0]), 1 + ca.exp(y[1]), ca.exp(y[2])]
+    return ca.Function("map", [N, beta], out, ["N", "beta"], ["W", "PR", "eta"])
+
+
+@lru_cache(maxsize=64)
+def surge_function(table: MapTable) -> ca.Function:
+    """Return the unscaled surge line as a CasADi function W -> PR_surge, in the table's units.
+
+    Raises
+    ------
+    MapError : the table is of a turbine.
+    """
+    if table.surge_W is None or table.surge_PR is None:
+        raise MapError(f"map {table.name!r} is of a {table.kind}: it has no surge line")
+    x = np.log(table.surge_W)
+    knots, P = spline_operator(x, *_ends(x))
+    W = ca.MX.sym("W")
+    coefficients = ca.DM(P @ np.log(table.surge_PR - 1))
+    y = ca.bspline(_clamp(ca.log(W), knots), coefficients, [knots.tolist()], [3], 1, {})
+    return ca.Function("surge", [W], [1 + ca.exp(y)], ["W"], ["PR_surge"])
+
+
+@lru_cache(maxsize=64)
+def off_function(table: MapTable) -> ca.Function:
+    """Return the CasADi function (N, beta) -> (off, off_N, off_beta), in table spans.
+
+    off is 0 inside the table, else the larger distance outside; the other two are signed.
+    """
+    N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
+    signed = []
+    for x, axis in ((N, table.N), (beta, table.beta)):
+        lo, hi = float(axis[0]), float(axis[-1])
+        signed.append((ca.fmax(0, x - hi) - ca.fmax(0, lo - x)) / (hi - lo))
+    off = ca.fmax(ca.fabs(signed[0]), ca.fabs(signed[1]))
+    return ca.Function(
+        "off", [N, beta], [off, *signed], ["N", "beta"], ["off", "off_N", "off_beta"]
+    )
+
+
+@dataclass(frozen=True)
+class MapCalibration(Parameters):
+    """Numbers that bend a scaled map to documented points; all leave the design point in place.
+
+    With the defaults the map's shape is untouched.  n is the relative corrected speed, 1 at the
+    design point.  RNI is the Reynolds number index, 1 at the design point.
+    """
+
+    a_W: float = par(
+        0.0,
+        unit="1",
+        source="identity",
+        doc="flow is multiplied by n**a_W",
+        lo=-5.0,
+        hi=5.0,
+    )
+    n_Re: float = par(
+        0.0,
+        unit="1",
+        source="identity",
+        doc="loss 1 - eta is multiplied by RNI**(-n_Re)",
+        lo=0.0,
+        hi=1.0,
+    )
+    c_PR: float = par(
+        0.0,
+        unit="1",
+        source="identity",
+        doc="eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)",
+        lo=0.0,
+        hi=200.0,
+    )
+    c_N: float = par(
+        0.0,
+        unit="1",
+        source="identity",
+        doc="eta is multiplied by exp(-c_N (n - 1)**2)",
+        lo=0.0,
+        hi=1000.0,
+    )
+    k_SM: float = par(
+        1.0,
+        unit="1",
+        source="identity",
+        doc="PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)",
+        lo=0.2,
+        hi=5.0,
+    )
+    a_SM: float = par(
+        0.0,
+        unit="1",
+        source="identity",
+        doc="PR_surge - 1 is multiplied by n**a_SM",
+        lo=-20.0,
+        hi=20.0,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaledMap:
+    """A map scaled so that n = 1, beta = beta_des, RNI = 1 gives the design values exactly.
+
+    Flow, PR - 1 and eta are each multiplied by a constant; the calibration then bends the map away
+    from the design point.
+
+    Parameters
+    ----------
+    table : the map's shape.
+    N_map_des, beta_des : where on the table the design point lies, in the table's units.
+    W_des : corrected flow at the design point, > 0; any unit, results have the same.
+    PR_des : pressure ratio at the design point, > 1.
+    eta_des : isentropic efficiency at the design point, in (0, 1).
+    cal : calibrated numbers.
+
+    Raises
+    ------
+    MapError : design location outside the table, design value outside its range, or an efficiency
+        that would reach 1 within the table after scaling.
+    """
+
+    table: MapTable
+    N_map_des: float
+    beta_des: float
+    W_des: float
+    PR_des: float
+    eta_des: float
+    cal: MapCalibration = field(default_factory=MapCalibration)
+
+    def __post_init__(self) -> None:
+        """Check that the map can be scaled as asked."""
+        t, who = self.table, f"map {self.table.name!r}"
+        for name, value, axis in (
+            ("N_map_des", self.N_map_des, t.N),
+            ("beta_des", self.beta_des, t.beta),
+        ):
+            if not axis[0] <= value <= axis[-1]:
+                raise MapError(
+                    f"{who}: {name} = {value:g} is outside the table, {axis[0]:g} to {axis[-1]:g}"
+                )
+        for name, value, lo, hi in (
+            ("W_des", self.W_des, 0.0, np.inf),
+            ("PR_des", self.PR_des, 1.0, np.inf),
+            ("eta_des", self.eta_des, 0.0, 1.0),
+        ):
+            if not lo < value < hi:
+                raise MapError(f"{who}: {name} = {value:g} must be between {lo:g} and {hi:g}")
+        i, j = np.unravel_index(int(np.argmax(t.eta)), t.eta.shape)
+        eta_map = float(map_function(t)(self.N_map_des, self.beta_des)[2])
+        best = float(t.eta[i, j]) * self.eta_des / eta_map
+        if best >= 1:
+            raise MapError(
+                f"{who}: scaled by {self.eta_des:g}/{eta_map:g} from N = {self.N_map_des:g}, beta "
+                f"= {self.beta_des:g}, efficiency would be {best:.4f} at N = {t.N[i]:g}, beta = "
+                f"{t.beta[j]:g}; choose a design location of higher efficiency on the map"
+            )
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """(n, beta, RNI) -> W, PR, eta, off, and for a compressor SM."""
+        t, cal = self.table, self.cal
+        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
+        _, des = _log_map(t)(self.N_map_des, self.beta_des)
+        N_held, y = _log_map(t)(self.N_map_des * n, beta)
+        held = N_held / self.N_map_des  # > 0, so that powers of it exist
+        rel = ca.exp(y - des)
+        W = self.W_des * rel[0] * held**cal.a_W
+        PR = 1 + (self.PR_des - 1) * rel[1]
+        # ln((PR - 1)/(PR_des - 1)) is y - des itself
+        droop = cal.c_PR * (y[1] - des[1]) ** 2 + cal.c_N * (held - 1) ** 2
+        eta = 1 - (1 - self.eta_des * rel[2] * ca.exp(-droop)) * RNI ** (-cal.n_Re)
+        off = off_function(t)(self.N_map_des * n, beta)[0]
+        out, names = [W, PR, eta, off], ["W", "PR", "eta", "off"]
+        if t.kind == "compressor":
+            W_map = W / self.W_des * ca.exp(des[0])
+            surge = (surge_function(t)(W_map) - 1) * (self.PR_des - 1) / ca.exp(des[1])
+            PR_surge = 1 + surge * cal.k_SM * held**cal.a_SM
+            out.append(PR_surge / PR - 1)
+            names.append("SM")
+        return ca.Function("scaled_map", [n, beta, RNI], out, ["n", "beta", "RNI"], names)
+
+    def lookup(self, n: Any, beta: Any, RNI: Any = 1.0) -> MapPoint:
+        """Read the map.
+
+        Parameters
+        ----------
+        n : relative corrected speed, 1 at the design point; float, array or ``casadi.MX``.
+        beta : auxiliary coordinate, in the table's units; likewise.
+        RNI : Reynolds number index, > 0, 1 at the design point; likewise.
+
+        Returns
+        -------
+        MapPoint of expressions if any argument is symbolic, else of floats or arrays.
+
+        Raises
+        ------
+        MapError : an argument is a ``casadi.SX``; B-splines exist in MX graphs only.
+        """
+        W, PR, eta, off, *SM = _call(self.function, n, beta, RNI)
+        return MapPoint(W=W, PR=PR, eta=eta, SM=SM[0] if SM else None, off=off)
+
+    def off_axes(self, n: Any, beta: Any) -> OffMap:
+        """Return the signed distance outside the table per axis, for messages; as in `lookup`."""
+        _, off_N, off_beta = _call(off_function(self.table), n * self.N_map_des, beta)
+        return OffMap(off_N, off_beta)
+
+
+def scale_map(
+    table: MapTable,
+    *,
+    W_des: float,
+    PR_des: float,
+    eta_des: float,
+    N_map_des: float | None = None,
+    beta_des: float | None = None,
+    cal: MapCalibration | None = None,
+) -> ScaledMap:
+    """Scale a map to a design point, by default from the source's own reference point.
+
+    Arguments as in :class:`ScaledMap`.
+
+    Raises
+    ------
+    MapError : no design location given and none in the table, or as in :class:`ScaledMap`.
+    """
+    location = {"N_map_des": N_map_des, "beta_des": beta_des}
+    reference = {"N_map_des": table.N_ref, "beta_des": table.beta_ref}
+    given = {k: reference[k] if v is None else v for k, v in location.items()}
+    missing = [k for k, v in given.items() if v is None]
+    if missing:
+        raise MapError(
+            f"map {table.name!r} carries no reference point: give {' and '.join(missing)}, within "
+            f"N {table.N[0]:g} to {table.N[-1]:g}, beta {table.beta[0]:g} to {table.beta[-1]:g}"
+        )
+    return ScaledMap(
+        table=table,
+        **given,  # type: ignore[arg-type]
+        W_des=W_des,
+        PR_des=PR_des,
+        eta_des=eta_des,
+        cal=MapCalibration() if cal is None else cal,
+    )
+
+
+def _call(f: ca.Function, *args: Any) -> tuple[Any, ...]:
+    """Call with symbols, floats or arrays; return expressions, floats or arrays."""
+    if any(isinstance(a, ca.SX) for a in args):
+        raise MapError("maps are B-splines, which exist in MX graphs only: use MX, not SX, symbols")
+    if any(isinstance(a, ca.MX) for a in args):
+        return tuple(f.call([ca.MX(a) for a in args]))
+    arrays = np.broadcast_arrays(*(np.asarray(a, dtype=float) for a in args))
+    out = f.call([ca.DM(a.reshape(1, -1)) for a in arrays])
+    if arrays[0].ndim == 0:
+        return tuple(float(o) for o in out)
+    return tuple(np.asarray(o).reshape(arrays[0].shape) for o in out)

@@ -1,0 +1,607 @@
+"""The paper's Figures 20 to 25, drawn from a dataset of a joint run.
+
+Figures are made with the object-oriented interface of matplotlib: no window, no global state, so
+that they work in threads, on servers and in notebooks alike.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apu_casadi.errors import DataError
+from apu_casadi.results import RPM, phases
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 160
+_WIDTH = 10.0  # in, 1600 px
+_INK, _MUTED, _GRID = "#1f2933", "#5f6b7a", "#e4e7eb"
+# Okabe and Ito: told apart in every common kind of colour blindness
+_ABC = {"a": "#d55e00", "b": "#0072b2", "c": "#009e73"}
+_NESTED = {"a": 3.4, "b": 2.2, "c": 1.0}  # line widths: curves that coincide all stay visible
+_CYCLES = 5e-3  # s, two cycles at 400 Hz: a bin of the envelope is never shorter
+_BANDS = ("#eef2f7", "#e3ebf5", "#fdf1dd", "#fbe3e0")
+_PHASE_INK = ("#33536f", "#1f4e79", "#8a5a00", "#9c2a1c")
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "axes.edgecolor": _MUTED,
+    "axes.labelcolor": _INK,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": _GRID,
+    "grid.linewidth": 0.7,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "text.color": _INK,
+    "axes.unicode_minus": True,
+    "axes.formatter.useoffset": False,
+}
+
+FIGURES = {
+    "fig20_phases": "Phases of the run: load, gas-path health and stator fault",
+    "fig21_speed_power": "Shaft speed and shaft power of the gas generator",
+    "fig22_compressor_outlet": "Compressor outlet total temperature and total pressure",
+    "fig23_T4_surge_margin": "Combustor outlet total temperature and compressor surge margin",
+    "fig24_currents": "Three-phase currents of the starter/generator",
+    "fig25_voltages": "Three-phase voltages of the starter/generator",
+}
+"""File names (without ``.png``) and titles, in the paper's order."""
+
+
+def _need(ds: xr.Dataset, names: Sequence[str]) -> None:
+    missing = [n for n in names if n not in ds]
+    if missing:
+        raise DataError(f"the dataset lacks {', '.join(missing)}")
+
+
+def _scenario(ds: xr.Dataset) -> dict[str, Any]:
+    try:
+        found = json.loads(ds.attrs["scenario"])
+    except (KeyError, TypeError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _figure(height: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(_WIDTH, height), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(fig)
+    return fig
+
+
+def _severity_note(ds: xr.Dataset) -> str:
+    """Tell the severity of the last stator fault: always mu, k_rf and kappa together."""
+    if not all(n in ds for n in ("mu", "k_rf", "kappa")):
+        return ""
+    mu = ds["mu"].values
+    hit = np.flatnonzero(mu > 0)
+    if hit.size == 0:
+        return ""
+    k = hit[-1]
+    m, r, c = (float(ds[n].values[k]) for n in ("mu", "k_rf", "kappa"))
+    kappa = f"κ = µ = {c:g}" if abs(c - m) < 1e-12 else f"κ = {c:g}"
+    return f"TTSC: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
+
+
+def _caption(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
+    number = key[3:5]
+    name = _scenario(ds).get("name", "")
+    words = [f"Figure {number}. {FIGURES[key]}."]
+    if name:
+        words.append(f"Scenario “{name}”.")
+    if key != "fig20_phases":
+        words.append(_severity_note(ds))
+    words.append(more)
+    text = textwrap.fill(" ".join(w for w in words if w), 160)
+    fig.text(0.012, 0.10 / fig.get_figheight(), text, fontsize=8.2, color=_MUTED, va="bottom")
+
+
+def _margins(fig: Figure, *, top: float = 0.18, bottom: float = 0.98) -> dict[str, float]:
+    """Return margins given in inches as fractions of the figure."""
+    h = fig.get_figheight()
+    return {"top": 1.0 - top / h, "bottom": bottom / h}
+
+
+def _colour(k: int) -> tuple[str, str]:
+    return _BANDS[k % len(_BANDS)], _PHASE_INK[k % len(_PHASE_INK)]
+
+
+def _fit(text: str, letters: int, lines: int = 2) -> str:
+    """Break a text into a few short lines at its spaces; cut it where that is not enough."""
+    broken = textwrap.wrap(text, max(letters, 1), break_long_words=False, break_on_hyphens=False)
+    if len(broken) <= lines and all(len(line) <= letters for line in broken):
+        return "\n".join(broken)
+    return text if len(text) <= letters else text[: max(letters - 1, 0)].rstrip() + "…"
+
+
+def _bands(ax: Axes, rows: Sequence[dict[str, Any]], *, names: bool) -> None:
+    """Shade the phases, mark their boundaries, and name them above the axes."""
+    lo, hi = rows[0]["start"], rows[-1]["end"]
+    width = ax.get_position().width * _WIDTH
+    for k, p in enumerate(rows):
+        band, ink = _colour(k)
+        ax.axvspan(p["start"], p["end"], color=band, lw=0, zorder=0)
+        if k:
+            ax.axvline(p["start"], color=ink, lw=1.0, ls=(0, (4, 2)), zorder=1.5)
+        if names:
+            inches = width * (p["end"] - p["start"]) / (hi - lo)
+            letters = max(int(inches / 0.088), 1)
+            ax.annotate(
+                _fit(p["name"], letters),
+                ((p["start"] + p["end"]) / 2, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(0, 5),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                fontsize=8.8,
+                color=ink,
+                fontweight="bold",
+            )
+    ax.set_xlim(lo, hi)
+
+
+def _roomy(ax: Axes, y: np.ndarray, margin: float) -> None:
+    """Leave room around a curve; a constant is not blown up to its rounding errors."""
+    lo, hi = float(np.nanmin(y)), float(np.nanmax(y))
+    least = 1e-4 * max(abs(lo), abs(hi), 1e-12)
+    room = margin * (hi - lo) + max(0.0, (least - (hi - lo)) / 2)
+    ax.set_ylim(lo - room, hi + room)
+
+
+def _quietest(rows: Sequence[dict[str, Any]], t: np.ndarray, y: np.ndarray) -> int | None:
+    """Return the phase whose beginning moves ``y`` least, but visibly: it wants an enlargement."""
+    best, least = None, np.inf
+    whole = float(np.ptp(y))
+    for k, p in enumerate(rows[1:], 1):
+        inside = y[(t >= p["start"] - 0.1) & (t <= min(p["end"], p["start"] + 2.5))]
+        move = float(np.ptp(inside)) if inside.size else 0.0
+        if max(1e-3 * whole, 1e-5 * float(np.abs(y).max())) < move < least:
+            best, least = k, move
+    return best
+
+
+def _trend(
+    ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, float, str]]
+) -> Figure:
+    """Draw quantities (name, label, scale, offset, colour) over time, each with an enlargement."""
+    import matplotlib as mpl
+
+    _need(ds, [c[0] for c in curves])
+    rows = phases(ds)
+    t = ds["time"].values
+    with mpl.rc_context(_STYLE):
+        fig = _figure(6.3)
+        data = [ds[name].values * scale + offset for name, _, scale, offset, _ in curves]
+        enlarged = [_quietest(rows, t, y) for y in data]
+        two = any(k is not None for k in enlarged)
+        grid = fig.add_gridspec(
+            len(curves),
+            2 if two else 1,
+            width_ratios=[3.1, 1.0] if two else None,
+            left=0.085, right=0.985, hspace=0.27, wspace=0.2, **_margins(fig, top=0.55, bottom=0.9),
+        )  # fmt: skip
+        for r, (y, k, (_, label, _, _, colour)) in enumerate(
+            zip(data, enlarged, curves, strict=True)
+        ):
+            last = r == len(curves) - 1
+            ax = fig.add_subplot(grid[r, 0])
+            _bands(ax, rows, names=r == 0)
+            ax.plot(t, y, color=colour, lw=1.7, solid_joinstyle="round")
+            ax.set_ylabel(label)
+            _roomy(ax, y, 0.08)
+            ax.tick_params(labelbottom=last)
+            if last:
+                ax.set_xlabel("Time [s]")
+            if k is None:
+                continue
+            side = fig.add_subplot(grid[r, 1])
+            p = rows[k]
+            lo, hi = p["start"] - 0.25, min(p["end"], p["start"] + 2.5)
+            inside = (t >= lo) & (t <= hi)
+            side.axvspan(lo, p["start"], color=_colour(k - 1)[0], lw=0, zorder=0)
+            side.axvspan(p["start"], hi, color=_colour(k)[0], lw=0, zorder=0)
+            side.axvline(p["start"], color=_colour(k)[1], lw=1.0, ls=(0, (4, 2)), zorder=1.5)
+            side.plot(t[inside], y[inside], color=colour, lw=1.7)
+            side.set_xlim(lo, hi)
+            _roomy(side, y[inside], 0.1)
+            side.annotate(
+                _fit(f"enlarged: {p['name']}", 30),
+                (0.5, 1.0), xycoords="axes fraction", xytext=(0, 5), textcoords="offset points",
+                ha="center", va="bottom", fontsize=8.2, color=_colour(k)[1],
+            )  # fmt: skip
+            if last:
+                side.set_xlabel("Time [s]")
+        _caption(fig, ds, key)
+    return fig
+
+
+def figure_21(ds: xr.Dataset) -> Figure:
+    """Draw shaft speed [r/min] and shaft power [kW]; DataError if a variable is missing."""
+    return _trend(
+        ds,
+        "fig21_speed_power",
+        [
+            ("N", "Shaft speed [r/min]", RPM, 0.0, "#0b5394"),
+            ("PW", "Shaft power [kW]", 1e-3, 0.0, "#b45309"),
+        ],
+    )
+
+
+def figure_22(ds: xr.Dataset) -> Figure:
+    """Draw T3 [K] and P3 [kPa]; DataError if a variable is missing."""
+    return _trend(
+        ds,
+        "fig22_compressor_outlet",
+        [
+            ("T3", "$T_3$ [K]", 1.0, 0.0, "#b91c1c"),
+            ("P3", "$P_3$ [kPa]", 1e-3, 0.0, "#0b5394"),
+        ],
+    )
+
+
+def figure_23(ds: xr.Dataset) -> Figure:
+    """Draw T4 [K] and the surge margin [%]; DataError if a variable is missing."""
+    return _trend(
+        ds,
+        "fig23_T4_surge_margin",
+        [
+            ("T4", "$T_4$ [K]", 1.0, 0.0, "#b91c1c"),
+            ("SM", "Surge margin [%]", 100.0, 0.0, "#0f766e"),
+        ],
+    )
+
+
+def _segments(
+    t: np.ndarray, table: np.ndarray, rows: Sequence[dict[str, Any]]
+) -> list[tuple[float, float, int]]:
+    """Return (start, end, index) of the stretches over which the rows of ``table`` are constant.
+
+    A change one sample off the beginning of a phase is drawn there.
+    """
+    same = np.all((table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1])), axis=1)
+    cuts = [0, *(np.flatnonzero(~same) + 1).tolist()]
+    ends = [*cuts[1:], t.size - 1]
+    starts = np.array([p["start"] for p in rows])
+    slack = 1.5 * float(np.min(np.diff(t)))
+
+    def instant(i: int) -> float:
+        near = starts[int(np.argmin(np.abs(starts - t[i])))]
+        return float(near if abs(near - t[i]) <= slack else t[i])
+
+    return [(instant(a), instant(b), a) for a, b in zip(cuts, ends, strict=True) if b > a]
+
+
+def _load_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> list[tuple[float, float, str]]:
+    """Return (start, end, words) of the loads, from the scenario or else from the mean power."""
+    table = _scenario(ds)
+    steps = [(p.get("start"), p.get("load")) for p in table.get("phase", ())]
+    steps += [(e.get("time"), e.get("load")) for e in table.get("event", ())]
+    loads = sorted(((float(s), x) for s, x in steps if isinstance(x, dict)), key=lambda s: s[0])
+    t_end = rows[-1]["end"]
+    loads = [x for x in loads if x[0] < t_end]
+    if loads:
+        ends = [s for s, _ in loads[1:]] + [t_end]
+        return [(s, e, _load_words(x)) for (s, x), e in zip(loads, ends, strict=True)]
+    t, P = ds["time"].values, ds["P_e"].values
+    lane = []
+    for p in rows:
+        tail = (t > p["end"] - 0.25 * (p["end"] - p["start"])) & (t <= p["end"])
+        lane.append((p["start"], p["end"], f"{np.mean(P[tail]) / 1e3:.0f} kW electric"))
+    return lane
+
+
+def _load_words(x: dict[str, Any]) -> str:
+    kind = x.get("kind", "")
+    words = {
+        "R": "resistive",
+        "RL": f"R-L, pf {x.get('power_factor', 0.85):g}",
+        "series": "series R-L",
+        "constant_power": "constant power",
+        "open": "open circuit",
+    }.get(kind, str(kind))
+    if x.get("unbalance") and len(set(x["unbalance"])) > 1:
+        words += ", unbalanced"
+    return f"2\u00a0×\u00a0{x['power_kW']:g}\u00a0kW\n{words}" if "power_kW" in x else words
+
+
+def figure_20(ds: xr.Dataset) -> Figure:
+    """Draw the phases of the run: load, health of the gas path and state of the stator over time.
+
+    Raises
+    ------
+    DataError : a variable is missing.
+    """
+    import matplotlib as mpl
+
+    factors = {"f_eta_c": "$η_c$", "f_W_c": "$W_c$", "f_eta_t": "$η_t$", "f_W_t": "$W_t$"}
+    _need(ds, [*factors, "mu", "k_rf", "kappa", "P_e"])
+    rows = phases(ds)
+    t = ds["time"].values
+    healthy, hurt = ("#d8efe3", "#14532d"), ("#f8cfc8", "#7f1d1d")
+    lanes: list[tuple[str, list[tuple[float, float, str, tuple[str, str]]]]] = []
+    loads = _load_lane(ds, rows)
+    tints = (("#bfd7ee", "#0b3c66"), ("#dbe8f5", "#0b3c66"))
+    lanes.append(
+        ("Electrical load", [(a, b, w, tints[i % 2]) for i, (a, b, w) in enumerate(loads)])
+    )
+    gas = np.column_stack([ds[f].values for f in factors])
+    cells = []
+    for a, b, i in _segments(t, gas, rows):
+        off = [
+            f"{s} {100 * (v - 1):+.3g} %".replace(" -", " −").replace(" ", "\u00a0")
+            for s, v in zip(factors.values(), gas[i], strict=True)
+            if v != 1.0
+        ]
+        words = "healthy" if not off else ", ".join(off[:2]) + "\n" + ", ".join(off[2:])
+        cells.append((a, b, words.strip(), hurt if off else healthy))
+    lanes.append(("Gas path", cells))
+    stator = np.column_stack([ds[f].values for f in ("mu", "k_rf", "kappa")])
+    cells = []
+    for a, b, i in _segments(t, stator, rows):
+        m, r, c = stator[i]
+        kappa = "κ = µ" if abs(c - m) < 1e-12 else f"κ = {c:g}"
+        words = "healthy"
+        if m > 0:
+            parts = f"µ = {100 * m:g} %", f"$k_{{rf}}$ = {r:g}", kappa
+            first, second, third = (x.replace(" ", "\u00a0") for x in parts)
+            words = f"TTSC {first}\n{second}, {third}"
+        cells.append((a, b, words, hurt if m > 0 else healthy))
+    lanes.append(("Stator", cells))
+    with mpl.rc_context(_STYLE):
+        fig = _figure(3.7)
+        ax = fig.add_axes((0.125, 0.0, 0.86, 1.0))
+        m = _margins(fig, top=0.45, bottom=0.8)
+        ax.set_position((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
+        _bands(ax, rows, names=True)
+        span = rows[-1]["end"] - rows[0]["start"]
+        per_letter = 0.075 * span / (0.86 * _WIDTH)
+        for y, (_, items) in enumerate(lanes):
+            for a, b, words, (fill, ink) in items:
+                ax.barh(
+                    y, b - a, left=a, height=0.7, color=fill, edgecolor="white", lw=1.6, zorder=2
+                )
+                letters = max(int((b - a) / per_letter) - 1, 1)
+                text = "\n".join(
+                    line
+                    for part in words.split("\n")
+                    for line in textwrap.wrap(part, letters + 2 * part.count("$"))
+                )
+                lines = text.split("\n")
+                longest = max(len(line) - 5 * (line.count("$") // 2) for line in lines)
+                size = 8.8 if len(lines) < 4 and longest <= letters else 7.0
+                if longest <= 1.3 * letters and len(lines) < 6:
+                    ax.text((a + b) / 2, y, text, ha="center", va="center", color=ink,
+                            fontsize=size, linespacing=1.25)  # fmt: skip
+        ax.set_yticks(range(len(lanes)), [n for n, _ in lanes], fontsize=9.5)
+        ax.set_ylim(len(lanes) - 0.5, -0.5)
+        ax.grid(False)
+        ax.tick_params(axis="y", length=0)
+        ax.spines["left"].set_visible(False)
+        ax.set_xlabel("Time [s]")
+        _caption(fig, ds, "fig20_phases", "Load of each of the two generators at rated voltage.")
+    return fig
+
+
+def envelope(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bin centres [as t], minima and maxima of ``y`` in ``bins`` equal parts of ``t``.
+
+    Every sample is in a bin, so that no peak is lost; all three have shape (bins',), bins' <= bins.
+    """
+    bins = max(min(bins, t.size), 1)
+    cuts = np.unique(np.linspace(0, t.size, bins + 1).astype(int)[:-1])
+    ends = np.append(cuts[1:], t.size) - 1
+    return (t[cuts] + t[ends]) / 2, np.minimum.reduceat(y, cuts), np.maximum.reduceat(y, cuts)
+
+
+def _waves(
+    ax: Axes, ds: xr.Dataset, names: Sequence[str], lo: float, hi: float, origin: float
+) -> None:
+    """Plot waveforms between two instants [s], in ms from ``origin``."""
+    tw = ds["time_w"].values
+    a, b = np.searchsorted(tw, (lo - 1e-9, hi + 1e-9))
+    for name in names:
+        ax.plot(
+            (tw[a:b] - origin) * 1e3, ds[name].values[a:b], color=_ABC[name[-1]], lw=1.15, zorder=3
+        )
+    ax.set_xlim((lo - origin) * 1e3, (hi - origin) * 1e3)
+
+
+def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str, short: str) -> Figure:
+    import matplotlib as mpl
+
+    names = [f"{symbol}_{p}" for p in "abc"]
+    rms = [f"{symbol.upper()}_{p}_rms" for p in "abc"]
+    waves = "time_w" in ds.coords
+    _need(ds, names + rms if waves else rms)
+    rows = phases(ds)
+    t = ds["time"].values
+    shown = rows[:4]
+    events = rows[1:4]
+    n_rows = 1 + (2 if waves else 0) + (1 if events else 0) - (1 if waves and not events else 0)
+    heights = [2.5] + [1.75] * (n_rows - 1)
+    with mpl.rc_context(_STYLE):
+        top, bottom, gap = 0.45, 0.95, 0.72
+        fig = _figure(sum(heights) + gap * (n_rows - 1) + top + bottom)
+        mean = sum(heights) / n_rows
+        outer = fig.add_gridspec(
+            n_rows, 1, left=0.08, right=0.985, hspace=gap / mean, height_ratios=heights,
+            **_margins(fig, top=top, bottom=bottom),
+        )  # fmt: skip
+        ax = fig.add_subplot(outer[0])
+        _bands(ax, rows, names=True)
+        if waves:
+            tw = ds["time_w"].values
+            bins = int(min(1400, max((tw[-1] - tw[0]) / _CYCLES, 1)))
+            for name, p in zip(names, "abc", strict=True):
+                x, lo, hi = envelope(tw, ds[name].values, bins)
+                ax.fill_between(x, lo, hi, color=_MUTED, alpha=0.09, lw=0)
+                for edge in (lo, hi):
+                    ax.plot(x, edge, color=_ABC[p], lw=_NESTED[p], solid_capstyle="butt")
+            ax.set_ylabel(label.replace(" [", " envelope ["))
+        else:
+            for name, p in zip(rms, "abc", strict=True):
+                ax.plot(t, ds[name].values, color=_ABC[p], lw=_NESTED[p])
+            ax.set_ylabel(f"{label}, rms")
+        ax.margins(y=0.06)
+        ax.set_xlabel("Time [s]", labelpad=2)
+        _legend(ax, "center right" if waves else "best")
+        row = 1
+        if waves:
+            _steady_row(fig, outer[row], ds, names, shown, short)
+            row += 1
+            if events:
+                _event_row(fig, outer[row], ds, names, events, rows, short)
+                row += 1
+        if events:
+            _rms_row(fig, outer[row], ds, rms, events, rows, short)
+        more = "Envelope: extremes of every sample. " if waves else ""
+        more += "" if len(rows) <= 4 else "Enlargements: first four phases."
+        _caption(fig, ds, key, more.strip())
+    return fig
+
+
+def _legend(ax: Axes, where: str) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], color=_ABC[p], lw=2.2, label=f"phase {p}") for p in "abc"]
+    ax.legend(
+        handles=handles, loc=where, ncols=3, fontsize=8.5,
+        frameon=True, framealpha=0.9, edgecolor="none", handlelength=1.4, columnspacing=1.1,
+        borderpad=0.3,
+    )  # fmt: skip
+
+
+def _title(ax: Axes, text: str, ink: str) -> None:
+    ax.annotate(
+        text, (0.5, 1.0), xycoords="axes fraction", xytext=(0, 4), textcoords="offset points",
+        ha="center", va="bottom", fontsize=8.4, color=ink,
+    )  # fmt: skip
+
+
+def _steady_row(
+    fig: Figure, spec: Any, ds: xr.Dataset, names: Sequence[str], shown: Any, short: str
+) -> None:
+    """Draw three cycles at the end of every phase, on one scale."""
+    grid = spec.subgridspec(1, len(shown), wspace=0.09)
+    first = None
+    for k, p in enumerate(shown):
+        ax = fig.add_subplot(grid[k], sharey=first)
+        first = first or ax
+        ax.set_facecolor(_colour(k)[0])
+        hi = p["end"] - 0.0125
+        lo = max(hi - 0.0075, p["start"])
+        _waves(ax, ds, names, lo, hi, lo)
+        _title(ax, f"{_fit(p['name'], 84 // len(shown) - 1, 1)}, from {lo:.3f} s", _colour(k)[1])
+        ax.tick_params(labelleft=k == 0)
+        ax.set_xlabel("ms", labelpad=1)
+        if k == 0:
+            ax.set_ylabel(short)
+
+
+def _event_row(
+    fig: Figure, spec: Any, ds: xr.Dataset, names: Sequence[str], events: Any, rows: Any, short: str
+) -> None:
+    """Draw the waveforms around the beginning of every later phase."""
+    from matplotlib.ticker import MultipleLocator
+
+    grid = spec.subgridspec(1, len(events), wspace=0.2)
+    for k, p in enumerate(events):
+        ax = fig.add_subplot(grid[k])
+        ink = _colour(k + 1)[1]
+        ax.axvspan(-100, 0, color=_colour(k)[0], lw=0, zorder=0)
+        ax.axvspan(0, 100, color=_colour(k + 1)[0], lw=0, zorder=0)
+        ax.axvline(0, color=ink, lw=1.0, ls=(0, (4, 2)), zorder=1.5)
+        _waves(ax, ds, names, p["start"] - 0.004, p["start"] + 0.008, p["start"])
+        ax.margins(y=0.06)
+        _title(
+            ax, f"{_fit(p['name'], 84 // len(events) - 6, 1)}: waveforms at {p['start']:g} s", ink
+        )
+        ax.xaxis.set_major_locator(MultipleLocator(2))
+        ax.set_xlabel("ms after the change", labelpad=1)
+        if k == 0:
+            ax.set_ylabel(short)
+
+
+def _rms_row(
+    fig: Figure, spec: Any, ds: xr.Dataset, rms: Sequence[str], events: Any, rows: Any, short: str
+) -> None:
+    """Draw the rms values around the beginning of every later phase, each on its own scale."""
+    grid = spec.subgridspec(1, len(events), wspace=0.2)
+    t = ds["time"].values
+    for k, p in enumerate(events):
+        ax = fig.add_subplot(grid[k])
+        ink = _colour(k + 1)[1]
+        lo, hi = max(p["start"] - 0.2, t[0]), min(p["start"] + 1.6, p["end"])
+        inside = (t >= lo - 1e-9) & (t <= hi + 1e-9)
+        ax.axvspan(lo, p["start"], color=_colour(k)[0], lw=0, zorder=0)
+        ax.axvspan(p["start"], hi, color=_colour(k + 1)[0], lw=0, zorder=0)
+        ax.axvline(p["start"], color=ink, lw=1.0, ls=(0, (4, 2)), zorder=1.5)
+        for name in rms:
+            y = ds[name].values[inside]
+            ax.plot(t[inside], y, color=_ABC[name[2]], lw=_NESTED[name[2]], zorder=3)
+        ax.set_xlim(lo, hi)
+        _roomy(ax, np.concatenate([ds[n].values[inside] for n in rms]), 0.1)
+        _title(ax, f"{_fit(p['name'], 84 // len(events), 1)}: rms, enlarged", ink)
+        ax.set_xlabel("Time [s]", labelpad=1)
+        if k == 0:
+            unit = ds[rms[0]].attrs.get("units", "")
+            ax.set_ylabel(f"rms [{unit}]")
+
+
+def figure_24(ds: xr.Dataset) -> Figure:
+    """Draw the phase currents [A]: envelope, steady cycles, events.  Without waveforms: rms only.
+
+    Raises
+    ------
+    DataError : a variable is missing.
+    """
+    return _three_phase(ds, "fig24_currents", "i", "Current [A]", "Current [A]")
+
+
+def figure_25(ds: xr.Dataset) -> Figure:
+    """Draw the phase voltages [V] as :func:`figure_24` draws the currents."""
+    return _three_phase(ds, "fig25_voltages", "v", "Voltage [V]", "Voltage [V]")
+
+
+_DRAW = {
+    "fig20_phases": figure_20,
+    "fig21_speed_power": figure_21,
+    "fig22_compressor_outlet": figure_22,
+    "fig23_T4_surge_margin": figure_23,
+    "fig24_currents": figure_24,
+    "fig25_voltages": figure_25,
+}
+
+
+def save_figures(ds: xr.Dataset, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write Figures 20 to 25 as PNG, 1600 px wide, into an existing folder; return the paths.
+
+    Raises
+    ------
+    DataError : a variable is missing.
+    """
+    made = []
+    for key, draw in _DRAW.items():
+        path = Path(folder) / f"{key}.png"
+        draw(ds).savefig(path, dpi=DPI)
+        made.append(path)
+    return made

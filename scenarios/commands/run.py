@@ -1,0 +1,120 @@
+"""Run a scenario: print its summary phase by phase, and write netCDF, JSON and figures.
+
+SCENARIO is a name of the library (see ``apu list``), a .toml file, or a .py file that defines
+``scenario``; a Python file is executed, so run only what you trust.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+NAME = "run"
+HELP = "run a scenario of the library or of a file"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare arguments and options."""
+    parser.add_argument("scenario", metavar="SCENARIO", help="a name, a .toml or a .py file")
+    parser.add_argument("--out", metavar="DIR", help="folder for the files (default results/NAME)")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON only")
+    parser.add_argument("--no-figures", action="store_true", help="draw no figures")
+    parser.add_argument(
+        "--no-waveforms", action="store_true", help="keep no waveforms: a small file, rms figures"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the scenario and write its results."""
+    from scenarios import registry
+
+    s = registry.get(args.scenario)
+    if args.no_waveforms:
+        s = s.change(waveform_dt=None)
+    folder = registry.prepare(args.out or f"results/{s.name}")
+    with _bar(s.name, s.duration, show=not args.quiet and sys.stderr.isatty()) as progress:
+        ds = registry.run(s, progress=progress)
+    made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
+    report = registry.summary(ds)
+    if args.json:
+        print(json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False))
+        return 0
+    print(f"{s.name}: {s.title}" if s.title else s.name)
+    print(table(report["phases"]))
+    if not args.quiet:
+        print("\nwritten:")
+        for path in made:
+            print(f"  {path}")
+    return 0
+
+
+@contextmanager
+def _bar(name: str, total: float, *, show: bool) -> Iterator[Callable[[float, float], None] | None]:
+    """Yield a callback that moves a progress bar on stderr, or None."""
+    if not show:
+        yield None
+        return
+    from tqdm import tqdm
+
+    form = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:g} s simulated [{elapsed}<{remaining}]"
+    with tqdm(total=total, desc=name, bar_format=form, file=sys.stderr, leave=True) as bar:
+
+        def progress(done: float, _: float) -> None:
+            bar.update(min(done, total) - bar.n)
+
+        yield progress
+
+
+def _faulty(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+_ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("phase [s]", lambda r: f"{r['start']:g} to {r['end']:g}"),
+    ("shaft speed [r/min]", lambda r: f"{r['N_rpm']:.1f}"),
+    ("  lowest", lambda r: f"{r['N_rpm_min']:.1f}"),
+    ("  highest", lambda r: f"{r['N_rpm_max']:.1f}"),
+    ("shaft power [kW]", lambda r: f"{r['PW_kW']:.2f}"),
+    ("fuel flow [kg/s]", lambda r: f"{r['Wf']:.5f}"),
+    ("SFC [kg/(kW h)]", lambda r: f"{r['SFC'] * 3.6e6:.4f}"),
+    ("T3 [K]", lambda r: f"{r['T3']:.2f}"),
+    ("P3 [kPa]", lambda r: f"{r['P3_kPa']:.2f}"),
+    ("T4 [K]", lambda r: f"{r['T4']:.2f}"),
+    ("  highest", lambda r: f"{r['T4_max']:.2f}"),
+    ("T5 [K]", lambda r: f"{r['T5']:.2f}"),
+    ("surge margin [%]", lambda r: f"{r['SM_percent']:.2f}"),
+    ("  lowest", lambda r: f"{r['SM_percent_min']:.2f}"),
+    ("V rms a [V]", lambda r: f"{r['V_a_rms']:.2f}"),
+    ("      b", lambda r: f"{r['V_b_rms']:.2f}"),
+    ("      c", lambda r: f"{r['V_c_rms']:.2f}"),
+    ("I rms a [A]", lambda r: f"{r['I_a_rms']:.2f}"),
+    ("      b", lambda r: f"{r['I_b_rms']:.2f}"),
+    ("      c", lambda r: f"{r['I_c_rms']:.2f}"),
+    ("electrical output [kW]", lambda r: f"{r['P_e'] / 1e3:.2f}"),
+    ("fault loss [kW]", lambda r: f"{r['P_loss_fault'] / 1e3:.3f}"),
+    ("f_eta_c, f_W_c", lambda r: f"{r['f_eta_c']:g}, {r['f_W_c']:g}"),
+    ("f_eta_t, f_W_t", lambda r: f"{r['f_eta_t']:g}, {r['f_W_t']:g}"),
+    ("TTSC mu [%]", lambda r: f"{100 * r['mu']:g}" if r["mu"] else "healthy"),
+    ("  k_rf", lambda r: _faulty(r["k_rf"], "g")),
+    ("  kappa", lambda r: _faulty(r["kappa"], "g")),
+    ("  h = mu/(k_rf + 1 - mu)", lambda r: _faulty(r["h"] or None, ".5f")),
+)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the phases side by side; means over the end of each phase, then extremes over it."""
+    columns = [[r["name"], *(show(r) for _, show in _ROWS)] for r in rows]
+    heads = ["", *(name for name, _ in _ROWS)]
+    left = max(len(h) for h in heads)
+    widths = [max(len(c) for c in column) for column in columns]
+    lines = []
+    for i, head in enumerate(heads):
+        cells = (f"{column[i]:>{w}}" for column, w in zip(columns, widths, strict=True))
+        lines.append(f"{head:<{left}}  " + "  ".join(cells))
+    lines.insert(1, "-" * len(lines[0]))
+    return "\n".join(line.rstrip() for line in lines)

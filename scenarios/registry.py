@@ -1,0 +1,190 @@
+"""The scenario library, and running a scenario: by name, from a file, or from Python.
+
+>>> from scenarios import registry
+>>> ds = registry.run("joint")  # doctest: +SKIP
+>>> ds["T4"].sel(time=5.0)  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from apu_casadi.errors import ScenarioError, nearest
+from scenarios.schema import Scenario
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Progress = Callable[[float, float], None]
+"""Called with the simulated and the total time [s]."""
+
+
+@cache
+def _library() -> dict[str, Scenario]:
+    made = {}
+    folder = files("scenarios") / "library"
+    for entry in sorted(folder.iterdir(), key=lambda e: e.name):
+        if entry.name.endswith(".toml"):
+            text = entry.read_text(encoding="utf-8")
+            s = Scenario.from_toml_text(text, f"library/{entry.name}")
+            if f"{s.name}.toml" != entry.name:
+                raise ScenarioError(f"library/{entry.name}: its name is {s.name!r}")
+            made[s.name] = s
+    return made
+
+
+def list_scenarios() -> list[Scenario]:
+    """Return the scenarios of the library in alphabetical order, ``joint`` first."""
+    return sorted(_library().values(), key=lambda s: (s.name != "joint", s.name))
+
+
+def get(name_or_path: str | os.PathLike[str]) -> Scenario:
+    """Return a scenario of the library, or read a ``.toml`` or ``.py`` file.
+
+    Something is taken as a file if it ends in ``.toml`` or ``.py`` or has a folder in it.  A Python
+    file is executed: run only what you trust.
+
+    Raises
+    ------
+    ScenarioError : unknown name (the nearest is named), missing file, wrong key or value.
+    """
+    text = os.fspath(name_or_path)
+    path = Path(text)
+    if path.suffix == ".py":
+        return Scenario.from_python(path)
+    if path.suffix == ".toml":
+        return Scenario.from_toml(path)
+    library = _library()
+    if text in library:
+        return library[text]
+    if path.name != text or path.exists():
+        raise ScenarioError(f"{text}: a scenario file ends in .toml or .py")
+    raise ScenarioError(f"unknown scenario {text!r} {nearest(text, library)}")
+
+
+def run(
+    scenario: Scenario | str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> xr.Dataset:
+    """Run a scenario and return the joint dataset.
+
+    Parameters
+    ----------
+    scenario : a description, a name of the library, or a file.
+    out : folder for the netCDF file, the figures and the summary; None writes nothing.
+    progress : called with the simulated and the total time [s].
+    overrides : attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
+        ``parameters={"machine.r_s": 0.01}``).
+
+    Raises
+    ------
+    ScenarioError, ParameterError : a wrong description; OperatingPointError, SimulationError : the
+        unit cannot run so; DataError : ``out`` cannot be written.
+    """
+    s = scenario if isinstance(scenario, Scenario) else get(scenario)
+    if overrides:
+        s = s.change(**overrides)
+    if out is not None:
+        prepare(out)
+    ds = _simulate(s, progress)
+    ds.attrs["scenario"] = s.to_json()
+    ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
+    if out is not None:
+        write(ds, out)
+    return ds
+
+
+def _simulate(s: Scenario, progress: Progress | None) -> xr.Dataset:
+    from apu_casadi.apu import Apu
+    from apu_casadi.multirate import simulate_joint
+
+    apu = Apu()
+    if s.parameters:
+        apu = apu.change(**s.parameters)
+    return simulate_joint(
+        apu,
+        duration=s.duration,
+        **s.start(),
+        ambient=s.ambient,
+        events=s.events(),
+        dt=s.dt,
+        waveform_dt=s.waveform_dt,
+        noise=None if s.noise is None else dict(s.noise),
+        seed=s.seed,
+        progress=progress,
+    )
+
+
+def prepare(out: str | os.PathLike[str]) -> Path:
+    """Make the folder for results, before a long run; :class:`DataError` if that is impossible."""
+    from apu_casadi.errors import DataError
+
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise DataError(f"{folder}: cannot make the folder for results: {e.strerror}") from None
+    if not os.access(folder, os.W_OK):
+        raise DataError(f"{folder}: no permission to write results there")
+    return folder
+
+
+def name_of(ds: xr.Dataset) -> str:
+    """Return the name of the scenario that made a dataset, ``"result"`` if it is not recorded."""
+    try:
+        return str(json.loads(ds.attrs["scenario"])["name"])
+    except (KeyError, TypeError, ValueError):
+        return "result"
+
+
+def summary(ds: xr.Dataset) -> dict[str, Any]:
+    """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
+    from apu_casadi.results import phase_summary
+
+    try:
+        title = str(json.loads(ds.attrs["scenario"])["title"])
+    except (KeyError, TypeError, ValueError):
+        title = ""
+    return {
+        "scenario": name_of(ds),
+        "title": title,
+        "apu_casadi_version": str(ds.attrs.get("apu_casadi_version", "")),
+        "phases": phase_summary(ds),
+    }
+
+
+def write(
+    ds: xr.Dataset, out: str | os.PathLike[str], *, figures: bool = True, name: str | None = None
+) -> list[Path]:
+    """Write ``NAME.nc``, ``summary.json`` and the figures into a folder; return the paths.
+
+    Raises
+    ------
+    DataError : the folder or a file cannot be written.
+    """
+    from apu_casadi import results
+    from apu_casadi.errors import DataError
+
+    folder = prepare(out)
+    made = [results.save(ds, folder / f"{name or name_of(ds)}.nc")]
+    text = json.dumps(summary(ds), indent=2, ensure_ascii=False, allow_nan=False)
+    path = folder / "summary.json"
+    try:
+        path.write_text(text + "\n", encoding="utf-8")
+        made.append(path)
+        if figures:
+            from apu_casadi import plotting
+
+            made += plotting.save_figures(ds, folder)
+    except OSError as e:
+        raise DataError(f"{folder}: cannot write results: {e.strerror or e}") from None
+    return made
