@@ -34,6 +34,7 @@ from apu_casadi.errors import OperatingPointError, ParameterError, SignalError, 
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import ttsc, wrsg
 from apu_casadi.machine.load import KINDS, V_MIN, ConstantPowerLoad, Load, OpenLoad, SeriesLoad
+from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
 from apu_casadi.machine.park import (
     Abc,
     Qd0,
@@ -42,7 +43,6 @@ from apu_casadi.machine.park import (
     qd0_to_abc,
     speed_voltage,
 )
-from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.machine.wrsg import Windings
 from apu_casadi.signals import Signal, Signals
@@ -322,9 +322,9 @@ class Generator:
 
         if V_t is None:
             wanted = self.V_ref_default if V_ref is None else V_ref
-            # V_t = V_ref - V_R / K_A with V_R within its limits, so the root is bracketed
+            # V_t = V_ref - V_R / K_A with 0 <= V_R <= V_R_max at rest, so the root is bracketed
             low = max((wanted - e.V_R_max / e.K_A) * p.V_rated_rms, 1e-6 * p.V_rated_rms)
-            high = (wanted - min(e.V_R_min, 0.0) / e.K_A) * p.V_rated_rms
+            high = wanted * p.V_rated_rms
             excess = [at(low)[3] - wanted, at(high)[3] - wanted] if high > low else [0.0, 0.0]
             if not excess[0] <= 0 <= excess[1]:
                 raise OperatingPointError(
@@ -335,7 +335,9 @@ class Generator:
             import scipy.optimize
 
             V_t = float(
-                scipy.optimize.brentq(lambda V: at(V)[3] - wanted, low, high, xtol=1e-12, rtol=1e-15)
+                scipy.optimize.brentq(
+                    lambda V: at(V)[3] - wanted, low, high, xtol=1e-12, rtol=1e-15
+                )
             )
         if not V_t > 0:
             raise OperatingPointError(f"terminal voltage must be > 0, got {V_t!r} V")
@@ -360,8 +362,8 @@ class Generator:
         if not abs(rate[worst]) < 1e-6:
             raise OperatingPointError(
                 f"steady state of {ss.name} with {load!r}: {ss.x.names[worst]} changes by "
-                f"{rate[worst]:.2e} of its nominal value per second, 1e-6 allowed; a constant-power "
-                f"load is a conductance below {V_MIN:g} of rated voltage"
+                f"{rate[worst]:.2e} of its nominal value per second, 1e-6 allowed; a constant-"
+                f"power load is a conductance below {V_MIN:g} of rated voltage"
             )
         y = ss.y.unpack(ss.g(x, u, []).full().ravel())
         return GeneratorPoint(ss, x, u, ref, V_t, y, float(abs(rate[worst])))
@@ -373,7 +375,7 @@ class Generator:
         load: Load,
         t_end: float,
         *,
-        switches: Sequence[tuple[float, Load | Ttsc | None | Mapping[str, float]]] = (),
+        switches: Sequence[tuple[float, Load | Ttsc | Mapping[str, float] | None]] = (),
         w_r: float | None = None,
         V_ref: float | None = None,
         dt_out: float = 50e-6,
@@ -586,7 +588,8 @@ def _build(gen: Generator, load_kind: str, faulted: str | None) -> StateSpace:
         Signal(f"v_{k}", "V", f"terminal voltage of phase {k}", nominal=300.0) for k in "abc"
     ]
     if not grounded:
-        algebraic.append(Signal("v_n", "V", "load star point to machine neutral", nominal=100.0))
+        # a difference of phase voltages: megavolts when a switch opens, so the nominal is large
+        algebraic.append(Signal("v_n", "V", "load star point to machine neutral", nominal=1e4))
     if faulted == "coupled":
         algebraic.append(Signal("i_fault", "A", "current of the fault branch", nominal=1e3))
     if leaky:

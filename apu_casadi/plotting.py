@@ -281,7 +281,7 @@ def _segments(
     cuts = [0, *(np.flatnonzero(~same) + 1).tolist()]
     ends = [*cuts[1:], t.size - 1]
     starts = np.array([p["start"] for p in rows])
-    slack = 1.5 * float(np.min(np.diff(t)))
+    slack = 1.5 * float(np.median(np.diff(t)))
 
     def instant(i: int) -> float:
         near = starts[int(np.argmin(np.abs(starts - t[i])))]
@@ -412,6 +412,23 @@ def envelope(t: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.nd
     return (t[cuts] + t[ends]) / 2, np.minimum.reduceat(y, cuts), np.maximum.reduceat(y, cuts)
 
 
+def cycle_rms(t: np.ndarray, y: np.ndarray, cycles: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return middle [s] and rms value of every run of full ``cycles`` of ``y``, at any frequency.
+
+    A cycle runs from one rising zero crossing to the next, so that the values do not ripple where
+    the exchange step holds no whole number of cycles.  Both have the same shape (n,), n maybe 0.
+    """
+    k = np.flatnonzero((y[:-1] < 0.0) & (y[1:] >= 0.0))
+    if k.size < cycles + 1:
+        return np.empty(0), np.empty(0)
+    part = -y[k] / (y[k + 1] - y[k])
+    zero = t[k] + part * (t[k + 1] - t[k])
+    square = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] ** 2 + y[:-1] ** 2) * np.diff(t))])
+    until = square[k] + 0.5 * y[k] ** 2 * part * (t[k + 1] - t[k])
+    span = zero[cycles:] - zero[:-cycles]
+    return zero[:-cycles] + span / 2, np.sqrt((until[cycles:] - until[:-cycles]) / span)
+
+
 def _waves(
     ax: Axes, ds: xr.Dataset, names: Sequence[str], lo: float, hi: float, origin: float
 ) -> None:
@@ -473,8 +490,12 @@ def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str, short: str) 
                 row += 1
         if events:
             _rms_row(fig, outer[row], ds, rms, events, rows, short)
-        more = "Envelope: extremes of every sample. " if waves else ""
-        more += "" if len(rows) <= 4 else "Enlargements: first four phases."
+        more = (
+            "Envelope: extremes of all samples. Enlarged rms: over eight full cycles. "
+            if waves
+            else ""
+        )
+        more += "" if len(rows) <= 4 else "First four phases enlarged."
         _caption(fig, ds, key, more.strip())
     return fig
 
@@ -523,7 +544,7 @@ def _event_row(
     """Draw the waveforms around the beginning of every later phase."""
     from matplotlib.ticker import MultipleLocator
 
-    grid = spec.subgridspec(1, len(events), wspace=0.2)
+    grid = spec.subgridspec(1, len(events), wspace=0.23)
     for k, p in enumerate(events):
         ax = fig.add_subplot(grid[k])
         ink = _colour(k + 1)[1]
@@ -545,8 +566,9 @@ def _rms_row(
     fig: Figure, spec: Any, ds: xr.Dataset, rms: Sequence[str], events: Any, rows: Any, short: str
 ) -> None:
     """Draw the rms values around the beginning of every later phase, each on its own scale."""
-    grid = spec.subgridspec(1, len(events), wspace=0.2)
+    grid = spec.subgridspec(1, len(events), wspace=0.23)
     t = ds["time"].values
+    tw = ds["time_w"].values if "time_w" in ds.coords else None
     for k, p in enumerate(events):
         ax = fig.add_subplot(grid[k])
         ink = _colour(k + 1)[1]
@@ -555,11 +577,18 @@ def _rms_row(
         ax.axvspan(lo, p["start"], color=_colour(k)[0], lw=0, zorder=0)
         ax.axvspan(p["start"], hi, color=_colour(k + 1)[0], lw=0, zorder=0)
         ax.axvline(p["start"], color=ink, lw=1.0, ls=(0, (4, 2)), zorder=1.5)
+        drawn = []
         for name in rms:
-            y = ds[name].values[inside]
-            ax.plot(t[inside], y, color=_ABC[name[2]], lw=_NESTED[name[2]], zorder=3)
+            x, y = t[inside], ds[name].values[inside]
+            if tw is not None:
+                a, b = np.searchsorted(tw, (lo - 1e-9, hi + 1e-9))
+                wave = ds[f"{name[0].lower()}_{name[2]}"].values[a:b]
+                cycles = cycle_rms(tw[a:b], wave, 8)
+                x, y = cycles if cycles[0].size > 1 else (x, y)
+            ax.plot(x, y, color=_ABC[name[2]], lw=_NESTED[name[2]], zorder=3)
+            drawn.append(y)
         ax.set_xlim(lo, hi)
-        _roomy(ax, np.concatenate([ds[n].values[inside] for n in rms]), 0.1)
+        _roomy(ax, np.concatenate(drawn), 0.1)
         _title(ax, f"{_fit(p['name'], 84 // len(events), 1)}: rms, enlarged", ink)
         ax.set_xlabel("Time [s]", labelpad=1)
         if k == 0:

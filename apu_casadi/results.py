@@ -6,6 +6,7 @@ and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for)
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -70,8 +71,8 @@ CHANNELS: Mapping[str, tuple[str, str]] = {
     "k_rf": ("1", "fault resistance over that of the shorted turns (nan: healthy)"),
     "kappa": ("1", "leakage partition of the shorted turns (nan: healthy)"),
     "P_total": ("W", "mean mechanical power of both generators over one exchange (eq 8)"),
-    "P_e": ("W", "mean electrical output over one exchange"),
-    "P_loss_fault": ("W", "mean extra loss of the fault over one exchange"),
+    "P_e": ("W", "mean electrical output of one generator over one exchange"),
+    "P_loss_fault": ("W", "mean extra loss of the fault in one generator over one exchange"),
     **{f"V_{p}_rms": ("V", f"phase {p} voltage, rms over one exchange") for p in "abc"},
     **{f"I_{p}_rms": ("A", f"phase {p} current, rms over one exchange") for p in "abc"},
     **{f"v_{p}": ("V", f"phase {p} terminal voltage") for p in "abc"},
@@ -174,7 +175,8 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     except OSError as e:
         raise DataError(f"{path}: cannot be written: {e.strerror or e}") from e
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
     return path
 
 
@@ -265,10 +267,10 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
 
     Each row holds name, start, end [s] and window [s]; the means over the last 0.5 s of the phase
     (over all of a shorter one) of N_rpm, PW_kW, Wf [kg/s], SFC [kg/(W s)], T3, T4, T5 [K], P3_kPa,
-    SM_percent, V_a_rms ... [V], I_a_rms ... [A], P_e and P_loss_fault [W]; the extremes over the
-    phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at its end; and the
-    severity of the stator fault at its end, always as mu, k_rf, kappa together (and h, which
-    follows from them; k_rf and kappa are None when healthy).
+    SM_percent, V_a_rms ... [V], I_a_rms ... [A], and P_e and P_loss_fault [W] of one generator; the
+    extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
+    its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
+    (and h, which follows from them; k_rf and kappa are None when healthy).
 
     Raises
     ------
@@ -279,17 +281,15 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     if missing:
         raise DataError(f"the dataset lacks {', '.join(missing)}")
     t = ds["time"].values
-    half = 0.5 * float(np.min(np.diff(t)))
+    tol = 1e-9
     col = {v: ds[v].values for v in needed}
     rows = []
-    all_phases = phases(ds)
-    for k, p in enumerate(all_phases):
-        # The sample at a boundary belongs to neither mean: the change may or may not be in it.
-        last = k == len(all_phases) - 1
-        stop = p["end"] + half if last else p["end"] - half
-        whole = (t > p["start"] - half) & (t < stop)
+    for k, p in enumerate(phases(ds)):
+        # a sample is the end of a step: the one at a boundary belongs to the earlier phase
+        before_end = t <= p["end"] + tol
+        whole = ((t > p["start"] + tol) | ((k == 0) & (t >= p["start"] - tol))) & before_end
         window = min(SUMMARY_WINDOW, p["end"] - p["start"])
-        tail = (t > p["end"] - window - half) & (t < stop)
+        tail = (t > p["end"] - window + tol) & before_end
         if not tail.any():
             raise DataError(
                 f"phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no sample; "

@@ -109,7 +109,7 @@ def _simulate(s: Scenario, progress: Progress | None) -> xr.Dataset:
 
     apu = Apu()
     if s.parameters:
-        apu = apu.change(**s.parameters)
+        apu = apu.change(s.parameters)
     return simulate_joint(
         apu,
         duration=s.duration,
@@ -118,7 +118,7 @@ def _simulate(s: Scenario, progress: Progress | None) -> xr.Dataset:
         events=s.events(),
         dt=s.dt,
         waveform_dt=s.waveform_dt,
-        noise=None if s.noise is None else dict(s.noise),
+        noise=None if s.noise is None else s.noise.build(),
         seed=s.seed,
         progress=progress,
     )

@@ -19,8 +19,8 @@ A TOML file reads like this::
 
 A phase keeps what it does not change; ``health = "none"`` and ``fault = "none"`` restore the
 healthy state.  Optional tables: ``[ambient]`` (altitude [m], Mach, dT_isa [K], war),
-``[parameters]`` (dotted names of the unit, as ``machine.r_s``) and ``[noise]`` (standard deviations
-of measured signals, in their SI units).  Errors count phases and events from 1.
+``[parameters]`` (dotted names of the unit, as ``machine.r_s``) and ``[noise]`` (N, w1, w2, and the
+tables gas and terminal: see :class:`NoiseSpec`).  Errors count phases and events from 1.
 
 The attributes of the classes here are the keys of the file, so that both are one description.
 """
@@ -286,6 +286,62 @@ class FaultSpec:
         return Ttsc(mu=self.mu, k_rf=self.k_rf, kappa=self.kappa, phase=self.phase)
 
 
+@dataclass(frozen=True)
+class NoiseSpec:
+    """Uncertainty added to a run, as standard deviations in SI units; zero where not given.
+
+    Parameters
+    ----------
+    N : state noise of the shaft speed per exchange step [rad/s].
+    w1, w2 : voltage noise of stator and rotor equations [V].
+    gas : measurement noise of gas-path outputs by name (``{"T3": 1.0}``).
+    terminal : measurement noise sigma_i [A], sigma_v and sigma_V_fd [V].
+
+    Raises
+    ------
+    ScenarioError : an unknown name under ``terminal``, or a negative or non-finite value.
+    """
+
+    N: float = 0.0
+    w1: float = 0.0
+    w2: float = 0.0
+    gas: Mapping[str, float] = field(default_factory=dict, hash=False)
+    terminal: Mapping[str, float] | None = field(default=None, hash=False)
+
+    def __post_init__(self) -> None:
+        """Check every value; the names under ``gas`` are checked by the simulation."""
+        for k in ("N", "w1", "w2"):
+            number(getattr(self, k), k, lo=0.0)
+        for k in ("gas", "terminal"):
+            table = getattr(self, k)
+            if k == "terminal" and table is None:
+                continue
+            names = _TERMINAL_NOISE if k == "terminal" else tuple(table)
+            checked = {n: number(v, f"{k}.{n}", lo=0.0) for n, v in _table(table, k, names).items()}
+            object.__setattr__(self, k, checked)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Self:
+        """Make the noise from a table; :class:`ScenarioError` for a wrong key or value."""
+        table = _table(data, "noise", tuple(f.name for f in dataclasses.fields(cls)))
+        with _inside("noise"):
+            return cls(**table)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the table that :meth:`from_dict` reads."""
+        return {k: v for k, v in dataclasses.asdict(self).items() if v is not None}
+
+    def build(self) -> Any:
+        """Return the noise of ``apu_casadi.multirate``."""
+        from apu_casadi.generator import MeasurementNoise
+        from apu_casadi.multirate import Noise
+
+        terminal = None if self.terminal is None else MeasurementNoise(**self.terminal)
+        return Noise(N=self.N, w1=self.w1, w2=self.w2, gas=self.gas, terminal=terminal)
+
+
+_TERMINAL_NOISE = ("sigma_i", "sigma_v", "sigma_V_fd")
+
 Health = Mapping[str, float] | Literal["none"]
 Fault = FaultSpec | Literal["none"]
 
@@ -425,15 +481,15 @@ class Scenario:
     title, doc : one line, and more.
     ambient : ambient and flight conditions.
     changes : further changes inside the phases (``[[event]]`` in a file).
-    dt : exchange step of the two parts [s]; every start and change lies on that grid.
+    dt : exchange step of the two parts [s]; a step before a change between two is shortened.
     waveform_dt : sampling step of the waveforms [s]; None for no waveforms (0 in a file).
-    noise : standard deviations of measured signals, by name, in their SI units.
+    noise : process and measurement noise; None for none.
     seed : seed of the noise.
     parameters : changed parameters of the unit, by dotted name (``machine.r_s``).
 
     Raises
     ------
-    ScenarioError : a wrong value; phases out of order, off the grid or beyond the end.
+    ScenarioError : a wrong value; phases out of order or beyond the end.
     """
 
     name: str
@@ -445,7 +501,7 @@ class Scenario:
     changes: tuple[Change, ...] = ()
     dt: float = 0.02
     waveform_dt: float | None = 50e-6
-    noise: Mapping[str, float] | None = field(default=None, hash=False)
+    noise: NoiseSpec | None = None
     seed: int | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
@@ -464,7 +520,6 @@ class Scenario:
         put("dt", number(self.dt, "dt", lo=1e-4, hi=0.2, unit="s"))
         end = number(self.duration, "duration", lo=0.0, hi=3600.0, open_lo=True, unit="s")
         put("duration", end)
-        self._on_grid(end, "duration")
         if self.waveform_dt is not None:
             step = number(self.waveform_dt, "waveform_dt", lo=1e-6, hi=self.dt, unit="s")
             put("waveform_dt", step)
@@ -474,24 +529,12 @@ class Scenario:
             whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
             _require(whole and self.seed >= 0, "seed", f"a whole number >= 0, got {self.seed!r}")
         if self.noise is not None:
-            _require(isinstance(self.noise, Mapping), "noise", f"a table, got {self.noise!r}")
-            sigmas = {str(k): number(v, f"noise.{k}", lo=0.0) for k, v in self.noise.items()}
-            put("noise", MappingProxyType(sigmas))
+            _require(isinstance(self.noise, NoiseSpec), "noise", f"got {self.noise!r}")
         _require(
             isinstance(self.parameters, Mapping), "parameters", f"a table, got {self.parameters!r}"
         )
         put("parameters", MappingProxyType(dict(self.parameters)))
         self._check_order()
-
-    def _on_grid(self, t: float, place: str, note: str = "") -> None:
-        n = round(t / self.dt)
-        if abs(t / self.dt - n) > 1e-6 or (n == 0 and t > 0):
-            raise _PlacedError(
-                place,
-                f"{t:g} s is not a multiple of the exchange step {self.dt:g} s "
-                f"(nearest: {max(n, 1) * self.dt:g})",
-                note,
-            )
 
     def _check_order(self) -> None:
         for attribute, cls in (("phases", Phase), ("changes", Change)):
@@ -526,7 +569,6 @@ class Scenario:
                     f"{p.start:g} s is not before the end of the run at {self.duration:g} s",
                     note,
                 )
-            self._on_grid(p.start, place, note)
             if any(q.name == p.name for q in self.phases[: i - 1]):
                 raise _PlacedError(
                     f"phase[{i}].name", f"{p.name!r} is the name of an earlier phase"
@@ -538,7 +580,6 @@ class Scenario:
                 raise _PlacedError(
                     place, f"{c.time:g} s is not before the end of the run at {self.duration:g} s"
                 )
-            self._on_grid(c.time, place)
             for k in c._changes():
                 if (c.time, k) in taken:
                     raise _PlacedError(
@@ -588,6 +629,8 @@ class Scenario:
             table = _table(data["ambient"], "ambient", names)
             with _inside("ambient"):
                 made["ambient"] = Ambient(**table)
+        if "noise" in data:
+            made["noise"] = NoiseSpec.from_dict(data["noise"])
         if data.get("waveform_dt") == 0 and not isinstance(data["waveform_dt"], bool):
             made["waveform_dt"] = None
         if "parameters" in data:
@@ -677,7 +720,7 @@ class Scenario:
         if self.changes:
             table["event"] = [c.to_dict() for c in self.changes]
         if self.noise is not None:
-            table["noise"] = dict(self.noise)
+            table["noise"] = self.noise.to_dict()
         if self.seed is not None:
             table["seed"] = self.seed
         if self.parameters:

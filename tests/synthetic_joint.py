@@ -53,7 +53,7 @@ def synthetic_joint(*, waveforms=True, end=14.0, waveform_dt=50e-6):
     P3 = 1e3 * (_steps(t, (802.5, 700, 690, 694), 0.3) + _kicks(t, (20.0, -6.0, -2.0), 0.5, 1.6))
     SM = _steps(t, (0.24, 0.345, 0.372, 0.366), 0.3) + _kicks(t, (0.03, -0.01, 0), 0.4, 1.6)
     Wf = _steps(t, (0.0483, 0.029, 0.0312, 0.0318), 0.2)
-    hurt = t >= 10.0
+    hurt = t > 10.0
     V = 229.8 + _kicks(t, (12.0, -1.2, -2.0), 0.15, 0.8)
     I = _steps(t, (326.0, 145.0, 145.0, 145.0)) * V / 229.8
     va, vb, vc = V - 5.2 * hurt, V + 2.1 * hurt, V + 3.1 * hurt
@@ -61,8 +61,8 @@ def synthetic_joint(*, waveforms=True, end=14.0, waveform_dt=50e-6):
     slow = {
         "N": N, "PW": PW, "Wf": Wf, "SFC": Wf / (PW + 30e3), "SNOx": 0.17, "SM": SM,
         "T3": T3, "P3": P3, "T4": T4, "T5": T4 - 350.0, "W2": 3.16, "residual": 1e-9,
-        "f_eta_c": np.where(t >= 6.0, 0.99, 1.0), "f_W_c": np.where(t >= 6.0, 0.97, 1.0),
-        "f_eta_t": np.where(t >= 6.0, 0.98, 1.0), "f_W_t": np.where(t >= 6.0, 1.04, 1.0),
+        "f_eta_c": np.where(t > 6.0, 0.99, 1.0), "f_W_c": np.where(t > 6.0, 0.97, 1.0),
+        "f_eta_t": np.where(t > 6.0, 0.98, 1.0), "f_W_t": np.where(t > 6.0, 1.04, 1.0),
         "mu": np.where(hurt, 0.05, 0.0), "k_rf": np.where(hurt, 20.0, np.nan),
         "kappa": np.where(hurt, 0.05, np.nan), "P_total": PW * 0.95, "P_e": PW * 0.9,
         "P_loss_fault": np.where(hurt, 6.8e3, 0.0),

@@ -50,8 +50,9 @@ def saturation(p: ExciterParameters, E_fd: Any) -> Any:
         return 0.0 * E_fd
     B = math.log(p.S_E1 / p.S_E2) / (p.E_1 - p.E_2)
     A = p.S_E2 * math.exp(-B * p.E_2)
-    exp = ca.exp if isinstance(E_fd, ca.SX | ca.MX | ca.DM) else math.exp
-    return A * exp(B * E_fd)
+    if isinstance(E_fd, ca.SX | ca.MX | ca.DM):
+        return A * ca.exp(B * E_fd)
+    return A * math.exp(min(B * E_fd, 500.0))  # a root search may try any field
 
 
 def exciter_rates(p: ExciterParameters, s: ExciterState, *, V_t: Any, V_ref: Any) -> ExciterState:

@@ -30,8 +30,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from apu_casadi.errors import ParameterError
-from apu_casadi.machine.park import PHASE_ANGLE
 from apu_casadi.machine.parameters import MachineParameters
+from apu_casadi.machine.park import PHASE_ANGLE
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,9 @@ class Ttsc:
         if self.k_rf < 0:
             raise ParameterError(f"Ttsc.k_rf = {self.k_rf:g} must be >= 0")
         if not self.mu <= self._kappa <= 1:
-            raise ParameterError(f"Ttsc.kappa = {self.kappa:g} is outside [mu, 1] = [{self.mu:g}, 1]")
+            raise ParameterError(
+                f"Ttsc.kappa = {self.kappa:g} is outside [mu, 1] = [{self.mu:g}, 1]"
+            )
         if self.phase not in PHASE_ANGLE:
             raise ParameterError(f"Ttsc.phase must be 'a', 'b' or 'c', got {self.phase!r}")
 

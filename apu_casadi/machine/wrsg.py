@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apu_casadi.machine.park import Qd0, speed_voltage
 from apu_casadi.machine.parameters import MachineParameters
+from apu_casadi.machine.park import Qd0, speed_voltage
 
 
 class Windings(NamedTuple):

@@ -11,7 +11,11 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Protocol, cast
 
-MODULES: tuple[str, ...] = ("scenarios.commands.list", "scenarios.commands.run")
+MODULES: tuple[str, ...] = (
+    "scenarios.commands.list",
+    "scenarios.commands.run",
+    "scenarios.commands.validate",
+)
 """The modules of the subcommands, in the order of the help text; add new ones here."""
 
 

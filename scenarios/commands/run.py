@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -37,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     if args.no_waveforms:
         s = s.change(waveform_dt=None)
     folder = registry.prepare(args.out or f"results/{s.name}")
-    with _bar(s.name, s.duration, show=not args.quiet and sys.stderr.isatty()) as progress:
+    show = not args.quiet and sys.stderr.isatty()
+    with _bar(s.name, s.duration, show=show) as bar, _stoppable(bar) as progress:
         ds = registry.run(s, progress=progress)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
@@ -53,16 +57,52 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+Progress = Callable[[float, float], None]
+
+
 @contextmanager
-def _bar(name: str, total: float, *, show: bool) -> Iterator[Callable[[float, float], None] | None]:
-    """Yield a callback that moves a progress bar on stderr, or None."""
+def _stoppable(inner: Progress) -> Iterator[Progress]:
+    """Let Ctrl-C stop the run between two exchange steps; a second one stops it at once.
+
+    Inside an integrator it would come out as a failure of the right-hand side.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield inner
+        return
+    asked = threading.Event()
+
+    def handler(*_: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    def progress(done: float, total: float) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        inner(done, total)
+
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield progress
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked.is_set():
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _bar(name: str, total: float, *, show: bool) -> Iterator[Progress]:
+    """Yield a callback that moves a progress bar on stderr, or does nothing."""
     if not show:
-        yield None
+        yield lambda done, total: None
         return
     from tqdm import tqdm
 
     form = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:g} s simulated [{elapsed}<{remaining}]"
-    with tqdm(total=total, desc=name, bar_format=form, file=sys.stderr, leave=True) as bar:
+    columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
+    with tqdm(
+        total=total, desc=name, bar_format=form, ncols=columns, nrows=24, file=sys.stderr
+    ) as bar:
 
         def progress(done: float, _: float) -> None:
             bar.update(min(done, total) - bar.n)
@@ -95,8 +135,8 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("I rms a [A]", lambda r: f"{r['I_a_rms']:.2f}"),
     ("      b", lambda r: f"{r['I_b_rms']:.2f}"),
     ("      c", lambda r: f"{r['I_c_rms']:.2f}"),
-    ("electrical output [kW]", lambda r: f"{r['P_e'] / 1e3:.2f}"),
-    ("fault loss [kW]", lambda r: f"{r['P_loss_fault'] / 1e3:.3f}"),
+    ("output of each [kW]", lambda r: f"{r['P_e'] / 1e3:.2f}"),
+    ("fault loss of each [kW]", lambda r: f"{r['P_loss_fault'] / 1e3:.3f}"),
     ("f_eta_c, f_W_c", lambda r: f"{r['f_eta_c']:g}, {r['f_W_c']:g}"),
     ("f_eta_t, f_W_t", lambda r: f"{r['f_eta_t']:g}, {r['f_W_t']:g}"),
     ("TTSC mu [%]", lambda r: f"{100 * r['mu']:g}" if r["mu"] else "healthy"),

@@ -1,0 +1,130 @@
+"""The console command: listing, running (on a stand-in simulation), refusing."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+from synthetic_joint import synthetic_joint
+
+from apu_casadi import results
+from apu_casadi.errors import OperatingPointError
+from scenarios import cli, registry
+
+
+@pytest.fixture
+def fake(monkeypatch, tmp_path):
+    """Replace the simulation; work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def simulate(s, progress):
+        if progress:
+            for k in range(15):
+                progress(float(k), 14.0)
+        return synthetic_joint(waveforms=s.waveform_dt is not None)
+
+    monkeypatch.setattr(registry, "_simulate", simulate)
+
+
+def test_list(capsys):
+    assert cli.main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("joint ")
+    assert cli.main(["list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["name"] == "joint"
+
+
+def test_list_loads_nothing_heavy():
+    code = (
+        "import sys; from scenarios.cli import main; main(['list'])\n"
+        "print([m for m in ('xarray', 'matplotlib', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_run_prints_the_phases_and_writes_everything(fake, capsys, tmp_path):
+    assert cli.main(["run", "joint"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""  # stderr is no terminal here: no progress bar
+    for words in ("design point", "TTSC fault", "shaft speed [r/min]", "k_rf", "kappa", "T4 [K]"):
+        assert words in out
+    folder = tmp_path / "results" / "joint"
+    names = {p.name for p in folder.iterdir()}
+    assert {"joint.nc", "summary.json", "fig20_phases.png", "fig25_voltages.png"} <= names
+    assert len(names) == 8
+    ds = results.load(folder / "joint.nc")
+    assert json.loads(ds.attrs["scenario"])["phase"][3]["fault"]["k_rf"] == 20.0
+
+
+def test_json_is_all_that_is_printed(fake, capsys, tmp_path):
+    assert cli.main(["run", "joint", "--json", "--no-figures", "--out", "here"]) == 0
+    out = capsys.readouterr().out
+    report = json.loads(out)
+    assert report["phases"][3]["mu"] == 0.05 and report["phases"][0]["k_rf"] is None
+    assert {p.name for p in (tmp_path / "here").iterdir()} == {"joint.nc", "summary.json"}
+    assert json.loads((tmp_path / "here" / "summary.json").read_text()) == report
+
+
+def test_no_waveforms(fake, capsys, tmp_path):
+    assert cli.main(["run", "joint", "--no-waveforms", "--no-figures", "--quiet"]) == 0
+    assert "time_w" not in results.load(tmp_path / "results" / "joint" / "joint.nc").coords
+    assert "written" not in capsys.readouterr().out
+
+
+def test_progress_bar_goes_to_a_terminal_s_stderr(fake, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    assert cli.main(["run", "joint", "--no-figures"]) == 0
+    assert "14.00/14 s simulated" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["run", "jont"], "unknown scenario 'jont' (did you mean 'joint'?)"),
+        (["run", "none.toml"], "none.toml: scenario file cannot be read"),
+        (["run", "joint", "--out", "file/x"], "cannot make the folder for results"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(fake, capsys, tmp_path, argv, message):
+    (tmp_path / "file").write_text("")
+    assert cli.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("apu: error: ") and message in err
+    assert err.count("\n") == 1
+
+
+def test_usage_errors_and_version(capsys):
+    assert cli.main([]) == 2
+    assert cli.main(["rnu"]) == 2
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("apu-casadi ")
+
+
+def test_ctrl_c_in_a_run_waits_for_the_exchange_step(fake, capsys, monkeypatch):
+    def simulate(s, progress):
+        signal.raise_signal(signal.SIGINT)  # as if inside the integrator: no exception here
+        progress(1.0, 14.0)
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(registry, "_simulate", simulate)
+    assert cli.main(["run", "joint"]) == 130
+    assert capsys.readouterr().err.startswith("apu: interrupted")
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_failed_simulation_is_status_1_and_interrupt_130(fake, capsys, monkeypatch):
+    def fails(*_):
+        raise OperatingPointError("beyond surge at 3.2 s")
+
+    monkeypatch.setattr(registry, "_simulate", fails)
+    assert cli.main(["run", "joint"]) == 1
+    assert capsys.readouterr().err == "apu: error: beyond surge at 3.2 s\n"
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(registry, "_simulate", interrupted)
+    assert cli.main(["run", "joint"]) == 130
+    assert "interrupted" in capsys.readouterr().err

@@ -1,0 +1,182 @@
+"""Who may import whom: the folders and modules form layers, and imports point downwards.
+
+The rules are the tables below.  Every import counts, also one inside a function or under
+TYPE_CHECKING: a dependency is a dependency.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("apu_casadi", "estimators", "scenarios")
+
+# Bottom first.  A module may import the layers below its own, and its neighbours only if NEIGHBOURS
+# says so.  "components" and "machine" stand for all modules in these folders.
+LAYERS = (
+    ("errors",),
+    ("signals", "parameters"),
+    ("statespace", "results"),
+    # solvers: they know nothing of turbines or windings, since those come above
+    ("rootfinding", "discretisation", "simulation"),
+    ("gas", "mapfiles"),
+    ("atmosphere", "maps"),
+    ("components", "machine"),
+    ("gasgenerator", "generator"),
+    ("trimming",),
+    ("control", "events"),
+    ("apu",),
+    ("multirate",),
+)
+NEIGHBOURS = {
+    "components": {"components"},
+    "machine": {"machine"},
+}
+# These see less than their place in LAYERS would let them.  They are not in LAYERS, and nothing in
+# apu_casadi imports them.
+ONLY = {
+    "plotting": {"results", "errors"},
+}
+# apu_casadi/__init__.py is the front door: it names modules, and no module comes in through it.
+ESTIMATORS = {"statespace", "signals", "results", "errors"}
+MATPLOTLIB = {"apu_casadi/plotting.py"}
+
+RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}
+
+
+def imports(path: Path) -> list[tuple[int, str]]:
+    """Return (line, dotted module) of every import; ``from package import module`` is resolved."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, a.name) for a in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                found.append((node.lineno, "." * node.level + (node.module or "")))
+                continue
+            module = node.module or ""
+            for a in node.names:
+                inner = ROOT.joinpath(*module.split("."), a.name)
+                is_module = inner.with_suffix(".py").exists() or (inner / "__init__.py").exists()
+                found.append((node.lineno, f"{module}.{a.name}" if is_module else module))
+    return sorted(set(found))
+
+
+def unit_of(dotted: str) -> str:
+    """``apu_casadi.machine.load`` -> ``machine``; ``apu_casadi`` -> ``""``, the front door."""
+    return (dotted.split(".") + [""])[1]
+
+
+def own_unit(path: Path) -> str:
+    """Return the unit that a file of apu_casadi belongs to."""
+    return path.relative_to(ROOT / "apu_casadi").parts[0].removesuffix(".py").replace("__init__", "")
+
+
+def verdict(path: Path, module: str) -> str | None:
+    """Return what is wrong with the import of ``module`` by ``path``; None if it is allowed."""
+    package = path.relative_to(ROOT).parts[0]
+    top = module.split(".")[0]
+    if module.startswith("."):
+        return "relative import; write the absolute one"
+    if top in ("tests", "notebooks"):
+        return f"nothing imports {top}"
+    if top == "matplotlib" and path.relative_to(ROOT).as_posix() not in MATPLOTLIB:
+        return "only apu_casadi.plotting uses matplotlib; draw there"
+    if top not in PACKAGES or package == "scenarios":
+        return None
+    if top == "scenarios":
+        return "nothing imports scenarios; move what is shared down into apu_casadi"
+    target = unit_of(module)
+    if package == "estimators":
+        if top == "estimators" or target in ESTIMATORS:
+            return None
+        return f"estimators import only {', '.join(sorted(ESTIMATORS))} of apu_casadi"
+    if top == "estimators":
+        return "apu_casadi does not know estimators"
+    mine = own_unit(path)
+    if mine in ("", "data"):
+        return None if mine == "" else "data holds no code"
+    if target == "":
+        return "name the module (from apu_casadi.signals import Signals), not the package"
+    if target in ONLY:
+        return f"nothing in apu_casadi imports {target}"
+    if mine in ONLY:
+        if target in ONLY[mine]:
+            return None
+        return f"{mine} sees only {', '.join(sorted(ONLY[mine]))}"
+    unplaced = [u for u in (mine, target) if u not in RANK]
+    if unplaced:
+        return f"{unplaced[0]} has no layer: give it one in LAYERS of {Path(__file__).name}"
+    if RANK[target] < RANK[mine] or target in NEIGHBOURS.get(mine, ()):
+        return None
+    how = "upward" if RANK[target] > RANK[mine] else "sideways"
+    return f"{how} import: {mine} is in layer {RANK[mine]}, {target} in layer {RANK[target]}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_point_downwards(package):
+    """The tables above; every offence is listed with its line."""
+    wrong = []
+    for path in sorted((ROOT / package).rglob("*.py")):
+        for line, module in imports(path):
+            why = verdict(path, module)
+            if why:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} imports {module}: {why}")
+    assert not wrong, "\n" + "\n".join(wrong)
+
+
+def test_every_module_has_a_place():
+    """A new module must be put into a layer, or the rules would silently pass it over."""
+    units = {own_unit(p) for p in (ROOT / "apu_casadi").rglob("*.py")} - {"", "data"}
+    missing = units - set(RANK) - set(ONLY)
+    assert not missing, f"no layer for {', '.join(sorted(missing))}: extend LAYERS in {__file__}"
+    gone = (set(RANK) | set(ONLY)) - units
+    assert not gone, f"LAYERS or ONLY name modules that do not exist: {', '.join(sorted(gone))}"
+
+
+def test_inner_packages_are_empty():
+    """Names have one home: only the front door re-exports."""
+    for path in (ROOT / "apu_casadi").glob("*/__init__.py"):
+        assert not ast.parse(path.read_text(encoding="utf-8")).body, f"{path} must stay empty"
+
+
+@pytest.mark.parametrize(
+    ("path", "module", "words"),
+    [
+        ("apu_casadi/signals.py", "apu_casadi.gas", "upward import: signals is in layer 1"),
+        ("apu_casadi/simulation.py", "apu_casadi.generator", "upward"),
+        ("apu_casadi/machine/wrsg.py", "apu_casadi.components.shaft", "sideways"),
+        ("apu_casadi/components/shaft.py", "apu_casadi.machine.park", "sideways"),
+        ("apu_casadi/generator.py", "apu_casadi.gasgenerator", "sideways"),
+        ("apu_casadi/plotting.py", "apu_casadi.apu", "plotting sees only errors, results"),
+        ("apu_casadi/apu.py", "apu_casadi.plotting", "nothing in apu_casadi imports plotting"),
+        ("apu_casadi/apu.py", "apu_casadi", "name the module"),
+        ("apu_casadi/apu.py", "scenarios.schema", "nothing imports scenarios"),
+        ("apu_casadi/apu.py", "estimators.ekf", "does not know estimators"),
+        ("estimators/ekf.py", "apu_casadi.generator", "estimators import only"),
+        ("scenarios/cli.py", "tests.test_cli", "nothing imports tests"),
+        ("scenarios/cli.py", "matplotlib.pyplot", "only apu_casadi.plotting"),
+        ("scenarios/cli.py", ".commands", "relative"),
+        ("apu_casadi/apu.py", "apu_casadi.brandnew", "brandnew has no layer"),
+    ],
+)
+def test_the_rules_bite(path, module, words):
+    """Forbidden imports, one of each kind: a rule that never fires guards nothing."""
+    assert words in (verdict(ROOT / path, module) or "")
+
+
+@pytest.mark.parametrize(
+    ("path", "module"),
+    [
+        ("apu_casadi/machine/wrsg.py", "apu_casadi.machine.park"),
+        ("apu_casadi/multirate.py", "apu_casadi.trimming"),
+        ("estimators/ekf.py", "apu_casadi.statespace"),
+        ("estimators/ekf.py", "estimators.belief"),
+        ("scenarios/cli.py", "apu_casadi.apu"),
+        ("apu_casadi/apu.py", "numpy"),
+    ],
+)
+def test_the_rules_let_through(path, module):
+    """Imports that the house design allows."""
+    assert verdict(ROOT / path, module) is None
