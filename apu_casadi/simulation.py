@@ -82,7 +82,7 @@ class Stepper:
     max_steps : solver steps allowed between two outputs.
     """
 
-    def __init__(  # noqa: D107 (the class says it)
+    def __init__(
         self,
         ss: StateSpace,
         grid: np.ndarray,
@@ -93,6 +93,7 @@ class Stepper:
         atol: float = ATOL,
         max_steps: int = 1_000_000,
     ) -> None:
+        """Build the integrator; see the class for the arguments."""
         if solver not in SOLVERS:
             raise SimulationError(f"unknown solver {solver!r} {nearest(solver, SOLVERS)}")
         self.ss = ss
@@ -215,7 +216,7 @@ class Stepper:
             solver=self.solver,
             rtol=self.rtol,
             atol=self.atol,
-            max_steps=self._max_steps,
+            max_steps=20_000,
         )
         good, bad, last = 0.0, 1.0, x0
         for _ in range(10):
@@ -231,7 +232,7 @@ class Stepper:
         name = self.ss.x.names[worst]
         return SimulationError(
             f"{self.ss.name}: {self.solver} failed with {code} between t = {t0:.6g} and "
-            f"{t0 + dt:.6g} s; it gets as far as t = {t0 + good * dt:.6g} s, where the largest "
+            f"{t0 + dt:.6g} s; it gets at least as far as t = {t0 + good * dt:.6g} s, where the largest "
             f"state is {name} = {last[worst]:.4g} {self.ss.x[name].unit} "
             f"({last[worst] / self.ss.x[name].nominal:.3g} of nominal). Likely cause: {cause}"
         )

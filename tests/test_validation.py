@@ -1,0 +1,40 @@
+"""The validation sections themselves: every row within its tolerance, and honest bookkeeping."""
+
+import math
+
+import pytest
+
+from apu_casadi.errors import ScenarioError
+from scenarios import validation
+from scenarios.validation import Row
+
+
+@pytest.mark.parametrize("name", ["table4", "table5", "table7", "table8", "generator", "conservation"])
+def test_every_row_is_within_its_tolerance(name):
+    """The goals of the tables and checks; ``apu validate`` prints the rows."""
+    rows = validation.run(name)
+    short = [f"{r.quantity}: {r.error:+.2e} > {r.tolerance:.0e}" for r in rows if not r.passed]
+    assert not short, short
+    assert rows
+
+
+def test_rows_that_were_fitted_are_not_called_predicted():
+    """Table 5: what the six map numbers were fitted to is marked calibrated."""
+    kinds = {r.quantity: r.kind for r in validation.run("table5")}
+    for fitted in ("W2", "W3", "T3", "P3", "T5", "T8", "HPCSM"):
+        assert kinds[fitted] == "calibrated"
+    assert kinds["Wf" if "Wf" in kinds else "SFC"] == "predicted"
+
+
+def test_a_row_with_a_bad_number_does_not_pass():
+    """NaN is a failure, not a pass."""
+    row = Row("x", "1", 1.0, math.nan, math.nan, 1e-3, "", "predicted")
+    assert not row.passed
+    with pytest.raises(ScenarioError, match="predicted"):
+        Row("x", "1", 1.0, 1.0, 0.0, 1e-3, "", "predictd")
+
+
+def test_unknown_sections_are_refused_with_the_nearest():
+    """A typo is answered with the section meant."""
+    with pytest.raises(ScenarioError, match="table5"):
+        validation.run("tabel5")
