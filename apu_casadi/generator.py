@@ -593,8 +593,7 @@ def _build(gen: Generator, load_kind: str, faulted: str | None) -> StateSpace:
     if faulted == "coupled":
         algebraic.append(Signal("i_fault", "A", "current of the fault branch", nominal=1e3))
     if leaky:
-        # up to 1e8; its rounding with an open generator, 1e-2, must stay below the tolerance
-        algebraic.append(Signal("di_fault", "A/s", "rate of i_fault", nominal=1e10))
+        algebraic.append(Signal("di_fault", "A/s", "rate of i_fault", nominal=1e8))
     Z = Signals(algebraic)
     (xv, x), (zv, z), (uv, u), (tv, th) = X.sx(), Z.sx(), U.sx(), TH.sx()
 

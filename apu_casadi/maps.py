@@ -20,8 +20,10 @@ law.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -287,8 +289,29 @@ class ScaledMap:
     @cached_property
     def function(self) -> ca.Function:
         """(n, beta, RNI) -> W, PR, eta, off, and for a compressor SM."""
-        t, cal = self.table, self.cal
         n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
+        out = self._bent(n, beta, RNI, self.cal)
+        names = ["n", "beta", "RNI"]
+        return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
+
+    @cached_property
+    def calibrated(self) -> ca.Function:
+        """As ``function`` with the numbers of the calibration as fourth argument.
+
+        (n, beta, RNI, cal) with cal of shape (6,) in the order of :class:`MapCalibration`'s fields,
+        for derivatives by them.
+        """
+        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
+        fields = [f.name for f in dataclasses.fields(MapCalibration)]
+        cal = ca.MX.sym("cal", len(fields))
+        numbers = SimpleNamespace(**dict(zip(fields, ca.vertsplit(cal), strict=True)))
+        out = self._bent(n, beta, RNI, numbers)
+        args, names = [n, beta, RNI, cal], ["n", "beta", "RNI", "cal"]
+        return ca.Function("calibrated_map", args, list(out.values()), names, list(out))
+
+    def _bent(self, n: ca.MX, beta: ca.MX, RNI: ca.MX, cal: Any) -> dict[str, ca.MX]:
+        """Return the outputs by name, with the numbers of ``cal`` floats or symbols."""
+        t = self.table
         _, des = _log_map(t)(self.N_map_des, self.beta_des)
         N_held, y = _log_map(t)(self.N_map_des * n, beta)
         held = N_held / self.N_map_des  # > 0, so that powers of it exist
@@ -299,14 +322,13 @@ class ScaledMap:
         droop = cal.c_PR * (y[1] - des[1]) ** 2 + cal.c_N * (held - 1) ** 2
         eta = 1 - (1 - self.eta_des * rel[2] * ca.exp(-droop)) * RNI ** (-cal.n_Re)
         off = off_function(t)(self.N_map_des * n, beta)[0]
-        out, names = [W, PR, eta, off], ["W", "PR", "eta", "off"]
+        out = {"W": W, "PR": PR, "eta": eta, "off": off}
         if t.kind == "compressor":
             W_map = W / self.W_des * ca.exp(des[0])
             surge = (surge_function(t)(W_map) - 1) * (self.PR_des - 1) / ca.exp(des[1])
             PR_surge = 1 + surge * cal.k_SM * held**cal.a_SM
-            out.append(PR_surge / PR - 1)
-            names.append("SM")
-        return ca.Function("scaled_map", [n, beta, RNI], out, ["n", "beta", "RNI"], names)
+            out["SM"] = PR_surge / PR - 1
+        return out
 
     def lookup(self, n: Any, beta: Any, RNI: Any = 1.0) -> MapPoint:
         """Read the map.

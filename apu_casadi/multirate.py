@@ -6,6 +6,11 @@ goes back through the gearbox.  Event instants are put on the exchange grid: the
 shortened, so that load, health and fault change exactly when they are meant to.
 
 At an instant shared by two steps the values stored are those at the end of the earlier one.
+
+The paper's exchange holds the speed that the machine sees, and the fuel, at their values at the
+beginning of the step: half a step late on average, hence an error of first order in the step
+(docs/MULTIRATE.md).  ``exchange="predicted"`` takes both at the middle of the step, where the
+speed is predicted by its last slope; the error is then of second order at the same price.
 """
 
 from __future__ import annotations
@@ -45,9 +50,16 @@ if TYPE_CHECKING:
     from apu_casadi.machine.ttsc import Ttsc
 
 WAVEFORMS = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_total")
-_RMS = {"V_a_rms": "v_a^2", "V_b_rms": "v_b^2", "V_c_rms": "v_c^2",
+RMS = {"V_a_rms": "v_a^2", "V_b_rms": "v_b^2", "V_c_rms": "v_c^2",
         "I_a_rms": "i_a^2", "I_b_rms": "i_b^2", "I_c_rms": "i_c^2"}  # fmt: skip
-_MEANS = ("P_total", "P_e", "P_loss_fault")
+MEANS = ("P_total", "P_e", "P_loss_fault")
+EXCHANGES = {
+    "paper": (False, False),
+    "predicted": (True, True),
+    "predicted speed": (True, False),
+    "predicted fuel": (False, True),
+}
+"""Exchange by name: is the machine's speed, and is the fuel, taken at the predicted mid-step?"""
 _GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
@@ -106,6 +118,7 @@ def simulate_joint(
     fault: Ttsc | None = None,
     events: Sequence[Event] = (),
     dt: float = 0.02,
+    exchange: str = "paper",
     waveform_dt: float | None = 50e-6,
     noise: Noise | None = None,
     seed: int | None = None,
@@ -131,6 +144,10 @@ def simulate_joint(
     fault : stator fault from the start, None: healthy.
     events : :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`.
     dt : exchange step, s.
+    exchange : ``"paper"``: eqs. (1)-(2) as printed, speed and fuel from the beginning of the step;
+        ``"predicted"``: both at mid-step, second order.  The step after an event is then computed
+        twice, since no slope is known there.  (``"predicted speed"`` and ``"predicted fuel"`` do
+        half of it, to tell the two errors apart.)  Energy is handed over exactly in each.
     waveform_dt : sampling of the stored waveforms, s; None stores none.
     noise, seed : uncertainty and the seed of its random numbers.
     hook : processes the rotor speed between state update and output (Algorithm 2).
@@ -149,6 +166,9 @@ def simulate_joint(
     OperatingPointError : no steady start.
     SimulationError : an integration or a cycle solution failed; says when and why.
     """
+    if exchange not in EXCHANGES:
+        raise ScenarioError(f"exchange {exchange!r} {nearest(exchange, EXCHANGES)}")
+    mid_speed, mid_fuel = EXCHANGES[exchange]
     gg, gen = apu.gas_generator, apu.generator
     ambient = Ambient() if ambient is None else ambient
     noise = Noise() if noise is None else noise
@@ -176,12 +196,12 @@ def simulate_joint(
     K = grid.size - 1
     Y = np.empty((len(gg.Y), K + 1))
     Y[:, 0] = y
-    slow = {k: np.empty(K + 1) for k in (*_MEANS, *_RMS, "mu", "k_rf", "kappa", *gg.THETA.names)}
+    slow = {k: np.empty(K + 1) for k in (*MEANS, *RMS, "mu", "k_rf", "kappa", *gg.THETA.names)}
     waves: dict[str, list[np.ndarray]] = {k: [] for k in WAVEFORMS}
     t_waves: list[np.ndarray] = []
     pending = list(events)
     now_load, now_fault = start_load, None
-    worst_f, steps_sg = 0.0, 0
+    steps_sg = 0
 
     def switch(new_load: Load, new_fault: Ttsc | None) -> None:
         nonlocal ss, x_sg, u_sg, th_sg, now_load, now_fault
@@ -192,9 +212,9 @@ def simulate_joint(
         now_load, now_fault = new_load, new_fault
 
     def record(k: int, means: Mapping[str, float]) -> None:
-        for name in _MEANS:
+        for name in MEANS:
             slow[name][k] = means[name]
-        for name, square in _RMS.items():
+        for name, square in RMS.items():
             slow[name][k] = math.sqrt(means[square])
         for name in gg.THETA.names:
             slow[name][k] = factors[name]
@@ -205,19 +225,21 @@ def simulate_joint(
 
     y0 = point.generator.y
     V, I = y0["V_t"], math.hypot(*(y0[f"i_{p}"] for p in "abc")) / math.sqrt(3.0)
-    record(0, {**{n: y0[n] for n in _MEANS}, **dict.fromkeys(("v_a^2", "v_b^2", "v_c^2"), V**2),
+    record(0, {**{n: y0[n] for n in MEANS}, **dict.fromkeys(("v_a^2", "v_b^2", "v_c^2"), V**2),
                **dict.fromkeys(("i_a^2", "i_b^2", "i_c^2"), I**2)})  # fmt: skip
     if waveform_dt is not None:
         t_waves.append(np.zeros(1))
         for name in WAVEFORMS:
             waves[name].append(np.array([y0[name]]))
+    slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
     if load != start_load or fault is not None:
         switch(load, fault)
+        slope = None
 
     for k in range(1, K + 1):
         t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
         while pending and pending[0].t <= t0 + _GRID_TOL:
-            event = pending.pop(0)
+            event, slope = pending.pop(0), None
             if isinstance(event, HealthChange):
                 factors.update(event.factors)
                 theta = gg.THETA.pack(factors)
@@ -225,28 +247,40 @@ def simulate_joint(
                 switch(event.load, now_fault)
             elif isinstance(event, FaultChange):
                 switch(now_load, event.fault)
-        # generators over [t0, t0 + h] at constant speed (eq. 2)
-        w_r = apu.w_r(float(x[0]))
         more = {}
         if noise.w1 or noise.w2:
             w1, w2 = noise.w1 * rng.standard_normal(3), noise.w2 * rng.standard_normal(3)
             more = dict(zip(("w1_q", "w1_d", "w1_0", "w2_fd", "w2_kd", "w2_kq"),
                             [*w1, *w2], strict=True))  # fmt: skip
-        u_sg = gen.inputs(now_load, w_r=w_r, V_ref=V_ref, **more)
         n_out = 1 if waveform_dt is None else max(1, round(h / waveform_dt))
-        step = stepper(ss, n_out, quad=(*_MEANS, *_RMS.values()), solver=solver, rtol=rtol, atol=atol)
-        r = step(x_sg, u_sg, th_sg, h, t0=t0)
-        steps_sg += int(r.stats.get("nsteps", 0))
+        step = stepper(ss, n_out, quad=(*MEANS, *RMS.values()), solver=solver, rtol=rtol, atol=atol)
+        N, u = float(x[0]), u.copy()
+        passes = 2 if slope is None and (mid_speed or mid_fuel) else 1
+        slope = slope or 0.0
+        for _ in range(passes):
+            N_mid = N + h / 2 * slope
+            # generators over [t0, t0 + h] at constant speed (eq. 2)
+            w_r = apu.w_r(N_mid if mid_speed else N)
+            u_sg = gen.inputs(now_load, w_r=w_r, V_ref=V_ref, **more)
+            r = step(x_sg, u_sg, th_sg, h, t0=t0)
+            steps_sg += int(r.stats.get("nsteps", 0))
+            # fuel held over the step, shaft power by eq. (1), then the gas generator's step
+            fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
+            if mid_fuel:
+                Wf_I_mid = Wf_I + h / 2 * float(fuel.Wf_I_dot)
+                fuel = governor(N=N_mid, N_ref=apu.N_ref, Wf_I=Wf_I_mid, par=apu.governor)
+            u[0], u[1] = float(fuel.Wf), apu.PW(r.mean["P_total"])
+            try:
+                x_new, z_new = gg.state_update(x, u, theta, z0=z, dt=h)
+            except SimulationError as error:
+                raise SimulationError(f"at t = {grid[k]:.6g} s: {error}") from None
+            slope = (float(x_new[0]) - N) / h
         x_sg = r.x_end.copy()
         j = ss.x.index("theta_e")
         x_sg[j] = math.remainder(x_sg[j], 2 * math.pi)
-        # fuel from the speed at t0, shaft power by eq. (1), then the gas generator's step
-        fuel = governor(N=float(x[0]), N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
         Wf_I = Wf_I + h * float(fuel.Wf_I_dot)
-        u = u.copy()
-        u[0], u[1] = float(fuel.Wf), apu.PW(r.mean["P_total"])
+        x, z = x_new, z_new
         try:
-            x, z = gg.state_update(x, u, theta, z0=z, dt=h)
             if noise.N:
                 x = x + noise.N * rng.standard_normal(1)
             if hook is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -634,3 +634,88 @@ def save_figures(ds: xr.Dataset, folder: str | os.PathLike[str]) -> list[Path]:
         draw(ds).savefig(path, dpi=DPI)
         made.append(path)
     return made
+
+
+_CASE_INK = ("#0b5394", "#b45309", "#0f766e", "#7a3e9d")
+_MARKS = ("o", "s", "^", "D")
+
+
+def figure_exchange_error(
+    curves: Mapping[tuple[str, str], tuple[np.ndarray, Mapping[str, np.ndarray]]],
+    quantities: Mapping[str, str],
+    *,
+    mark: float = 0.020,
+) -> Figure:
+    """Draw errors over the exchange step, one logarithmic panel for each quantity.
+
+    Parameters
+    ----------
+    curves : by (case, exchange), steps [s] and errors by quantity, arrays of one shape (n,).
+    quantities : panels, by name with their title; four at most.
+    mark : step [s] that is marked: the paper's.
+    """
+    import matplotlib as mpl
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import FixedLocator, NullLocator
+
+    cases = list(dict.fromkeys(case for case, _ in curves))
+    exchanges = list(dict.fromkeys(ex for _, ex in curves))
+    dash = dict(zip(exchanges, ("-", (0, (4, 2)), (0, (1, 1.5))), strict=False))
+    steps = np.unique(np.concatenate([dt for dt, _ in curves.values()]))
+    with mpl.rc_context(_STYLE):
+        fig = _figure(7.4)
+        grid = fig.add_gridspec(
+            2, 2, left=0.085, right=0.985, hspace=0.34, wspace=0.2,
+            **_margins(fig, top=0.85, bottom=1.0),
+        )  # fmt: skip
+        for k, (q, title) in enumerate(quantities.items()):
+            ax = fig.add_subplot(grid[k // 2, k % 2])
+            for (case, ex), (dt, errors) in curves.items():
+                c = cases.index(case)
+                ax.loglog(
+                    1e3 * dt, errors[q], color=_CASE_INK[c], ls=dash[ex], marker=_MARKS[c], ms=4.5,
+                    mfc=_CASE_INK[c] if ex == exchanges[0] else "white", lw=1.5,
+                )  # fmt: skip
+            every = np.concatenate([errors[q] for _, errors in curves.values()])
+            _slopes(ax, steps, every)
+            ax.axvline(1e3 * mark, color=_MUTED, lw=0.9, zorder=0.5)
+            ax.xaxis.set_major_locator(FixedLocator(list(1e3 * steps)))
+            ax.xaxis.set_minor_locator(NullLocator())
+            ax.set_xticklabels([f"{1e3 * s:g}" for s in steps])
+            ax.set_xlim(1e3 * steps[0] / 1.25, 1e3 * steps[-1] * 1.25)
+            ax.set_ylim(every.min() / 2, every.max() * 2)
+            _title(ax, title[0].upper() + title[1:], _INK)
+            if k % 2 == 0:
+                ax.set_ylabel("Largest relative error")
+            if k >= len(quantities) - 2:
+                ax.set_xlabel("Exchange step [ms]")
+        handles = [
+            Line2D([], [], color=_CASE_INK[k], marker=_MARKS[k], ms=4.5, lw=1.5, label=case)
+            for k, case in enumerate(cases)
+        ] + [
+            Line2D([], [], color=_INK, ls=dash[ex], marker="o", ms=4.5, lw=1.5,
+                   mfc=_INK if ex == exchanges[0] else "white", label=f"exchange “{ex}”")
+            for ex in exchanges
+        ]  # fmt: skip
+        fig.legend(
+            handles=handles, loc="upper center", ncols=len(handles), frameon=False, fontsize=9,
+            bbox_to_anchor=(0.53, 1.0), columnspacing=1.6, handlelength=2.4,
+        )  # fmt: skip
+        text = (
+            "Error of the multi-rate exchange against the unit as one model with one solver. "
+            "Grey: slopes 1 and 2. Vertical line: the paper's 20 ms."
+        )
+        fig.text(0.012, 0.10 / fig.get_figheight(), textwrap.fill(text, 160), fontsize=8.2,
+                 color=_MUTED, va="bottom")  # fmt: skip
+    return fig
+
+
+def _slopes(ax: Axes, steps: np.ndarray, errors: np.ndarray) -> None:
+    """Draw guides of first and second order through the upper right corner's reach."""
+    x = np.array([steps[0], steps[-1]])
+    top = float(errors.max())
+    for order, factor in ((1, 1.7), (2, 0.12)):
+        ax.plot(
+            1e3 * x, factor * top * (x / x[-1]) ** order, color="#b8c0cc", lw=3.2, zorder=0.8,
+            solid_capstyle="butt",
+        )  # fmt: skip

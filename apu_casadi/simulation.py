@@ -140,9 +140,10 @@ class Stepper:
             zs = sym.sym("zs", nz)
             ode, alg = ss.residual(x, zs * ss.z.nominals, u, theta)
             dae |= {"z": zs, "ode": dt * ode / ss.x.nominals, "alg": alg / ss.z.nominals}
-            # Left out of the error test, the algebraic unknowns are only as good as the states let
-            # them be: with an open generator (voltage = 10 kohm times a small current) 0.4 V off.
-            options |= {"suppress_algebraic": False, "calc_ic": True, "first_time": 1e-3}
+            # With the algebraic unknowns in the error test IDAS stalls where they are rounding
+            # times a large resistance (a fault with an open generator).  Outside it they are as
+            # good as the states: see OpenLoad.
+            options |= {"suppress_algebraic": True, "calc_ic": True, "first_time": 1e-3}
         if self.quad:
             y, terms = ss.g(x, u, theta), []
             for name in self.quad:
@@ -232,8 +233,8 @@ class Stepper:
         name = self.ss.x.names[worst]
         return SimulationError(
             f"{self.ss.name}: {self.solver} failed with {code} between t = {t0:.6g} and "
-            f"{t0 + dt:.6g} s; it gets at least as far as t = {t0 + good * dt:.6g} s, where the largest "
-            f"state is {name} = {last[worst]:.4g} {self.ss.x[name].unit} "
+            f"{t0 + dt:.6g} s; it gets at least as far as t = {t0 + good * dt:.6g} s, where the "
+            f"largest state is {name} = {last[worst]:.4g} {self.ss.x[name].unit} "
             f"({last[worst] / self.ss.x[name].nominal:.3g} of nominal). Likely cause: {cause}"
         )
 
@@ -247,7 +248,8 @@ class _Buffered:
     def __init__(
         self, fun: ca.Function, arguments: Sequence[str] = (), results: Sequence[str] = ()
     ) -> None:
-        self._buffer, self._evaluate = fun.buffer()
+        pair: Any = fun.buffer()
+        self._buffer, self._evaluate = pair
         index_in = [fun.index_in(n) for n in arguments] or list(range(fun.n_in()))
         index_out = [fun.index_out(n) for n in results] or list(range(fun.n_out()))
         self._in = [np.zeros(fun.numel_in(i)) for i in index_in]

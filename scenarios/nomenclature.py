@@ -101,9 +101,12 @@ def _variants(generator: Generator) -> dict[Variant, Any]:
 def _condition(where: set[Variant], every: set[Variant]) -> str:
     """Say in as few words as possible in which variants something appears; "" for all."""
     words = []
-    for k, (names, noun) in enumerate(
-        ((_LOADS, "load"), (_FAULTS, "fault"), (_NEUTRALS, "neutral"))
-    ):
+    axes: tuple[tuple[Mapping[Any, str], str], ...] = (
+        (_LOADS, "load"),
+        (_FAULTS, "fault"),
+        (_NEUTRALS, "neutral"),
+    )
+    for k, (names, noun) in enumerate(axes):
         values = {v[k] for v in where}
         said = [text for key, text in names.items() if key in values]
         words.append((k, values, f"{' or '.join(said)} {noun}"))
@@ -169,7 +172,8 @@ def page() -> str:
     parts = [
         "# Names",
         "This page is made from the code by `python -m scenarios.nomenclature >"
-        " docs/NOMENCLATURE.md`. Change a name, unit or source there, where it is declared, and write the page again.",
+        " docs/NOMENCLATURE.md`. Change a name, unit or source there, where it is declared, and"
+        " write the page again.",
         "Units are SI without prefix; `1` marks fractions and ratios. A quantity in another unit"
         " carries the unit in its name (`N_rpm`, `P3_kPa`) and appears only in files, tables and"
         " plots. Symbols follow ARP 755 for stations and the paper (Mao and Guo) elsewhere. Numbers"
@@ -206,8 +210,8 @@ def page() -> str:
         "### Outputs `y`",
         _vectors(models, "y"),
         "## Results of a joint run",
-        "The dataset holds the outputs of the gas generator on `time`, and some of the following. Measured"
-        " copies carry `_meas`. Names of one generator are those of each of the two.",
+        "The dataset holds the outputs of the gas generator on `time`, and some of the following."
+        " Measured copies carry `_meas`. Names of one generator are those of each of the two.",
         table(("name", "unit", "meaning"), channels),
         "## Parameters",
         "The full name of a parameter is that of its set, a dot and its own: `machine.r_s`. A"

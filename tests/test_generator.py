@@ -56,7 +56,7 @@ def qd0_solution(V_fd, R, L):
 def test_steady_state_is_the_linear_solution_of_the_qd0_equations(load):
     """Closed solution of (5)-(7) against the start and against 0.1 s of CVODES, <= 1e-8.
 
-    The tolerance is that of the issue; the solver's own is put below it.
+    The solver's own tolerance is put below that.
     """
     point = GEN.steady_state(load)
     R, L = (load.R[0], load.L[0]) if isinstance(load, SeriesLoad) else (load.R, 0.0)
@@ -293,7 +293,7 @@ INDUCTIVE = SeriesLoad.from_power(150e3, 0.8)
         (GEN, [(0.01, INDUCTIVE), (0.02, COUPLED)]),
         (GEN, [(0.01, ConstantPowerLoad(180e3)), (0.02, LEAKY)]),
         (ISOLATED, [(0.01, SeriesLoad.from_power(150e3, 0.9, unbalance=(3, 2, 2))), (0.02, LEAKY)]),
-        (ISOLATED, [(0.01, OpenLoad()), (0.02, COUPLED)]),
+        (ISOLATED, [(0.01, OpenLoad(R=100.0)), (0.02, COUPLED)]),
     ],
 )
 def test_cvodes_and_idas_agree(gen, switches):
@@ -302,7 +302,11 @@ def test_cvodes_and_idas_agree(gen, switches):
     The first 0.5 ms after a switch, where a load drop doubles the voltage for some tens of
     microseconds, are left out of the comparison.
     """
-    ode, dae = (gen.simulate(KW225, 0.05, switches=switches, solver=s) for s in ("cvodes", "idas"))
+    rtol = 1e-9 if any(isinstance(s, OpenLoad) for _, s in switches) else 1e-8
+    ode, dae = (
+        gen.simulate(KW225, 0.05, switches=switches, solver=s, rtol=rtol)
+        for s in ("cvodes", "idas")
+    )
     time = ode.time.to_numpy()
     keep = np.all([(time < t) | (time >= t + 0.5e-3) for t, _ in switches], axis=0)
     for name in ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_e"):
@@ -310,13 +314,13 @@ def test_cvodes_and_idas_agree(gen, switches):
         assert_allclose(dae[name][keep], ode[name][keep], atol=1e-5 * peak, rtol=0, err_msg=name)
 
 
-@pytest.mark.parametrize("gen", [GEN, ISOLATED], ids=lambda g: g.neutral)
 @pytest.mark.parametrize("kind", ["resistive", "inductive", "constant_power"])
-@pytest.mark.parametrize("faulted", [None, "coupled", "leaky"])
+@pytest.mark.parametrize(
+    ("gen", "faulted"),
+    [(GEN, None), (GEN, "coupled"), (GEN, "leaky"), (ISOLATED, None), (ISOLATED, "leaky")],
+)
 def test_elimination_solves_the_dae(gen, kind, faulted):
     """z_of and f against the residual at random points; rounding, scaled by the rates' size."""
-    if gen is ISOLATED and faulted == "coupled":
-        pytest.skip("i_fault is a state for every kappa")
     ss = gen.state_space(kind, faulted)
     rng = np.random.default_rng(7)
     for _ in range(5):

@@ -25,11 +25,13 @@ LAYERS = (
     ("gas", "mapfiles"),
     ("atmosphere", "maps"),
     ("components", "machine"),
+    ("cycle",),
     ("gasgenerator", "generator"),
     ("trimming",),
     ("control", "events"),
     ("apu",),
-    ("multirate",),
+    ("jointmodel", "multirate"),
+    ("linearisation", "monolithic"),
 )
 NEIGHBOURS = {
     "components": {"components"},
@@ -112,9 +114,8 @@ def verdict(path: Path, module: str) -> str | None:
         if target in ONLY[mine]:
             return None
         return f"{mine} sees only {', '.join(sorted(ONLY[mine]))}"
-    unplaced = [u for u in (mine, target) if u not in RANK]
-    if unplaced:
-        return f"{unplaced[0]} has no layer: give it one in LAYERS of {Path(__file__).name}"
+    if mine not in RANK or target not in RANK:
+        return None  # test_every_module_has_a_place tells, once
     if RANK[target] < RANK[mine] or target in NEIGHBOURS.get(mine, ()):
         return None
     if (mine, target) in EXCEPTIONS:
@@ -155,10 +156,12 @@ def test_no_exception_is_stale():
     assert not stale, f"remove from EXCEPTIONS of {Path(__file__).name}: {stale}"
 
 
-def test_inner_packages_are_empty():
-    """Names have one home: only the front door re-exports."""
+def test_inner_packages_hold_no_code():
+    """Names have one home: only the front door re-exports; a docstring is welcome."""
     for path in (ROOT / "apu_casadi").glob("*/__init__.py"):
-        assert not ast.parse(path.read_text(encoding="utf-8")).body, f"{path} must stay empty"
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        code = [node for node in body if not isinstance(node, ast.Expr)]
+        assert not code, f"{path} must hold no code, line {code[0].lineno} does"
 
 
 @pytest.mark.parametrize(
@@ -178,7 +181,6 @@ def test_inner_packages_are_empty():
         ("scenarios/cli.py", "tests.test_cli", "nothing imports tests"),
         ("scenarios/cli.py", "matplotlib.pyplot", "only apu_casadi.plotting"),
         ("scenarios/cli.py", ".commands", "relative"),
-        ("apu_casadi/apu.py", "apu_casadi.brandnew", "brandnew has no layer"),
     ],
 )
 def test_the_rules_bite(path, module, words):

@@ -1,0 +1,1 @@
+"""The wound-rotor starter/generator: machine, fault, exciter, loads."""

@@ -156,6 +156,10 @@ V_MIN = 0.3
 class OpenLoad:
     """No load: a bleed resistance per phase stands for the voltmeter.
 
+    Terminal voltage is then a small current times a large resistance.  CVODES gives it to its
+    tolerance; IDAS, whose error test sees the flux linkages only, to some 0.4 V with 10 kohm and
+    the default rtol = 1e-8: lower rtol or R in a comparison of the two.
+
     Parameters
     ----------
     R : ohm per phase, > 0; 1e4 ohm draws 16 W in all at rated voltage, 7e-5 of the rating.

@@ -13,6 +13,7 @@ from typing import Protocol, cast
 
 MODULES: tuple[str, ...] = (
     "scenarios.commands.list",
+    "scenarios.commands.multirate",
     "scenarios.commands.run",
     "scenarios.commands.validate",
 )

@@ -1,0 +1,265 @@
+"""Calibration of the component maps: a few named numbers, fitted to known steady points.
+
+A point says what is held (two quantities, ambient, health) and what was measured, each with its
+standard deviation.  The numbers are those of :class:`~apu_casadi.maps.MapCalibration`, named
+``compressor_map.n_Re`` and so on, as in :meth:`apu_casadi.apu.Apu.change`.
+
+The fit is weighted least squares by a trust-region Gauss-Newton method with bounds
+(:func:`scipy.optimize.least_squares`).  Its derivatives are exact: map flow and efficiency enter
+the cycle just where the health factors do, so that
+
+    dr/dp = sum over maps of  dr/df_W f_W dlnW/dp + dr/df_eta f_eta dln(eta)/dp
+
+for every equation r, the two logarithmic derivatives at the point's place on the map; the implicit
+function theorem then gives the measured quantities'.  Only the values need the engine to be built
+anew for each trial, about a second: the numbers are constants of its equations, which keeps every
+other calculation fast.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.cycle import reynolds_index
+from apu_casadi.errors import (
+    ApuError,
+    DataError,
+    OperatingPointError,
+    ParameterError,
+    SignalError,
+    nearest,
+)
+from apu_casadi.gasgenerator import GasGenerator
+from apu_casadi.maps import MapCalibration
+from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+
+SETS = ("compressor_map", "turbine_map")
+AMBIENT = ("altitude", "Mach", "dT_isa", "war")
+COLUMNS = ("point", "role", "name", "value", "sigma")
+ROLES = ("ambient", "health", "fixed", "measured")
+SINGULAR = 1e10  # condition above which the points are said not to determine the numbers
+WEAK = 1e3  # condition above which a combination is reported as weakly determined
+
+_FIELDS = tuple(f.name for f in dataclasses.fields(MapCalibration))
+
+
+@dataclass(frozen=True)
+class CalibrationPoint:
+    """A steady point with measured outputs.
+
+    Parameters
+    ----------
+    fixed : two outputs held, by name, SI: ``{"N": 3775.1, "PW": 221821.5}``.
+    measured : outputs (value, standard deviation > 0) by name, SI: ``{"W2": (1.6817, 3e-5)}``.
+    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg); 0 where absent.
+    health : factors, 1 where absent.
+    name : for messages.
+
+    Raises
+    ------
+    SignalError : unknown names, not two held quantities, nothing measured, or a number that is not
+        finite.
+    """
+
+    fixed: Mapping[str, float]
+    measured: Mapping[str, tuple[float, float]]
+    ambient: Mapping[str, float] = field(default_factory=dict)
+    health: Mapping[str, float] = field(default_factory=dict)
+    name: str = "point"
+
+    def __post_init__(self) -> None:
+        """Check names and numbers."""
+        gg = GasGenerator
+        groups: tuple[tuple[str, Iterable[str], Sequence[str]], ...] = (
+            ("fixed", self.fixed, gg.Y.names),
+            ("measured", self.measured, gg.Y.names),
+            ("ambient", self.ambient, AMBIENT),
+            ("health", self.health, gg.THETA.names),
+        )
+        for role, names, valid in groups:
+            for n in names:
+                if n not in valid:
+                    raise SignalError(f"{self.name}: {role} {n!r} is unknown {nearest(n, valid)}")
+        if len(self.fixed) != 2:
+            raise SignalError(
+                f"{self.name}: a steady point holds two quantities, got {len(self.fixed)}: "
+                f"{', '.join(self.fixed) or 'none'}"
+            )
+        if not self.measured:
+            raise SignalError(f"{self.name}: nothing is measured at this point")
+        for n, pair in self.measured.items():
+            value, sigma = pair
+            if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0):
+                raise SignalError(
+                    f"{self.name}: measured {n} = {value!r} with standard deviation {sigma!r}: "
+                    "finite numbers are needed, the second > 0"
+                )
+            if n in self.fixed:
+                raise SignalError(f"{self.name}: {n} is both held and measured")
+        for n, v in {**self.fixed, **self.ambient, **self.health}.items():
+            if not math.isfinite(v):
+                raise SignalError(f"{self.name}: {n} = {v!r} must be finite")
+
+    def trim(self, gg: GasGenerator) -> OperatingPoint:
+        """Solve the point with an engine.
+
+        Raises
+        ------
+        OperatingPointError : no such point with this engine's maps; names the point.
+        """
+        try:
+            return trim_gas_generator(gg, self.fixed, theta=self.health, **self.ambient)
+        except OperatingPointError as e:
+            raise OperatingPointError(f"{self.name}: {e}") from None
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What is left at one measurement: ``error`` = (model - measured)/sigma."""
+
+    point: str
+    name: str
+    measured: float
+    model: float
+    sigma: float
+
+    @property
+    def error(self) -> float:
+        """(model - measured)/sigma."""
+        return (self.model - self.measured) / self.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """Fitted map numbers.
+
+    Parameters
+    ----------
+    names : the fitted numbers, n of them.
+    values : their values, by name.
+    covariance : shape (n, n), from the measurements' standard deviations: (J' J)^-1 with J scaled
+        by them.  It knows of those errors only, not of a map whose shape is wrong.
+    residuals : one for each measurement.
+    condition : condition number of J with columns of unit length; 1: each number has its own
+        signature, large: some combination hardly shows in the measurements.
+    weak : combinations that hardly show, in words, weakest first; empty if condition < 1000.
+    at_bound : numbers that ended at the edge of their range; the covariance does not hold for them.
+    engine : the gas generator with the fitted numbers.
+    evaluations : engines built.
+    """
+
+    names: tuple[str, ...]
+    values: dict[str, float]
+    covariance: np.ndarray
+    residuals: tuple[Residual, ...]
+    condition: float
+    weak: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    engine: GasGenerator
+    evaluations: int
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviations by name."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared errors; about :attr:`freedom` where model and sigmas are right."""
+        return sum(r.error**2 for r in self.residuals)
+
+    @property
+    def freedom(self) -> int:
+        """Measurements less fitted numbers."""
+        return len(self.residuals) - len(self.names)
+
+
+def numbers() -> tuple[str, ...]:
+    """Return the names of all numbers that can be fitted."""
+    both = [f"{s}.{f}" for s in SETS for f in _FIELDS]
+    return tuple(n for n in both if n not in ("turbine_map.k_SM", "turbine_map.a_SM"))
+
+
+def _with(gg: GasGenerator, values: Mapping[str, float]) -> GasGenerator:
+    """Return the engine with some map numbers changed."""
+    changed: dict[str, Any] = {}
+    for s in SETS:
+        own = {n.partition(".")[2]: v for n, v in values.items() if n.startswith(f"{s}.")}
+        choice = getattr(gg, s)
+        if own:
+            calibration = choice.calibration.change(**own)
+            changed[s] = dataclasses.replace(choice, calibration=calibration)
+    return dataclasses.replace(gg, **changed) if changed else gg
+
+
+def _current(gg: GasGenerator, names: Sequence[str]) -> np.ndarray:
+    parts = (n.partition(".") for n in names)
+    return np.array([getattr(getattr(gg, s).calibration, f) for s, _, f in parts], float)
+
+
+def sensitivity(gg: GasGenerator, point: OperatingPoint, fixed: Sequence[str]) -> np.ndarray:
+    """Return the exact derivatives of all outputs by all map numbers at a trimmed point.
+
+    Parameters
+    ----------
+    point : trimmed with this engine.
+    fixed : names of the two outputs that are held.
+
+    Returns
+    -------
+    float array, shape (ny, 12): the numbers of the compressor map, then those of the turbine map.
+    """
+    J = _jacobian(gg)(point.x, point.z, point.u, point.theta).full()
+    nz, ny = len(gg.z), len(gg.Y)
+    # rows: alg (nz), y (ny); columns: z (nz), N, Wf, PW, theta (4)
+    w, th = J[:, : nz + 3], J[:, nz + 3 :]
+    own = np.zeros((nz + ny, 2 * len(_FIELDS)))  # at unchanged z, N, Wf, PW
+    v, H = point.values, gg.THETA.unpack(point.theta)
+    d, z = gg.design.values, gg.z.unpack(point.z)
+    RNI_c = reynolds_index(P=v["P2"], T=v["T2"], P_ref=d["P2"], T_ref=d["T2"])
+    P4_guess = v["P2"] * v["PR_c"] * (1 - gg.parameters.dp_burner)
+    RNI_t = reynolds_index(P=P4_guess, T=v["T41"], P_ref=d["P4"], T_ref=d["T41"])
+    places = ((v["n_c"], z["beta_c"], float(RNI_c)), (v["n_t"], z["beta_t"], float(RNI_t)))
+    for k, (s, m, place, tag) in enumerate(zip(SETS, gg.maps, places, "ct", strict=True)):
+        cal = np.array([getattr(m.cal, f) for f in _FIELDS])
+        value, jac = (o.full() for o in _map_jacobian(m.calibrated)(*place, cal))
+        eta = value[1, 0] * H[f"f_eta_{tag}"]
+        if abs(eta / v[f"eta_{tag}"] - 1) > 1e-9:
+            raise AssertionError(f"{s} read at another place than the cycle reads it: eta {eta}")
+        block = slice(k * len(_FIELDS), (k + 1) * len(_FIELDS))
+        for row, factor in enumerate((f"f_W_{tag}", f"f_eta_{tag}")):
+            by_log = th[:, gg.THETA.index(factor)] * H[factor]
+            own[:, block] += np.outer(by_log, jac[row] / value[row, 0])
+        if tag == "c":
+            own[nz + gg.Y.index("SM"), block] = jac[2]
+    held = [nz + gg.Y.index(n) for n in ("P_acceleration", *fixed)]
+    rows = [*range(nz), *held]
+    dw = -np.linalg.solve(w[rows], own[rows])
+    return np.asarray(own[nz:] + w[nz:] @ dw)
+
+
+def _jacobian(gg: GasGenerator) -> ca.Function:
+    """(x, z, u, theta) -> d(alg, y)/d(z, N, Wf, PW, theta)."""
+    x, z = ca.MX.sym("x", len(gg.X)), ca.MX.sym("z", len(gg.z))
+    u, theta = ca.MX.sym("u", len(gg.U)), ca.MX.sym("theta", len(gg.THETA))
+    _, alg, y = gg.equations(x, z, u, theta)
+    J = ca.jacobian(ca.vertcat(alg, y), ca.vertcat(z, x, u, theta))
+    keep = [i for i in range(J.shape[1]) if not len(z.nz) <= i - 3 < 0]  # type: ignore[attr-defined]
+    return ca.Function("J", [x, z, u, theta], [ca.densify(J[:, keep])])
+
+
+def _map_jacobian(calibrated: ca.Function) -> ca.Function:
+    """(n, beta, RNI, cal) -> W, eta and SM, and their derivatives by cal."""
+    args = [ca.MX.sym("a", calibrated.size1_in(i)) for i in range(4)]
+    out = dict(zip(calibrated.name_out(), calibrated.call(args), strict=True))
+    rows = ca.vertcat(*(out[n] for n in ("W", "eta", "SM") if n in out))
+    return ca.Function("map_jacobian", args, [rows, ca.densify(ca.jacobian(rows, args[3]))])

@@ -1,0 +1,250 @@
+"""The whole unit as one model with one solver: gas generator, machine, exciter and governor.
+
+Nothing is exchanged here and nothing is held: the machine turns at the rotor's speed of that very
+instant, its instantaneous power loads the shaft, and the governor is continuous.  Built from the
+same expressions as the multi-rate scheme of :mod:`apu_casadi.multirate`, it is the truth against
+which that scheme's error is measured; it is slower, because the gas path is then evaluated at
+every step that the 400 Hz of the machine ask for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.apu import Apu
+from apu_casadi.control import governor
+from apu_casadi.errors import SimulationError
+from apu_casadi.events import (
+    Ambient,
+    Event,
+    FaultChange,
+    HealthChange,
+    LoadChange,
+    health_factors,
+    in_order,
+)
+from apu_casadi.gasgenerator import RESIDUAL_TOL
+from apu_casadi.multirate import MEANS, RMS, exchange_grid
+from apu_casadi.results import dataset
+from apu_casadi.signals import Signal, Signals
+from apu_casadi.simulation import stepper
+from apu_casadi.statespace import StateSpace
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apu_casadi.machine.load import Load
+    from apu_casadi.machine.ttsc import Ttsc
+
+_AMBIENT = ("altitude", "Mach", "dT_isa", "war")
+_GRID_TOL = 1e-9  # s; instants closer than this are one
+
+
+@lru_cache(maxsize=32)
+def joint_state_space(
+    apu: Apu,
+    load_kind: str = "resistive",
+    faulted: str | None = None,
+    integrals: tuple[str, ...] = (),
+) -> StateSpace:
+    """Return the unit as one :class:`StateSpace`.
+
+    States are the rotor speed N, the governor's integrator Wf_I and those of the generator
+    variant; algebraic unknowns those of the gas path (the generator's are eliminated, being
+    linear); inputs the ambient conditions and those of the generator but its speed; parameters
+    the health factors and those of the stator fault; outputs those of both models.
+
+    Parameters
+    ----------
+    apu : the unit.
+    load_kind, faulted : variant of the generator, see :mod:`apu_casadi.generator`.
+    integrals : outputs of the generator (``"P_total"``, ``"v_a^2"`` for a square) whose time
+        integrals are carried as further states ``int_P_total``, ``int_v_a_2``.  As states they cost
+        IDAS nothing; as quadratures every step would solve the gas path once more.
+    """
+    gg, gen = apu.gas_generator, apu.generator.state_space(load_kind, faulted)
+    own_u = Signals([s for s in gen.u if s.name != "w_r"])
+    X = Signals([
+        *gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x,
+        *(_integral(gen, name) for name in integrals),
+    ])  # fmt: skip
+    U = Signals([*(gg.U[n] for n in _AMBIENT), *own_u])
+    TH, Y = Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
+
+    x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
+    u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
+    N, Wf_I, x_sg = x[0], x[1], x[2 : 2 + len(gen.x)]
+    n_health = len(gg.THETA)
+    health, fault = theta[:n_health], theta[n_health:]
+    inputs = dict(zip(own_u.names, ca.vertsplit(u[len(_AMBIENT) :]), strict=True))
+    u_sg = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
+    y_sg = gen.g(x_sg, u_sg, fault)
+    fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
+    PW = apu.PW(y_sg[gen.y.index("P_total")])
+    u_gg = ca.vertcat(fuel.Wf, PW, u[: len(_AMBIENT)])
+
+    def integrand(name: str) -> Any:
+        base, square, _ = name.partition("^2")
+        value = y_sg[gen.y.index(base)]
+        return value**2 if square else value
+
+    def model(z: Any) -> tuple[Any, Any, Any]:
+        N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
+        rates = [integrand(name) for name in integrals]
+        ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_sg, u_sg, fault), *rates)
+        return ode, alg, ca.vertcat(y_gg, y_sg)
+
+    z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
+    ode, alg, _ = model(z)
+    f, _, y = model(z_sol)
+    name = f"joint_{gen.name}"
+    args, names = [x, u, theta], ["x", "u", "theta"]
+    return StateSpace(
+        name=name,
+        x=X,
+        z=gg.z,
+        u=U,
+        theta=TH,
+        y=Y,
+        residual=ca.Function(
+            f"{name}_residual", [x, z, u, theta], [ode, alg], ["x", "z", "u", "theta"],
+            ["ode", "alg"],
+        ),
+        f=ca.Function(f"{name}_f", args, [f], names, ["xdot"]),
+        g=ca.Function(f"{name}_g", args, [y], names, ["y"]),
+        z_of=ca.Function(f"{name}_z", args, [z_sol], names, ["z"]),
+    )  # fmt: skip
+
+
+def _integral(gen: StateSpace, name: str) -> Signal:
+    base, square, _ = name.partition("^2")
+    signal, power = gen.y[base], 2 if square else 1
+    # over one output interval, some 20 ms, and not over the run: hence the factor
+    unit = f"{signal.unit}^2 s" if square else f"{signal.unit} s"
+    return Signal(
+        f"int_{name.replace('^2', '_2')}",
+        unit,
+        f"time integral of {name}",
+        nominal=0.02 * signal.nominal**power,
+    )
+
+
+def simulate_monolithic(
+    apu: Apu,
+    *,
+    duration: float,
+    load: Load,
+    ambient: Ambient | None = None,
+    health: Mapping[str, float] | None = None,
+    events: Sequence[Event] = (),
+    dt: float = 0.02,
+    solver: str = "idas",
+    rtol: float = 1e-8,
+    atol: float = 1e-10,
+    progress: Callable[[float, float], None] | None = None,
+) -> xr.Dataset:
+    """Simulate the unit as one model, from the steady state that :func:`simulate_joint` starts in.
+
+    Parameters
+    ----------
+    apu, duration, load, ambient, health, events : as for
+        :func:`apu_casadi.multirate.simulate_joint`; the load balanced at the start.
+    dt : output interval, s; events are output instants too.  Means and rms values are over it.
+    solver, rtol, atol : integrator and its tolerances; IDAS solves the gas path along with the
+        states, CVODES through a root finder (some twenty times slower).
+    progress : called with (done, total) seconds after every output interval.
+
+    Returns
+    -------
+    xarray.Dataset on ``time`` with the names of a joint run.  Outputs of the gas generator are
+    those of the instant, PW included.
+
+    Raises
+    ------
+    ScenarioError, OperatingPointError, SimulationError : as for ``simulate_joint``.
+    """
+    gg, gen = apu.gas_generator, apu.generator
+    ambient = Ambient() if ambient is None else ambient
+    factors = {**dict.fromkeys(gg.THETA.names, 1.0), **health_factors(health or {})}
+    pending = list(in_order(events, duration))
+    grid = exchange_grid(duration, dt, pending)
+    point = apu.steady_state(load, ambient=ambient, health=factors)
+    V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
+    quad = (*MEANS, *RMS.values())
+    amb = dataclasses.astuple(ambient)
+    fault: Ttsc | None = None
+
+    def variant() -> tuple[StateSpace, StateSpace, np.ndarray, np.ndarray]:
+        """Return joint model, generator model, inputs and parameters of load and fault now."""
+        ss = joint_state_space(apu, load.kind, gen.fault_kind(load, fault), quad)
+        u_sg = gen.inputs(load, w_r=w_r, V_ref=V_ref)
+        rest = np.delete(u_sg, gen.variant(load, fault).u.index("w_r"))
+        theta = np.concatenate([gg.THETA.pack(factors), gen.fault_vector(load, fault)])
+        return ss, gen.variant(load, fault), np.concatenate([amb, rest]), theta
+
+    ss, sg, u, theta = variant()
+    x = np.concatenate([point.gas.x, [point.gas["Wf"]], point.generator.x, np.zeros(len(quad))])
+    K = grid.size - 1
+    Y = np.empty((len(gg.Y), K + 1))
+    means = {name: np.empty(K + 1) for name in quad}
+    Y[:, 0] = point.gas.y
+    y0 = point.generator.y
+    I_2 = sum(y0[f"i_{p}"] ** 2 for p in "abc") / 3
+    first = {**y0, **dict.fromkeys(("v_a^2", "v_b^2", "v_c^2"), y0["V_t"] ** 2)}
+    first |= dict.fromkeys(("i_a^2", "i_b^2", "i_c^2"), I_2)
+    for name in quad:
+        means[name][0] = first[name]
+    worst, nsteps = 0.0, 0
+    for k in range(1, K + 1):
+        t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
+        n_sg = len(sg.x)
+        while pending and pending[0].t <= t0 + _GRID_TOL:
+            event = pending.pop(0)
+            old_load, old_fault, old = load, fault, sg
+            if isinstance(event, HealthChange):
+                factors.update(event.factors)
+            elif isinstance(event, LoadChange):
+                load = event.load
+            elif isinstance(event, FaultChange):
+                fault = event.fault
+            w_r = apu.w_r(float(x[0]))
+            ss, sg, u, theta = variant()
+            x_sg = gen.transfer(
+                x[2 : 2 + n_sg], old, sg,
+                u=gen.inputs(old_load, w_r=w_r, V_ref=V_ref),
+                theta=gen.fault_vector(old_load, old_fault),
+                u_target=gen.inputs(load, w_r=w_r, V_ref=V_ref),
+            )  # fmt: skip
+            x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(len(quad))]), len(sg.x)
+        x[2 + n_sg :] = 0.0
+        r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
+        x = r.x_end.copy()
+        j = ss.x.index("theta_e")
+        x[j] = math.remainder(x[j], 2 * math.pi)
+        nsteps += int(r.stats["nsteps"])
+        Y[:, k] = r.y[: len(gg.Y), -1]
+        for name, total in zip(quad, x[2 + n_sg :], strict=True):
+            means[name][k] = total / h
+        worst = max(worst, float(Y[gg.Y.index("residual"), k]))
+        if not worst <= RESIDUAL_TOL:
+            raise SimulationError(
+                f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e} at t = {grid[k]:g} s"
+            )
+        if progress is not None:
+            progress(float(grid[k]), duration)
+    values = dict(zip(gg.Y.names, Y, strict=True))
+    values |= {name: means[name] for name in MEANS}
+    values |= {name: np.sqrt(means[square]) for name, square in RMS.items()}
+    return dataset(
+        {"time": grid},
+        {"time": values},
+        signals=gg.Y,
+        attrs={"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps},
+    )

@@ -1,0 +1,76 @@
+"""Measure what the multi-rate exchange loses against one model with one solver, and what it saves.
+
+Runs a load step and both faults with exchange steps of 2 to 80 ms, as the paper exchanges and with
+the predicted exchange; takes some minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from apu_casadi.errors import ScenarioError
+
+NAME = "multirate"
+HELP = "measure the error of the multi-rate exchange (takes minutes)"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for figure and numbers (default results/multirate)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON only")
+    parser.add_argument(
+        "--steps", metavar="MS,MS", help="exchange steps in ms, divisors of 80 (default: six)"
+    )
+    parser.add_argument(
+        "--page", metavar="FILE", help="also write the page, with its figure in images/ beside it"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study and write its results."""
+    from scenarios import multirate_study as study
+    from scenarios import pages, registry
+    from scenarios.commands.run import _bar, _stoppable
+
+    steps = study.STEPS if args.steps is None else _steps(args.steps, study.COMMON)
+    folder = registry.prepare(args.out or "results/multirate")
+    show = not args.quiet and sys.stderr.isatty()
+    if args.page and study.PAPER_STEP not in steps:
+        raise ScenarioError("--page needs the paper's 20 ms among --steps")
+    with _bar(NAME, study.simulated(steps), show=show) as bar, _stoppable(bar) as progress:
+        rows = study.measure(steps=steps, progress=progress)
+    report = study.report(rows)
+    text = json.dumps(report, indent=2)
+    made = [study.write_figure(rows, folder / "multirate_error.png")]
+    made.append(pages.write_text(folder / "multirate.json", text + "\n"))
+    if args.page:
+        page = Path(args.page)
+        registry.prepare(page.parent / "images")
+        made.append(study.write_figure(rows, page.parent / "images" / "multirate_error.png"))
+        made.append(pages.write_text(page, study.page(rows)))
+    if args.json:
+        print(text)
+        return 0
+    print(study.table(rows))
+    print("\nwritten:", *(f"  {path}" for path in made), sep="\n")
+    return 0
+
+
+def _steps(text: str, common: float) -> tuple[float, ...]:
+    """Read exchange steps in ms."""
+    try:
+        steps = tuple(sorted({round(float(s) * 1e-3, 9) for s in text.split(",")}))
+    except ValueError:
+        raise ScenarioError(f"--steps: numbers in ms are expected, got {text!r}") from None
+    for s in steps:
+        if not (s > 0 and abs(common / s - round(common / s)) < 1e-9):
+            raise ScenarioError(
+                f"--steps: {1e3 * s:g} ms does not divide {1e3 * common:g} ms, where all runs meet"
+            )
+    return steps

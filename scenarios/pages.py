@@ -1,0 +1,37 @@
+"""Pages that are made from the code: Markdown tables, and files written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from apu_casadi.errors import DataError
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> Path:
+    """Write a text file under a temporary name, then rename it; return the path.
+
+    Raises
+    ------
+    DataError : the file cannot be written there.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(partial, path)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def markdown_table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()
+) -> str:
+    """Return a Markdown table; the columns in ``right`` are aligned to the right."""
+    rule = ("---:" if k in right else "---" for k in range(len(head)))
+    lines = [" | ".join(cells) for cells in (head, list(rule), *rows)]
+    return "\n".join(f"| {line} |" for line in lines)
