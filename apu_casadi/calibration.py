@@ -250,11 +250,13 @@ def sensitivity(gg: GasGenerator, point: OperatingPoint, fixed: Sequence[str]) -
 def _jacobian(gg: GasGenerator) -> ca.Function:
     """(x, z, u, theta) -> d(alg, y)/d(z, N, Wf, PW, theta)."""
     x, z = ca.MX.sym("x", len(gg.X)), ca.MX.sym("z", len(gg.z))
-    u, theta = ca.MX.sym("u", len(gg.U)), ca.MX.sym("theta", len(gg.THETA))
+    flows, around = ca.MX.sym("flows", 2), ca.MX.sym("around", len(gg.U) - 2)
+    u, theta = ca.vertcat(flows, around), ca.MX.sym("theta", len(gg.THETA))
     _, alg, y = gg.equations(x, z, u, theta)
-    J = ca.jacobian(ca.vertcat(alg, y), ca.vertcat(z, x, u, theta))
-    keep = [i for i in range(J.shape[1]) if not len(z.nz) <= i - 3 < 0]  # type: ignore[attr-defined]
-    return ca.Function("J", [x, z, u, theta], [ca.densify(J[:, keep])])
+    J = ca.densify(ca.jacobian(ca.vertcat(alg, y), ca.vertcat(z, x, flows, theta)))
+    inner = ca.Function("J", [x, z, flows, around, theta], [J])
+    us = ca.MX.sym("u", len(gg.U))
+    return ca.Function("J", [x, z, us, theta], [inner(x, z, us[:2], us[2:], theta)])
 
 
 def _map_jacobian(calibrated: ca.Function) -> ca.Function:
@@ -263,3 +265,215 @@ def _map_jacobian(calibrated: ca.Function) -> ca.Function:
     out = dict(zip(calibrated.name_out(), calibrated.call(args), strict=True))
     rows = ca.vertcat(*(out[n] for n in ("W", "eta", "SM") if n in out))
     return ca.Function("map_jacobian", args, [rows, ca.densify(ca.jacobian(rows, args[3]))])
+
+
+def calibrate(
+    gg: GasGenerator,
+    points: Sequence[CalibrationPoint],
+    free: Sequence[str],
+    *,
+    max_evaluations: int = 40,
+) -> CalibrationResult:
+    """Fit map numbers to points, starting from the engine's own.
+
+    Parameters
+    ----------
+    gg : engine with the map shapes; numbers that are not free keep its values.
+    points : steady points with measurements.
+    free : numbers to fit, such as ``"compressor_map.n_Re"``; see :func:`numbers`.
+    max_evaluations : engines built at most.
+
+    Raises
+    ------
+    ParameterError : unknown or doubled numbers, fewer measurements than numbers, or points that do
+        not determine the numbers; names the combination that does not show.
+    OperatingPointError : a point cannot be solved at the start, or the fit did not converge.
+    """
+    from scipy.optimize import least_squares
+
+    points, names = tuple(points), tuple(free)
+    _check_free(names, points)
+    targets = [(p, n, *p.measured[n]) for p in points for n in p.measured]
+    sigma = np.array([t[3] for t in targets])
+    measured = np.array([t[2] for t in targets])
+    index = [SETS.index(n.partition(".")[0]) * len(_FIELDS) + _FIELDS.index(n.partition(".")[2])
+             for n in names]  # fmt: skip
+    fields = {f.name: f.metadata for f in dataclasses.fields(MapCalibration)}
+    lower, upper = (
+        np.array([fields[n.partition(".")[2]][side] for n in names]) for side in ("lo", "hi")
+    )
+    built: dict[bytes, tuple[GasGenerator, list[OperatingPoint]]] = {}
+
+    def solved(p: np.ndarray) -> tuple[GasGenerator, list[OperatingPoint]]:
+        key = p.tobytes()
+        if key not in built:
+            engine = _with(gg, dict(zip(names, p.tolist(), strict=True)))
+            built[key] = engine, [point.trim(engine) for point in points]
+        return built[key]
+
+    def model(p: np.ndarray) -> np.ndarray:
+        _, trims = solved(p)
+        return np.array([t[n] for t, point in zip(trims, points, strict=True) for n in point.measured])
+
+    def errors(p: np.ndarray) -> np.ndarray:
+        try:
+            return (model(p) - measured) / sigma
+        except ApuError:
+            if len(built) == 0:  # at the start there is nowhere to go back to
+                raise
+            return np.full(sigma.shape, np.inf)  # makes the trust region shrink
+
+    def jacobian(p: np.ndarray) -> np.ndarray:
+        engine, trims = solved(p)
+        rows = []
+        for t, point in zip(trims, points, strict=True):
+            S = sensitivity(engine, t, tuple(point.fixed))[:, index]
+            rows += [S[engine.Y.index(n)] for n in point.measured]
+        return np.array(rows) / sigma[:, None]
+
+    # off the edge by a hundredth: some numbers are at their identity, and at their limit, when 0
+    start = np.clip(_current(gg, names), lower + 0.01, upper - 0.01)
+    fit = least_squares(
+        errors, start, jacobian, bounds=(lower, upper), xtol=1e-13, ftol=1e-13, gtol=1e-13,
+        max_nfev=max_evaluations,
+    )  # fmt: skip
+    if fit.status <= 0:
+        raise OperatingPointError(
+            f"calibration did not converge in {len(built)} evaluations: sum of squared errors "
+            f"{2 * fit.cost:.4g} at " + _listing(names, fit.x)
+        )
+    J = np.asarray(fit.jac)
+    covariance, condition, weak = _determined(J, names)
+    edge = 1e-9 * (upper - lower)
+    at_bound = tuple(
+        n for n, v, lo, hi, e in zip(names, fit.x, lower, upper, edge, strict=True)
+        if v - lo <= e or hi - v <= e
+    )  # fmt: skip
+    engine, _ = solved(fit.x)
+    residuals = tuple(
+        Residual(p.name, n, value, float(m), s)
+        for (p, n, value, s), m in zip(targets, model(fit.x), strict=True)
+    )
+    values = dict(zip(names, fit.x.tolist(), strict=True))
+    return CalibrationResult(
+        names, values, covariance, residuals, condition, weak, at_bound, engine, len(built)
+    )
+
+
+def _check_free(names: tuple[str, ...], points: tuple[CalibrationPoint, ...]) -> None:
+    valid = numbers()
+    for n in names:
+        if n not in valid:
+            raise ParameterError(f"no map number {n!r} {nearest(n, valid)}")
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice or not names:
+        raise ParameterError(f"numbers to fit: {'twice ' + ', '.join(twice) if twice else 'none'}")
+    count = sum(len(p.measured) for p in points)
+    if count < len(names):
+        raise ParameterError(
+            f"{count} measurements cannot determine {len(names)} numbers: {', '.join(names)}"
+        )
+
+
+def _listing(names: Sequence[str], values: Sequence[float] | np.ndarray) -> str:
+    return ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, values, strict=True))
+
+
+def _determined(J: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, float, tuple[str, ...]]:
+    """Return covariance, condition and weak combinations; refuse what cannot be determined."""
+    length = np.linalg.norm(J, axis=0)
+    none = [n for n, l in zip(names, length, strict=True) if not l > 0]
+    if none:
+        raise ParameterError(f"no measurement depends on {', '.join(none)}: do not fit it")
+    _, s, Vt = np.linalg.svd(J / length, full_matrices=False)
+
+    def words(v: np.ndarray) -> str:
+        v = v * np.sign(v[np.argmax(np.abs(v))])
+        order = [i for i in np.argsort(-np.abs(v)) if abs(v[i]) >= 0.1]
+        return " ".join(f"{v[i]:+.2f} {names[i]}" for i in order)
+
+    condition = float(s[0] / s[-1]) if s[-1] > 0 else math.inf
+    if not condition < SINGULAR:
+        raise ParameterError(
+            f"the points do not determine the numbers: condition {condition:.1e}, and {words(Vt[-1])} "
+            "(each in units of its own effect) shows in no measurement; fit fewer numbers, or add a "
+            "point at another speed, pressure ratio or altitude"
+        )
+    weak = tuple(words(Vt[k]) for k in range(len(s) - 1, -1, -1) if s[0] > WEAK * s[k])
+    root = (Vt.T / s) / length[:, None]
+    return root @ root.T, condition, weak
+
+
+def read_points(path: str | Path) -> list[CalibrationPoint]:
+    """Read points from a CSV file with one quantity on each line.
+
+    Columns ``point, role, name, value, sigma``; lines that begin with ``#`` are comments.  ``role``
+    is ambient, health, fixed (two for each point) or measured; ``sigma``, the standard deviation,
+    is for measured ones only.  SI units, names as in :attr:`GasGenerator.Y`::
+
+        point,role,name,value,sigma
+        cruise,ambient,altitude,8000,
+        cruise,fixed,N,3775.1,
+        cruise,fixed,PW,221821.5,
+        cruise,measured,W2,1.6817,1.7e-4
+
+    Raises
+    ------
+    DataError : no such file, a wrong header, or a line that cannot be read; says which.
+    SignalError : a point with unknown names, or not two held quantities.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as e:
+        raise DataError(f"{path}: cannot be read: {getattr(e, 'strerror', None) or e}") from e
+    lines = [(k, x) for k, x in enumerate(text.splitlines(), 1) if x.strip() and x[0] != "#"]
+    rows = list(csv.reader(x for _, x in lines))
+    if not rows or tuple(c.strip() for c in rows[0]) != COLUMNS:
+        raise DataError(f"{path}: the first line must be {','.join(COLUMNS)}")
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for (k, _), row in zip(lines[1:], rows[1:], strict=True):
+        cells = [c.strip() for c in row] + [""] * (len(COLUMNS) - len(row))
+        if len(cells) > len(COLUMNS):
+            raise DataError(f"{path}, line {k}: {len(cells)} columns, {len(COLUMNS)} expected")
+        point, role, name, value, sigma = cells
+        if role not in ROLES:
+            raise DataError(f"{path}, line {k}: role {role!r} {nearest(role, ROLES)}")
+        where = f"{path}, line {k}: {name}"
+        if (role == "measured") != bool(sigma):
+            raise DataError(f"{where}: a standard deviation goes with measured quantities, only")
+        group = found.setdefault(point, {r: {} for r in ROLES})[role]
+        if name in group:
+            raise DataError(f"{where}: given twice for point {point!r}")
+        v = _number(value, where)
+        group[name] = (v, _number(sigma, where)) if role == "measured" else v
+    if not found:
+        raise DataError(f"{path}: no points below the header")
+    return [CalibrationPoint(**groups, name=point) for point, groups in found.items()]
+
+
+def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
+    """Write points as :func:`read_points` reads them.
+
+    Raises
+    ------
+    DataError : the file cannot be written.
+    """
+    rows: list[tuple[Any, ...]] = [COLUMNS]
+    for p in points:
+        for role in ("ambient", "health", "fixed"):
+            rows += [(p.name, role, n, repr(float(v)), "") for n, v in getattr(p, role).items()]
+        rows += [(p.name, "measured", n, repr(float(v)), repr(float(s)))
+                 for n, (v, s) in p.measured.items()]  # fmt: skip
+    try:
+        with Path(path).open("w", encoding="utf-8", newline="") as f:
+            csv.writer(f, lineterminator="\n").writerows(rows)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from e
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise DataError(f"{where}: {text!r} is not a number") from None

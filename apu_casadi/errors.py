@@ -38,6 +38,10 @@ class ScenarioError(ApuError, ValueError):
     """A scenario description has an unknown key or an impossible value."""
 
 
+class BackendError(ApuError, RuntimeError):
+    """Compiled code was demanded and cannot be had, or a compiled function was called wrongly."""
+
+
 class DataError(ApuError, ValueError):
     """A file is missing, damaged, or lacks a column."""
 

@@ -1,4 +1,4 @@
-"""The paper's Figures 20 to 25, drawn from a dataset of a joint run.
+"""The paper's Figures 15 to 25 and the figure of the exchange error, drawn from datasets.
 
 Figures are made with the object-oriented interface of matplotlib: no window, no global state, so
 that they work in threads, on servers and in notebooks alike.
@@ -665,8 +665,8 @@ def figure_exchange_error(
     with mpl.rc_context(_STYLE):
         fig = _figure(7.4)
         grid = fig.add_gridspec(
-            2, 2, left=0.085, right=0.985, hspace=0.34, wspace=0.2,
-            **_margins(fig, top=0.85, bottom=1.0),
+            2, 2, left=0.085, right=0.985, hspace=0.3, wspace=0.2,
+            **_margins(fig, top=0.65, bottom=0.85),
         )  # fmt: skip
         for k, (q, title) in enumerate(quantities.items()):
             ax = fig.add_subplot(grid[k // 2, k % 2])
@@ -719,3 +719,205 @@ def _slopes(ax: Axes, steps: np.ndarray, errors: np.ndarray) -> None:
             1e3 * x, factor * top * (x / x[-1]) ** order, color="#b8c0cc", lw=3.2, zorder=0.8,
             solid_capstyle="butt",
         )  # fmt: skip
+
+
+# ------------------------------------------------------------------ module by module: 15 to 19
+
+MODULE_FIGURES = {
+    "fig15_speed_T3": "Shaft speed and compressor outlet total temperature",
+    "fig16_P3_T4": "Compressor outlet total pressure and combustor outlet total temperature",
+    "fig17_T5_surge_margin": "Turbine outlet total temperature and compressor surge margin",
+    "fig18_healthy_transient": "Generator, load step to the design point: currents and voltages",
+    "fig19_ttsc_currents": "Generator at the design point, 5 % short circuit: currents",
+}
+"""File names (without ``.png``) and titles of Figures 15 to 19."""
+
+_GAS_PANELS = {
+    "fig15_speed_T3": (("N", "Shaft speed [r/min]", RPM), ("T3", "$T_3$ [K]", 1.0)),
+    "fig16_P3_T4": (("P3", "$P_3$ [kPa]", 1e-3), ("T4", "$T_4$ [K]", 1.0)),
+    "fig17_T5_surge_margin": (("T5", "$T_5$ [K]", 1.0), ("SM", "Surge margin [%]", 100.0)),
+}
+
+
+def _note(fig: Figure, key: str, more: str) -> None:
+    text = textwrap.fill(f"Figure {key[3:5]}. {MODULE_FIGURES[key]}. {more}", 160)
+    fig.text(0.012, 0.10 / fig.get_figheight(), text, fontsize=8.2, color=_MUTED, va="bottom")
+
+
+def figure_gas_generator(
+    key: str, runs: Sequence[xr.Dataset], checks: Sequence[xr.Dataset], t_step: float
+) -> Figure:
+    """Draw one of Figures 15 to 17: the gas generator alone, fuel step at ``t_step`` [s].
+
+    Parameters
+    ----------
+    key : of :data:`MODULE_FIGURES`.
+    runs, checks : the same runs by two routes, the latter drawn as dots; attribute ``f_W_t``.
+
+    Raises
+    ------
+    DataError : a variable is missing.
+    """
+    import matplotlib as mpl
+    from matplotlib.lines import Line2D
+
+    panels = _GAS_PANELS[key]
+    for ds in (*runs, *checks):
+        _need(ds, [p[0] for p in panels])
+    inks = ("#0b5394", "#b45309")
+    t_end = float(runs[0]["time"][-1])
+    rows = [
+        {"name": "degraded gas path, 230 kW", "start": 0.0, "end": t_step},
+        {"name": "fuel flow +10 %, load proportional to speed cubed", "start": t_step,
+         "end": t_end},
+    ]  # fmt: skip
+    with mpl.rc_context(_STYLE):
+        fig = _figure(6.3)
+        grid = fig.add_gridspec(
+            len(panels), 1, left=0.085, right=0.985, hspace=0.14,
+            **_margins(fig, top=0.45, bottom=1.0),
+        )  # fmt: skip
+        for r, (name, label, scale) in enumerate(panels):
+            ax = fig.add_subplot(grid[r])
+            _bands(ax, rows, names=r == 0)
+            every = []
+            for ds, check, ink in zip(runs, checks, inks, strict=False):
+                t, y = ds["time"].values, ds[name].values * scale
+                ax.plot(t, y, color=ink, lw=1.7, solid_joinstyle="round")
+                some = slice(None, None, max(t.size // 40, 1))
+                ax.plot(check["time"].values[some], check[name].values[some] * scale, "o", ms=3.6,
+                        mfc="white", mec=ink, mew=1.0)  # fmt: skip
+                every.append(y)
+            _roomy(ax, np.concatenate(every), 0.1)
+            ax.set_ylabel(label)
+            ax.tick_params(labelbottom=r == len(panels) - 1)
+            if r == 0:
+                handles = [
+                    Line2D([], [], color=ink, lw=1.7,
+                           label=f"turbine flow factor {float(ds.attrs['f_W_t']):g}")
+                    for ds, ink in zip(runs, inks, strict=False)
+                ]  # fmt: skip
+                handles.append(Line2D([], [], color=_INK, marker="o", ls="", ms=3.6, mfc="white",
+                                      label="continuous model, CVODES"))  # fmt: skip
+                ax.legend(handles=handles, loc="lower right", fontsize=8.5, frameon=True,
+                          framealpha=0.9, edgecolor="none")  # fmt: skip
+        ax.set_xlabel("Time [s]")
+        _note(
+            fig,
+            key,
+            "Efficiency of compressor −1 %, of turbine −2 %, compressor flow −3 %; the paper's "
+            "“4 % turbine flow degradation” with either sign. Lines: 20 ms step of (12).",
+        )
+    return fig
+
+
+def _ms(ax: Axes, ds: xr.Dataset, origin: float, lo: float, hi: float, *, xlabel: bool) -> None:
+    ax.axvspan(lo, 0, color=_BANDS[0], lw=0, zorder=0)
+    ax.axvspan(0, hi, color=_BANDS[1], lw=0, zorder=0)
+    ax.axvline(0, color=_PHASE_INK[1], lw=1.0, ls=(0, (4, 2)), zorder=1.5)
+    ax.set_xlim(lo, hi)
+    if xlabel:
+        ax.set_xlabel("ms after the change", labelpad=1)
+
+
+def figure_18(ds: xr.Dataset, check: xr.Dataset, origin: float) -> Figure:
+    """Draw currents and voltages of the healthy generator around a load step at ``origin`` [s].
+
+    ``check`` is the same run by another solver, drawn as dots.
+
+    Raises
+    ------
+    DataError : a variable is missing.
+    """
+    import matplotlib as mpl
+
+    quantities = {"i": "Current [A]", "v": "Voltage [V]"}
+    names = [f"{q}_{p}" for q in quantities for p in "abc"]
+    for data in (ds, check):
+        _need(data, names)
+    t = (ds["time"].values - origin) * 1e3
+    tc = (check["time"].values - origin) * 1e3
+    apart = max(
+        float(np.abs(ds[n].values - np.interp(t, tc, check[n].values))[np.abs(t) > 0.5].max()
+              / np.abs(ds[n].values).max()) for n in names
+    )  # fmt: skip
+    with mpl.rc_context(_STYLE):
+        fig = _figure(6.6)
+        grid = fig.add_gridspec(
+            2, 2, width_ratios=[1.7, 1.0], left=0.08, right=0.985, hspace=0.26, wspace=0.2,
+            **_margins(fig, top=0.5, bottom=0.95),
+        )  # fmt: skip
+        for r, (q, label) in enumerate(quantities.items()):
+            left, right = fig.add_subplot(grid[r, 0]), fig.add_subplot(grid[r, 1])
+            _ms(left, ds, origin, -4, 10, xlabel=r == 1)
+            _ms(right, ds, origin, -10, float(t[-1]), xlabel=r == 1)
+            for p in "abc":
+                y = ds[f"{q}_{p}"].values
+                left.plot(t, y, color=_ABC[p], lw=1.2)
+                some = np.flatnonzero((tc >= -4) & (tc <= 10))[::8]
+                left.plot(tc[some], check[f"{q}_{p}"].values[some], "o", ms=2.6, mfc="white",
+                          mec=_ABC[p], mew=0.8)  # fmt: skip
+                x, rms = cycle_rms(t, y)
+                right.plot(x, rms, color=_ABC[p], lw=_NESTED[p])
+            left.set_ylabel(label)
+            right.set_ylabel(label.replace(" [", " rms ["))
+            if r == 0:
+                _title(left, "waveforms; dots: second solver", _PHASE_INK[1])
+                _title(right, "rms over each cycle", _PHASE_INK[1])
+                _legend(left, "upper left")
+                low, high = left.get_ylim()
+                left.set_ylim(low, high + 0.22 * (high - low))
+        _note(fig, "fig18_healthy_transient",
+              f"From 100 kW to 225 kW. CVODES and IDAS differ by at most {apart:.0e} of the peak, "
+              "from 0.5 ms after the step.")  # fmt: skip
+    return fig
+
+
+def figure_19(runs: Mapping[str, xr.Dataset], origin: float, notes: Mapping[str, str]) -> Figure:
+    """Draw phase currents, their rms and the fault branch's current after a short circuit.
+
+    Parameters
+    ----------
+    runs : by name, one column each.
+    origin : instant of the fault, s.
+    notes : severity of each run in words.
+
+    Raises
+    ------
+    DataError : a variable is missing.
+    """
+    import matplotlib as mpl
+
+    for ds in runs.values():
+        _need(ds, ["i_a", "i_b", "i_c", "i_fault"])
+    with mpl.rc_context(_STYLE):
+        fig = _figure(7.8)
+        grid = fig.add_gridspec(
+            3, len(runs), height_ratios=[1.5, 1, 1], left=0.08, right=0.985, hspace=0.32,
+            wspace=0.17, **_margins(fig, top=0.5, bottom=0.95),
+        )  # fmt: skip
+        for c, (name, ds) in enumerate(runs.items()):
+            t = (ds["time"].values - origin) * 1e3
+            waves, rms, branch = (fig.add_subplot(grid[r, c]) for r in range(3))
+            _ms(waves, ds, origin, -4, 10, xlabel=False)
+            _ms(rms, ds, origin, -10, float(t[-1]), xlabel=False)
+            _ms(branch, ds, origin, -4, 10, xlabel=True)
+            inside = (t >= -4) & (t <= 10)
+            for p in "abc":
+                y = ds[f"i_{p}"].values
+                waves.plot(t[inside], y[inside], color=_ABC[p], lw=1.3)
+                x, value = cycle_rms(t, y)
+                rms.plot(x, value, color=_ABC[p], lw=1.8)
+            branch.plot(t[inside], ds["i_fault"].values[inside] * 1e-3, color="#7a3e9d", lw=1.4)
+            _title(waves, notes.get(name, name), _PHASE_INK[1])
+            if c == 0:
+                waves.set_ylabel("Phase currents [A]")
+                rms.set_ylabel("rms, each cycle [A]")
+                branch.set_ylabel("Fault branch [kA]")
+                _legend(waves, "upper left")
+            low, high = waves.get_ylim()
+            waves.set_ylim(low, high + 0.2 * (high - low))
+        _note(fig, "fig19_ttsc_currents",
+              "Phase a, full coupling (κ = µ); the paper does not state $k_{rf}$. Current of the "
+              "branch that bridges the shorted turns below.")  # fmt: skip
+    return fig

@@ -21,12 +21,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu
 from apu_casadi.events import Event, FaultChange, HealthChange, LoadChange
+from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.monolithic import simulate_monolithic
@@ -41,6 +43,8 @@ STEPS = (0.002, 0.005, 0.010, 0.020, 0.040, 0.080)
 PAPER_STEP = 0.020  # s
 COMMON = 0.080  # s, where all of them meet
 T_EVENT, DURATION = 2 * COMMON, 22 * COMMON
+COMPARED = ("paper", "predicted", "corrected")
+"""Exchanges of ``simulate_joint`` that are measured with every step."""
 QUANTITIES = {
     "N": "speed, of its excursion",
     "P": "power",
@@ -136,7 +140,7 @@ _SPLIT = ("predicted speed", "predicted fuel")
 
 
 def simulated(
-    steps: Sequence[float] = STEPS, *, cases: int = len(CASES), exchanges: int = 2
+    steps: Sequence[float] = STEPS, *, cases: int = len(CASES), exchanges: int = len(COMPARED)
 ) -> float:
     """Return the simulated time, s, of all runs of :func:`measure` with its other defaults."""
     runs = exchanges * len(steps) + len(_SPLIT) + 2  # two: the truth, and the one model
@@ -147,7 +151,7 @@ def measure(
     *,
     steps: Sequence[float] = STEPS,
     cases: Sequence[str] = tuple(CASES),
-    exchanges: Sequence[str] = ("paper", "predicted"),
+    exchanges: Sequence[str] = COMPARED,
     contributions: float | None = PAPER_STEP,
     apu: Apu | None = None,
     progress: Callable[[float, float], None] | None = None,
@@ -279,12 +283,41 @@ def write_figure(rows: Sequence[Measured], path: Path) -> Path:
             {q: np.array([getattr(r, q) for r in group]) for q in QUANTITIES},
         )
         for case in dict.fromkeys(r.case for r in rows)
-        for ex in ("paper", "predicted")
+        for ex in COMPARED
         if len(group := select(rows, case, ex)) > 1
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     plotting.figure_exchange_error(curves, QUANTITIES).savefig(path, dpi=plotting.DPI)
     return path
+
+
+class Mode(NamedTuple):
+    """Frequency, Hz, and damping ratio of an oscillation."""
+
+    frequency: float
+    damping: float
+
+
+def regulator_mode(generator: Generator | None = None) -> Mode:
+    """Return the least damped oscillation of the generator with its exciter at 100 kW."""
+    point = (generator or Generator()).steady_state(KW100)
+    ss = point.ss
+    x = ca.SX.sym("x", len(ss.x))
+    A = ca.Function("A", [x], [ca.jacobian(ss.f(x, point.u, []), x)])(point.x).full()
+    # under a balanced load nothing depends on the rotor angle
+    keep = [k for k, name in enumerate(ss.x.names) if name != "theta_e"]
+    s = np.linalg.eigvals(A[np.ix_(keep, keep)])
+    s = s[s.imag > 0]
+    s = s[np.argmin(-s.real / np.abs(s))]
+    return Mode(float(abs(s.imag)) / (2 * math.pi), float(-s.real / abs(s)))
+
+
+def fault_words() -> str:
+    """Tell the severity of the study's stator fault in words."""
+    event = CASES["TTSC fault"].event
+    assert isinstance(event, FaultChange) and event.fault is not None
+    f = event.fault
+    return f"mu = {100 * f.mu:g} %, k_rf = {f.k_rf:g} (assumed), kappa = {f.kappa:g} = mu"
 
 
 def _span(values: Sequence[float], form: str = ".1e") -> str:
@@ -296,55 +329,62 @@ def page(rows: Sequence[Measured]) -> str:
     """Return docs/MULTIRATE.md: one paragraph with the measured numbers, the figure, the tables."""
     cases = list(dict.fromkeys(r.case for r in rows))
 
-    def at(ex: str, q: str, dt: float = PAPER_STEP) -> list[float]:
-        return [getattr(r, q) for r in rows if r.exchange == ex and abs(r.dt - dt) < 1e-9]
+    def at(ex: str) -> list[Measured]:
+        return [r for r in rows if r.exchange == ex and abs(r.dt - PAPER_STEP) < 1e-9]
 
-    def orders(ex: str, q: str) -> list[float]:
-        return [order(select(rows, c, ex), q) for c in cases]
+    def percent(ex: str, q: str) -> str:
+        return _span([100 * getattr(r, q) for r in at(ex)], ".2g") + " %"
 
-    def faster(ex: str, dt: float = PAPER_STEP) -> list[float]:
-        return [_faster(rows, r) for r in rows if r.exchange == ex and abs(r.dt - dt) < 1e-9]
+    def orders(ex: str, q: str) -> str:
+        return _span([order(select(rows, c, ex), q) for c in cases], ".1f")
 
-    def percent(values: Sequence[float]) -> str:
-        return _span([100 * v for v in values], ".2g") + " %"
+    def faster(ex: str) -> str:
+        return _span([_faster(rows, r) for r in at(ex)], ".0f")
 
     one = [max(r.N, r.P, r.V, r.E) for r in rows if r.exchange == "one model"]
-    text = f"""# What the multi-rate exchange loses, and saves
+    mode = regulator_mode()
+    period = 1e3 / mode.frequency
+    text = f"""# What the multi-rate exchange loses, and what it saves
 
 Made by `apu multirate --page docs/MULTIRATE.md`; the numbers below are measured, not typed.
 
 Section 3 of the paper lets the machine run for 20 ms at the speed of the beginning of the step,
-hands its mean power to the gas generator, and argues that the first "can be ignored" and the
-second is free of error. Against the same unit as one model with one solver
-(`apu_casadi/monolithic.py`) the second is true and the first is not: at 20 ms the speed is wrong
-by {percent(at("paper", "N"))} of its excursion after a load step, a gas-path fault and a stator
-fault, the voltage by {percent(at("paper", "V"))}, the power by {percent(at("paper", "P"))} and the
-energy by {percent(at("paper", "E"))} of their values. The error falls with the first power of the
-step (measured order of the speed {_span(orders("paper", "N"), ".2f")}), because held values are
-half a step late on average. Most of the speed's error comes from the fuel that the sampled
-governor holds: with the fuel alone taken at mid-step it is
-{percent(at("predicted fuel", "N"))}, with the machine's speed alone
-{percent(at("predicted speed", "N"))}; voltage and power see the held speed directly.
-`simulate_joint(..., exchange="predicted")` takes both at the middle of the step, where the speed
-is predicted by its last slope: the speed's error at 20 ms is then
-{percent(at("predicted", "N"))}, the voltage's {percent(at("predicted", "V"))}, the energy's
-{percent(at("predicted", "E"))}, of measured order {_span(orders("predicted", "N"), ".2f")}, at the
-same price. Handed-over energy is exact in both. What the scheme saves is real: it runs
-{_span(faster("paper"), ".0f")} times faster than the one model (`predicted`:
-{_span(faster("predicted"), ".0f")} times), both with a relative tolerance of 1e-8.
+hands its mean power to the gas generator, and argues that the error of the first "can be ignored"
+and that the second has none. Against the same unit as one model with one solver
+(`apu_casadi/monolithic.py`) the second holds, energy being handed over exactly, and the first does
+not: at 20 ms the speed is wrong by {percent("paper", "N")} of its excursion after a load step, a
+gas-path fault and a stator fault, and the voltage by {percent("paper", "V")}, the power by
+{percent("paper", "P")} and the energy by {percent("paper", "E")} of their values. The error falls
+with the first power of the step (measured order of the speed {orders("paper", "N")}), since what
+is held is half a step late on average. The speed's error is that of the fuel held by the sampled
+governor: with the fuel alone taken at mid-step it is {percent("predicted fuel", "N")}, with the
+machine's speed alone predicted still {percent("predicted speed", "N")}. Power and voltage see the
+held speed directly, and its staircase meets the voltage regulator's own mode
+({mode.frequency:.0f} Hz, damping ratio {mode.damping:.2f} at 100 kW) when the step is near the
+mode's period of {period:.0f} ms, which the paper's 20 ms is.
+`simulate_joint(..., exchange="predicted")` lets the speed go on with its last slope and takes the
+fuel of mid-step: at 20 ms the errors are {percent("predicted", "N")} (speed),
+{percent("predicted", "V")} (voltage), {percent("predicted", "P")} (power) and
+{percent("predicted", "E")} (energy), of measured order {orders("predicted", "N")} (speed), at the
+same price. `exchange="corrected"` computes each step twice: {percent("corrected", "N")},
+{percent("corrected", "V")}, {percent("corrected", "P")} and {percent("corrected", "E")}. What the
+scheme saves is real: with 20 ms it runs {faster("paper")} times faster than the one model,
+{faster("predicted")} times with `"predicted"` and {faster("corrected")} times with `"corrected"`,
+all with a relative tolerance of {_RTOL:g}.
 
 ![Error over exchange step](images/multirate_error.png)
 
-How it is measured: each case starts steady, has its event at {T_EVENT:g} s and ends at
-{DURATION:g} s. All runs meet every {1e3 * COMMON:g} ms. Speed: largest error over the largest
-excursion of the true speed. Power and voltage: largest relative error of the mean and of the
-worst phase's rms value over {1e3 * COMMON:g} ms. Energy: largest error of the energy taken since
-the event, over that energy. Order: least-squares slope from 10 ms up; with finer steps the
-stator fault's speed error stops at the 800 Hz ripple of the shaft, which no mean over a step
-shows. "One model" is the truth's own model at the tolerance of the other runs instead of a tenth
-of it: at most {max(one):.0e}. Times are processor times of one run without the building of
-the integrators, on one core, and vary with the machine; the governor of the truth is continuous,
-so that its sampling counts as part of the scheme's error.
+How it is measured. Each case starts steady, has its event at {T_EVENT:g} s and ends at
+{DURATION:g} s; the stator fault is {fault_words()}. All runs meet every {1e3 * COMMON:g} ms.
+Speed: largest error over the largest excursion of the true speed. Power and voltage: largest
+relative error of the mean, and of the worst phase's rms value, over {1e3 * COMMON:g} ms. Energy:
+largest error of the energy taken since the event, over that energy. Order: least-squares slope
+from 10 ms up; with finer steps the speed after the stator fault keeps an error of the size of the
+shaft's 800 Hz ripple, which no mean over a step shows. "One model" is the truth's own model at the
+tolerance of the other runs instead of a tenth of it: its error is at most {max(one):.0e}. Times
+are processor times of one run of {DURATION:g} s without the building of the integrators; they vary
+with the machine. The governor of the truth is continuous, so that its sampling counts as part of
+the scheme's error.
 """
     for case in cases:
         text += f"\n## {case[0].upper()}{case[1:]}\n\n"

@@ -13,10 +13,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module, resources
 
-from apu_casadi.errors import DataError, ScenarioError, nearest
+from apu_casadi.errors import ApuError, DataError, ScenarioError, nearest
 
 KINDS = ("input", "calibrated", "predicted", "check")
-MODULES = ("scenarios.paper_tables", "scenarios.checks")
+MODULES = (
+    "scenarios.paper_tables",
+    "scenarios.checks",
+    "scenarios.peers.gas",
+    "scenarios.peers.machine",
+#C
+)
+
+
+class Skipped(ApuError):
+    """A section cannot run here; the message says what it needs."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +92,7 @@ def run(name: str) -> list[Row]:
     Raises
     ------
     ScenarioError : no section of that name.
+    Skipped : it needs a program that is not installed.
     """
     known = sections()
     if name not in known:

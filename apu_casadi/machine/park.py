@@ -44,6 +44,16 @@ def _sin(angle: Any) -> Any:
     return ca.sin(angle) if isinstance(angle, ca.SX | ca.MX | ca.DM) else np.sin(angle)
 
 
+def _axes(theta_e: Any) -> list[tuple[Any, Any]]:
+    """Cosine and sine of the angle from each phase's axis to the q axis.
+
+    By the addition theorem, from one cosine and one sine: these are the dearest operations here.
+    """
+    c, s = _cos(theta_e), _sin(theta_e)
+    fixed = ((math.cos(a), math.sin(a)) for a in PHASE_ANGLE.values())
+    return [(c * cos_a + s * sin_a, s * cos_a - c * sin_a) for cos_a, sin_a in fixed]
+
+
 def abc_to_qd0(theta_e: Any, x: Abc) -> Qd0:
     """Return T x.
 
@@ -52,16 +62,15 @@ def abc_to_qd0(theta_e: Any, x: Abc) -> Qd0:
     theta_e : electrical angle from the phase-a axis to the q axis, rad.
     x : phase quantities, any unit.
     """
-    angles = [theta_e - PHASE_ANGLE[k] for k in PHASES]
-    q = 2.0 / 3.0 * sum(_cos(t) * v for t, v in zip(angles, x, strict=True))
-    d = 2.0 / 3.0 * sum(_sin(t) * v for t, v in zip(angles, x, strict=True))
+    axes = _axes(theta_e)
+    q = 2.0 / 3.0 * sum(c * v for (c, _), v in zip(axes, x, strict=True))
+    d = 2.0 / 3.0 * sum(s * v for (_, s), v in zip(axes, x, strict=True))
     return Qd0(q, d, (x.a + x.b + x.c) / 3.0)
 
 
 def qd0_to_abc(theta_e: Any, x: Qd0) -> Abc:
     """Return T^-1 x; the inverse of :func:`abc_to_qd0`."""
-    angles = [theta_e - PHASE_ANGLE[k] for k in PHASES]
-    return Abc(*(_cos(t) * x.q + _sin(t) * x.d + x.zero for t in angles))
+    return Abc(*(c * x.q + s * x.d + x.zero for c, s in _axes(theta_e)))
 
 
 def phase_column(theta_e: Any, phase_angle: Any) -> Qd0:
@@ -78,7 +87,7 @@ def phase_selector(phase_angle: Any) -> Abc:
 
     Written as (1 + 2 cos(offset)) / 3, so that the faulty phase is a number and not a structure.
     """
-    return Abc(*((1.0 + 2.0 * _cos(PHASE_ANGLE[k] - phase_angle)) / 3.0 for k in PHASES))
+    return Abc(*((1.0 + 2.0 * c) / 3.0 for c, _ in _axes(phase_angle)))
 
 
 def speed_voltage(w_r: Any, x: Qd0) -> Qd0:

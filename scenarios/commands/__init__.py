@@ -12,7 +12,11 @@ from importlib import import_module
 from typing import Protocol, cast
 
 MODULES: tuple[str, ...] = (
+    "scenarios.commands.calibrate",
+    "scenarios.commands.linearise",
+    "scenarios.commands.errata",
     "scenarios.commands.list",
+    "scenarios.commands.maps",
     "scenarios.commands.multirate",
     "scenarios.commands.run",
     "scenarios.commands.validate",

@@ -1,0 +1,459 @@
+"""Exact propagation of the generator over steps of constant speed.
+
+Inside an exchange step the speed is constant.  With a linear load the windings then obey
+
+    dx/dt = A(theta) x + b(theta) E_fd + c(theta),    theta = theta_0 + w_r t,
+
+in the qd0 frame: constant coefficients for a healthy machine with a balanced load, 2 pi-periodic
+ones otherwise.  Only the exciter is not linear, and it is slow.  So the windings need no small
+steps: their transition matrix over a sample h,
+
+    x(t + h) = P(theta(t)) [x; E; E'; E''; 1],        E(t + s) = E + s E' + s^2/2 E'',
+
+is computed once for a load, a fault and h.  P is an analytic function of the rotor angle: its
+Fourier series is cut where it has converged to ``TAIL``, and interpolated in speed.  The exciter
+advances by the classical Runge-Kutta method between the samples, with the terminal voltage
+linear in between.
+
+A and b are derivatives of the model's own right-hand side: no equation is written again.  Not for
+constant-power loads, which are not linear; right after a switch, where the windings settle within
+microseconds, an adaptive integrator samples the mean power better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.backend import Caller, compiled
+from apu_casadi.errors import SimulationError
+from apu_casadi.generator import Generator
+from apu_casadi.machine import exciter as ac5a
+from apu_casadi.simulation import StepResult
+from apu_casadi.statespace import StateSpace
+
+TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
+MAGNUS_TOL = 1e-8  # largest change of P, relative, when the steps it is made of are halved
+HARMONICS = 24  # highest harmonic resolved; a series that has not converged by then is refused
+SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
+_NODES = 4  # Chebyshev nodes in speed
+_GAUSS = math.sqrt(3.0) / 6.0
+
+
+def linear_states(ss: StateSpace) -> list[str]:
+    """Names of the states that obey the linear equations: flux linkages and fault current."""
+    return [n for n in ss.x.names if n.startswith("lam_") or n == "i_fault"]
+
+
+def applicable(ss: StateSpace) -> bool:
+    """Whether the model is linear in its winding states at constant speed."""
+    return "G_load" not in ss.x
+
+
+@dataclass(frozen=True)
+class _Split:
+    """Positions of the parts of a generator's state."""
+
+    linear: list[int]
+    slow: list[int]
+    angle: int
+    drive: int  # E_fd among all states
+
+
+def _split(ss: StateSpace) -> _Split:
+    linear = ss.x.indices(linear_states(ss))
+    angle, drive = ss.x.index("theta_e"), ss.x.index("E_fd")
+    slow = [i for i in range(len(ss.x)) if i not in (*linear, angle)]
+    return _Split(linear, slow, angle, drive)
+
+
+@lru_cache(maxsize=64)
+def _coefficients(ss: StateSpace) -> ca.Function:
+    """Function (theta_e, u, theta) -> augmented matrix M of d/dt [x; E; E'; E''; 1].
+
+    Checks that the model is linear in x and E where it is taken to be.
+    """
+    s = _split(ss)
+    x, u, th = ca.SX.sym("x", len(ss.x)), ca.SX.sym("u", len(ss.u)), ca.SX.sym("t", len(ss.theta))
+    rate = ss.f(x, u, th)[s.linear]
+    own = ca.vertcat(x[s.linear], x[s.drive])
+    J = ca.jacobian(rate, own)
+    if any(ca.which_depends(ca.vec(ca.densify(J)), own, 1, True)):
+        raise SimulationError(f"{ss.name} is not linear in its windings: use another integrator")
+    n = len(s.linear)
+    rest = ca.substitute(rate, own, ca.SX.zeros(n + 1))
+    M = ca.SX.zeros(n + 4, n + 4)
+    M[:n, : n + 1] = J
+    M[:n, n + 3] = rest
+    M[n, n + 1] = 1
+    M[n + 1, n + 2] = 1
+    return ca.Function("M", [x[s.angle], u, th], [ca.densify(M)], {"cse": True})
+
+
+def _expm(M: np.ndarray) -> np.ndarray:
+    """Exponentials of a stack of matrices (k, n, n): Taylor series with scaling and squaring."""
+    norm = np.abs(M).sum(axis=-1).max() if M.size else 0.0
+    squarings = max(0, math.ceil(math.log2(max(norm, 1e-300) / 0.25)))
+    A = M / 2.0**squarings
+    n = M.shape[-1]
+    E = np.broadcast_to(np.eye(n), M.shape) + A
+    term = A
+    for k in range(2, 10):  # 0.25^10/10! = 3e-13
+        term = term @ A / k
+        E = E + term
+    for _ in range(squarings):
+        E = E @ E
+    return E
+
+
+def _transition(M_of: Any, theta0: np.ndarray, w: np.ndarray, h: float, steps: int) -> np.ndarray:
+    """Transition matrices over h from angles theta0 at speeds w, by Magnus steps of order 4.
+
+    (Blanes, Casas, Oteo, Ros, Physics Reports 470, 2009: two Gauss points and one commutator.)
+    """
+    hs = h / steps
+    P = None
+    for k in range(steps):
+        M1 = M_of(theta0 + w * hs * (k + 0.5 - _GAUSS), w)
+        M2 = M_of(theta0 + w * hs * (k + 0.5 + _GAUSS), w)
+        Omega = hs / 2 * (M1 + M2) + math.sqrt(3.0) / 12 * hs * hs * (M2 @ M1 - M1 @ M2)
+        E = _expm(Omega)
+        P = E if P is None else E @ P
+    assert P is not None
+    return P
+
+
+@dataclass(frozen=True)
+class Table:
+    """Transition matrices of one load, fault and sample, as Fourier series in the rotor angle.
+
+    Parameters
+    ----------
+    centre, half : middle and half width of the speed range, rad/s.
+    series : coefficients of 1, cos k theta, sin k theta, each a polynomial in the relative speed
+        (w - centre)/half, shape (powers, n (n + 4) * (1 + 2 H)).
+    harmonics : H.
+    error : largest relative change when the Magnus steps were halved.
+    """
+
+    centre: float
+    half: float
+    series: np.ndarray
+    harmonics: int
+    error: float
+
+    def at(self, w: float) -> np.ndarray:
+        """Series at speed w, rad/s, shape (n (n + 4), 1 + 2 H)."""
+        s = (w - self.centre) / self.half
+        powers = np.array([1.0, s, s * s, s * s * s])
+        return np.asarray((powers @ self.series).reshape(-1, 1 + 2 * self.harmonics))
+
+
+def transition_table(
+    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float
+) -> Table:
+    """Compute the transition matrices over ``h`` for all rotor angles and nearby speeds.
+
+    Raises
+    ------
+    SimulationError : the Fourier series or the Magnus steps do not converge (a load so light
+        that the windings settle within a small part of h while the coefficients turn).
+    """
+    M_fun, n = _coefficients(ss), len(linear_states(ss))
+    iw = ss.u.index("w_r")
+    centre, half = w_rated, SPEED_RANGE * w_rated
+    k = np.arange(_NODES)
+    nodes = centre + half * np.cos(np.pi * (2 * k + 1) / (2 * _NODES))
+    to_powers = np.linalg.inv(np.vander((nodes - centre) / half, _NODES, increasing=True))
+
+    def M_of(angle: np.ndarray, w: np.ndarray) -> np.ndarray:
+        U = np.repeat(u[:, None], angle.size, axis=1)
+        U[iw] = w
+        TH = np.repeat(theta.reshape(-1, 1), angle.size, axis=1)
+        out = M_fun.map(angle.size)(angle[None, :], U, TH).full()
+        m = n + 4
+        return np.asarray(out.reshape(m, angle.size, m).transpose(1, 0, 2))
+
+    probe = np.array([0.1, 0.9, 2.3])
+    Mp = M_of(probe, np.full(3, centre))
+    constant = np.abs(Mp - Mp[0]).max() <= 1e-12 * np.abs(Mp[0]).max()
+    angles = np.zeros(1) if constant else 2 * np.pi * np.arange(2 * HARMONICS) / (2 * HARMONICS)
+    w = np.repeat(nodes, angles.size)
+    a = np.tile(angles, _NODES)
+    # the number of Magnus steps is doubled until a few angles agree, then used for all
+    steps, error = 1, 0.0
+    if not constant:
+        pw = np.full(3, nodes[0])
+        last = _transition(M_of, probe, pw, h, steps)
+        while True:
+            new = _transition(M_of, probe, pw, h, 2 * steps)
+            error = float(np.abs(new - last).max() / np.abs(new[:, :n, :n]).max()) / 15
+            steps *= 2
+            if error <= MAGNUS_TOL:
+                break
+            if steps >= 256:
+                raise SimulationError(
+                    f"{ss.name}: transition matrices over {h:.3g} s do not converge "
+                    f"(error {error:.1e} with {steps} steps)"
+                )
+            last = new
+    P = _transition(M_of, a, w, h, steps)[:, :n, :]
+    P = P.transpose(0, 2, 1).reshape(_NODES, angles.size, -1)  # column-major entries
+    if constant:
+        return Table(centre, half, to_powers @ P[:, 0, :], 0, error)
+    F = np.fft.rfft(P, axis=1) / angles.size
+    size = np.abs(F).max(axis=(0, 2))
+    kept = np.nonzero(size > TAIL * size[0])[0]
+    H = int(kept[-1])
+    if H >= HARMONICS - 1:
+        raise SimulationError(
+            f"{ss.name}: the transition matrix over {h:.3g} s has {H} harmonics of the rotor angle "
+            f"above {TAIL:g}: the load is too light for this step"
+        )
+    series = np.empty((_NODES, P.shape[2], 1 + 2 * H))
+    series[:, :, 0] = F[:, 0].real
+    series[:, :, 1::2] = 2 * F[:, 1 : H + 1].real.transpose(0, 2, 1)
+    series[:, :, 2::2] = -2 * F[:, 1 : H + 1].imag.transpose(0, 2, 1)
+    return Table(centre, half, to_powers @ series.reshape(_NODES, -1), H, error)
+
+
+def gregory(n: int) -> np.ndarray:
+    """Weights, shape (n + 1,), of a mean over n equal intervals: trapezoids, ends corrected.
+
+    Gregory's formula of order six.  For what ripples periodically the trapezoidal rule inside is
+    spectrally accurate, which Simpson's is not.
+    """
+    w = np.ones(n + 1)
+    ends = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
+    w[:5], w[-5:] = ends, ends[::-1]
+    return w / n
+
+
+@lru_cache(maxsize=64)
+def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...],
+             quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
+    """n_out samples at once: (x0, P, u, theta, h) -> (x, y, means).
+
+    ``P`` holds one column of transition matrix entries for all samples (``constant``) or one for
+    each; means by :func:`gregory`.
+    """
+    s, n = _split(ss), len(linear_states(ss))
+    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
+    p, e = gen.machine, gen.exciter
+    names = [ss.x.names[i] for i in s.slow]
+    i_E = names.index("E_fd")
+
+    xo, uo, to = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
+    y = ss.g(xo, uo, to)
+    V_t = y[ss.y.index("V_t")]
+    V_dot = ca.jtimes(V_t, xo, ss.f(xo, uo, to))
+    if constant:  # nothing depends on the rotor angle; spare its cosines
+        V_t, V_dot = ca.substitute([V_t, V_dot], [xo[s.angle]], [ca.SX(0)])
+    V_of = ca.Function("V_of", [xo, uo, to], [V_t, V_dot])
+
+    # -- one sample, SX
+    x, P = ca.SX.sym("x", nx), ca.SX.sym("P", n * (n + 4))
+    u, th = ca.SX.sym("u", nu), ca.SX.sym("t", nt)
+    h, V = ca.SX.sym("h"), ca.SX.sym("V", 2)
+    u_d = ss.u.unpack(u)
+
+    def rates(slow: Any, V_t: Any) -> Any:
+        state = ac5a.ExciterState(**dict(zip(names, ca.vertsplit(slow), strict=True)))
+        d = ac5a.exciter_rates(e, state, V_t=V_t / p.V_rated_rms, V_ref=u_d["V_ref"])
+        return ca.vertcat(*(getattr(d, k) for k in names))
+
+    slow = x[s.slow]
+    d_slow = rates(slow, V[0])
+    E, E1 = slow[i_E], d_slow[i_E]
+    E2 = ca.jtimes(E1, slow, d_slow)
+    lin1 = ca.mtimes(ca.reshape(P, n, n + 4), ca.vertcat(x[s.linear], E, E1, E2, 1))
+    angle1 = x[s.angle] + h * u_d["w_r"]
+    x1 = ca.SX(nx, 1)
+    x1[s.linear], x1[s.angle] = lin1, angle1
+    x1[s.slow] = slow
+    x1[s.drive] = E + h * E1 + h**2 / 2 * E2
+    # terminal voltage between the samples: cubic through values and rates at both (Hermite); under
+    # a fault it ripples with twice the frequency, which a straight line would cut by 1 %
+    V1, V1_dot = V_of(x1, u, th)
+    Vm = (V[0] + V1) / 2 + h / 8 * (V[1] - V1_dot)
+    k1 = d_slow
+    k2 = rates(slow + h / 2 * k1, Vm)
+    k3 = rates(slow + h / 2 * k2, Vm)
+    k4 = rates(slow + h * k3, V1)
+    x1[s.slow] = slow + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    sample = ca.Function("sample", [x, V, P, u, th, h], [x1, ca.vertcat(V1, V1_dot)], {"cse": True})
+
+    # -- a group of samples unrolled, which spares copies, then all groups
+    size = next(k for k in (10, 8, 5, 4, 2, 1) if n_out % k == 0)
+    n_P = n * (n + 4)
+    Ps = ca.SX.sym("P", n_P, 1 if constant else size)
+    xk, Vk, states = x, V, []
+    for k in range(size):
+        xk, Vk = sample(xk, Vk, Ps if constant else Ps[:, k], u, th, h)
+        states.append(xk)
+    c = ca.vertcat(u, th, h)
+    fixed = [c, Ps] if constant else [c]
+    carry, moved = ca.vertcat(x, V, *fixed), [] if constant else [Ps]
+    group = ca.Function(
+        "group",
+        [carry, *moved],
+        [ca.vertcat(xk, Vk, *fixed), ca.horzcat(*states)],
+        {"cse": True},
+    )
+    X0, U, TH, H = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt), ca.MX.sym("h")
+    PP = ca.MX.sym("P", n_P, 1 if constant else n_out)
+    start = ca.vertcat(X0, *V_of(X0, U, TH), U, TH, H, *([PP] if constant else []))
+    run = group.mapaccum("run", n_out // size, 1)
+    Xall = run(start)[1] if constant else run(start, PP)[1]
+    # -- outputs and means
+    terms = []
+    for q in quad:
+        base, _, power = q.partition("^")
+        v = y[ss.y.index(base)]
+        terms.append(v**2 if power else v)
+    wanted = ca.vertcat(*(y[ss.y.index(k)] for k in outputs), *terms)
+    out = ca.Function("out", [xo, uo, to], [wanted], {"cse": True})
+    w = gregory(n_out)
+    y0 = out(X0, U, TH)
+    Y = out.map("outs", "serial", n_out, [1, 2], [])(Xall, U, TH)
+    k = len(outputs)
+    means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
+    return ca.Function(
+        f"advance_{ss.name}_{n_out}",
+        [X0, PP, U, TH, H],
+        [Xall[:, n_out - 1], Y[:k, :], means] if k else [Xall[:, n_out - 1], ca.MX(0, 1), means],
+        ["x0", "P", "u", "theta", "h"],
+        ["x", "y", "mean"],
+    )
+
+
+class Propagator:
+    """Steps of one model variant with one load and fault; a fast stand-in for a ``Stepper``.
+
+    Parameters
+    ----------
+    gen, ss : generator and its model variant (:meth:`Generator.variant`).
+    u, theta : inputs and fault parameters; only w_r, V_ref and noise may change afterwards.
+    n_out : samples in a step, at least 10.
+    dt : length of every step, s.
+    outputs : outputs to be returned at the samples.
+    quad : outputs (or squares, ``"v_a^2"``) whose mean over the step is returned.
+
+    Raises
+    ------
+    SimulationError : the model is not linear in its windings, or the series does not converge;
+        use :func:`apu_casadi.simulation.stepper` there.
+    """
+
+    def __init__(
+        self,
+        gen: Generator,
+        ss: StateSpace,
+        u: np.ndarray,
+        theta: np.ndarray,
+        *,
+        n_out: int,
+        dt: float,
+        outputs: Sequence[str] = (),
+        quad: Sequence[str] = (),
+    ) -> None:
+        """Compute or fetch the table, build or fetch the functions."""
+        if not applicable(ss):
+            raise SimulationError(f"{ss.name}: a constant-power load is not linear")
+        if n_out < 10:
+            raise SimulationError(f"{ss.name}: at least 10 samples are needed, got {n_out}")
+        self.ss, self.n_out, self.dt = ss, n_out, dt
+        self.outputs, self.quad = tuple(outputs), tuple(quad)
+        self.h = dt / n_out
+        self.theta = np.array(theta, dtype=float)
+        self.table = _cached_table(ss, u, self.theta, self.h, gen.machine.w_rated)
+        constant = self.table.harmonics == 0
+        self._constant = constant
+        fun = _advance(gen, ss, n_out, self.outputs, self.quad, constant)
+        self._call = _caller(fun)
+        self._angle = ss.x.index("theta_e")
+        self._iw = ss.u.index("w_r")
+        w_rated = gen.machine.w_rated
+        self._w_ok = (1 - SPEED_RANGE) * w_rated, (1 + SPEED_RANGE) * w_rated
+        self._trig = np.ones((1 + 2 * self.table.harmonics, n_out))
+
+    def valid(self, w_r: float) -> bool:
+        """Whether the speed, rad/s electrical, lies in the range of the table."""
+        return self._w_ok[0] <= w_r <= self._w_ok[1]
+
+    def __call__(
+        self, x0: np.ndarray, u: np.ndarray, *, t0: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Advance one step.
+
+        Returns
+        -------
+        State at the end, outputs at the samples of shape (outputs, n_out), and means.  The arrays
+        are overwritten by the next call.
+
+        Raises
+        ------
+        SimulationError : a result is not finite, or the speed is outside the table.
+        """
+        w = float(u[self._iw])
+        if not self.valid(w):
+            raise SimulationError(
+                f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table's "
+                f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
+            )
+        P = self.table.at(w)
+        if not self._constant:
+            phase = float(x0[self._angle]) + w * self.h * np.arange(self.n_out)
+            c1, s1 = np.cos(phase), np.sin(phase)
+            T = self._trig
+            T[1], T[2] = c1, s1
+            for k in range(2, self.table.harmonics + 1):
+                T[2 * k - 1] = T[2 * k - 3] * c1 - T[2 * k - 2] * s1
+                T[2 * k] = T[2 * k - 2] * c1 + T[2 * k - 3] * s1
+            P = P @ T
+        x, y, mean = self._call(x0, P, u, self.theta, self.h)
+        if not math.isfinite(float(x.sum())):
+            raise SimulationError(f"{self.ss.name}: state not finite in the step from {t0:.6g} s")
+        return x, y, mean
+
+    def result(self, x0: np.ndarray, u: np.ndarray, *, t0: float = 0.0) -> StepResult:
+        """Advance one step, returned in the form of a ``Stepper``; ``y`` has the outputs only."""
+        x, y, mean = self(x0, u, t0=t0)
+        t = t0 + self.dt * np.arange(1, self.n_out + 1) / self.n_out
+        means = dict(zip(self.quad, mean.ravel().tolist(), strict=True))
+        return StepResult(t, x.reshape(-1, 1).copy(), y.copy(), means, {"nsteps": self.n_out})
+
+
+_CALLERS: dict[int, tuple[ca.Function, Any]] = {}
+
+
+def _caller(fun: ca.Function) -> Any:
+    """One compiled caller per function; the function is kept, so that its id stays valid."""
+    if id(fun) not in _CALLERS:
+        _CALLERS[id(fun)] = (fun, Caller(compiled(fun)))
+    return _CALLERS[id(fun)][1]
+
+
+_TABLES: OrderedDict[tuple[Any, ...], tuple[StateSpace, Table]] = OrderedDict()
+
+
+def _cached_table(
+    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float
+) -> Table:
+    """Tables are kept by what they depend on: load, noise, fault, sample; not speed, not V_ref."""
+    key_u = np.array(u, dtype=float)
+    key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
+    key = (id(ss), key_u.tobytes(), theta.tobytes(), round(h, 15), w_rated)
+    if key not in _TABLES:
+        _TABLES[key] = (ss, transition_table(ss, np.array(u, float), theta, h, w_rated))
+        if len(_TABLES) > 256:
+            _TABLES.popitem(last=False)
+    _TABLES.move_to_end(key)
+    return _TABLES[key][1]

@@ -1,0 +1,171 @@
+"""Fit map numbers to steady points and print them with their standard deviations.
+
+Without FILE the defaults of the package are made again: from maps without any calibration, and
+the rows W2, T3, P3, T5 and HPCSM of the paper's Table 5 and HPCSM of Table 4.
+
+FILE is a CSV with one quantity on each line and SI units; role is ambient (altitude, Mach, dT_isa,
+war), health (f_eta_c, ...), fixed (two for each point) or measured:
+
+    point,role,name,value,sigma
+    bench 1,ambient,dT_isa,5,
+    bench 1,fixed,N,3775.1,
+    bench 1,fixed,PW,400e3,
+    bench 1,measured,W2,3.143,0.01
+    bench 1,measured,T3,567.9,0.5
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from apu_casadi.calibration import CalibrationPoint, CalibrationResult
+    from apu_casadi.gasgenerator import GasGenerator
+
+NAME = "calibrate"
+HELP = "fit map numbers to table or test-bench points"
+
+FREE = (
+    "compressor_map.a_W", "compressor_map.n_Re", "compressor_map.k_SM", "compressor_map.a_SM",
+    "turbine_map.a_W", "turbine_map.c_PR",
+)  # fmt: skip
+"""The numbers that the defaults set."""
+
+CLOSURE = 1e-4
+"""Relative standard deviation of a published row: how far the cycle, with no map in it, misses the
+rows of Table 4.  The digits printed are finer."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare arguments and options."""
+    parser.add_argument("file", metavar="FILE", nargs="?", help="CSV of points (see above)")
+    parser.add_argument(
+        "--free", metavar="A,B", help="numbers to fit, comma separated (default: the six of the code)"
+    )
+    parser.add_argument("--write-points", metavar="CSV", help="write the points used, as a template")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def published_points() -> list[CalibrationPoint]:
+    """Return the points that the defaults were fitted to, from Tables 4 and 5."""
+    from apu_casadi.calibration import CalibrationPoint
+    from apu_casadi.gasgenerator import GasGeneratorParameters
+    from scenarios.validation import reference
+
+    p = GasGeneratorParameters()
+    table4, table5 = (
+        {r["parameter"]: float(r["GasTurb"]) for r in reference(t)} for t in ("table4", "table5")
+    )
+
+    def measured(value: float) -> tuple[float, float]:
+        return value, CLOSURE * abs(value)
+
+    return [
+        CalibrationPoint(
+            name="Table 4",
+            ambient={"altitude": p.altitude, "Mach": p.Mach, "dT_isa": p.dT_isa, "war": p.war},
+            fixed={"N": p.N, "T4": p.T4},
+            measured={"SM": measured(table4["HPCSM"] / 100)},
+        ),
+        CalibrationPoint(
+            name="Table 5",
+            ambient={"altitude": 8000.0, "Mach": 0.7, "dT_isa": 5.0},
+            fixed={"N": p.N, "PW": 1e3 * table5["PWSD"]},
+            measured={
+                "W2": measured(table5["W2"]),
+                "T3": measured(table5["T3"]),
+                "P3": measured(1e3 * table5["P3"]),
+                "T5": measured(table5["T5"]),
+                "SM": measured(table5["HPCSM"] / 100),
+            },
+        ),
+    ]
+
+
+def uncalibrated() -> GasGenerator:
+    """Return the default engine with the maps' shapes as published."""
+    import dataclasses
+
+    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.maps import MapCalibration
+
+    gg, plain = GasGenerator(), MapCalibration()
+    return dataclasses.replace(
+        gg,
+        compressor_map=dataclasses.replace(gg.compressor_map, calibration=plain),
+        turbine_map=dataclasses.replace(gg.turbine_map, calibration=plain),
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, and print the result."""
+    from apu_casadi.calibration import calibrate, read_points, write_points
+    from apu_casadi.gasgenerator import GasGenerator
+
+    points = read_points(args.file) if args.file else published_points()
+    if args.write_points:
+        write_points(points, args.write_points)
+    free = [n.strip() for n in args.free.split(",") if n.strip()] if args.free else list(FREE)
+    result = calibrate(GasGenerator() if args.file else uncalibrated(), points, free)
+    print(json.dumps(report(result), indent=2, allow_nan=False) if args.json else text(result))
+    return 0
+
+
+def report(result: CalibrationResult) -> dict[str, Any]:
+    """Return the result as plain numbers, with the values now in the code beside them."""
+    now = _in_code(result)
+    return {
+        "numbers": [
+            {"name": n, "value": result.values[n], "std": result.std[n], "in_code": now[n]}
+            for n in result.names
+        ],
+        "covariance": result.covariance.tolist(),
+        "residuals": [{**vars(r), "error": r.error} for r in result.residuals],
+        "chi2": result.chi2,
+        "degrees_of_freedom": result.freedom,
+        "condition": result.condition,
+        "weak": list(result.weak),
+        "at_bound": list(result.at_bound),
+        "engines_built": result.evaluations,
+    }
+
+
+def _in_code(result: CalibrationResult) -> dict[str, float]:
+    from apu_casadi.gasgenerator import GasGenerator
+
+    gg = GasGenerator()
+    parts = (n.partition(".") for n in result.names)
+    return {f"{s}.{f}": getattr(getattr(gg, s).calibration, f) for s, _, f in parts}
+
+
+def text(result: CalibrationResult) -> str:
+    """Return the result as text."""
+    now, std = _in_code(result), result.std
+    width = max(len(n) for n in result.names)
+    lines = [f"{'number':<{width}}  {'value':>12}  {'std. dev.':>10}  {'in the code':>12}"]
+    lines += [
+        f"{n:<{width}}  {result.values[n]:12.8f}  {std[n]:10.2e}  {now[n]:12.8f}"
+        for n in result.names
+    ]
+    spread = [std[n] for n in result.names]
+    lines += ["", "correlations"]
+    for i, n in enumerate(result.names):
+        row = " ".join(
+            f"{result.covariance[i, j] / (spread[i] * spread[j]):+6.2f}" for j in range(i + 1)
+        )
+        lines.append(f"{n:<{width}}  {row}")
+    lines += ["", f"{'point':<12} {'':>6} {'measured':>14} {'model':>14} {'sigma':>10} {'error/sigma':>12}"]
+    lines += [
+        f"{r.point:<12} {r.name:>6} {r.measured:14.7g} {r.model:14.7g} {r.sigma:10.2e} {r.error:12.4f}"
+        for r in result.residuals
+    ]
+    lines += [
+        "",
+        f"chi2 {result.chi2:.3g} with {result.freedom} degrees of freedom, condition "
+        f"{result.condition:.1f}, {result.evaluations} engines built",
+    ]
+    lines += [f"weakly determined: {w}" for w in result.weak]
+    lines += [f"at the edge of its range: {n}" for n in result.at_bound]
+    return "\n".join(lines)

@@ -1,0 +1,123 @@
+"""Linearise gas generator, generator or the whole unit at a steady point; print its eigenvalues.
+
+The point is given by the electrical load of each generator and the ambient conditions.  The
+generator is on its rotor's axes, averaged over an electrical period; the unit is continuous in
+time, with its governor.  The eigenvalues are printed slowest first, and drawn in the complex plane.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from apu_casadi.linearisation import LinearModel
+
+NAME = "linearise"
+HELP = "print and draw the eigenvalues at a steady point"
+MODELS = ("gas", "generator", "joint")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--model", choices=MODELS, default="joint", help="default %(default)s")
+    parser.add_argument("--power", metavar="KW", type=float, default=225.0,
+                        help="load of each generator at 230 V (default %(default)s)")  # fmt: skip
+    parser.add_argument("--power-factor", metavar="PF", type=float, default=1.0, help="default 1")
+    parser.add_argument("--constant-power", action="store_true", help="a load that holds its power")
+    parser.add_argument("--altitude", metavar="M", type=float, default=0.0, help="default 0 m")
+    parser.add_argument("--mach", metavar="MA", type=float, default=0.0, help="default 0")
+    parser.add_argument("--disa", metavar="K", type=float, default=5.0, help="ISA deviation, default 5 K")
+    parser.add_argument("--json", action="store_true", help="print JSON, with all matrices")
+    parser.add_argument("--out", metavar="DIR", default="results/linearise", help="default %(default)s")
+    parser.add_argument("--no-figures", action="store_true", help="draw no figure")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Trim, linearise, print and draw."""
+    model = linear_model(args)
+    path = None
+    if not args.no_figures:
+        from apu_casadi.eigenplot import plot_eigenvalues
+        from scenarios import registry
+
+        label = f"{args.power:g} kW each, {args.altitude:g} m, Mach {args.mach:g}"
+        path = registry.prepare(args.out) / "eigenvalues.png"
+        plot_eigenvalues({label: model}).savefig(path)
+    if args.json:
+        print(json.dumps(report(model), indent=2, allow_nan=False))
+        return 0
+    print(table(model))
+    if path is not None:
+        print(f"\n{path}")
+    return 0
+
+
+def linear_model(args: argparse.Namespace) -> LinearModel:
+    """Return the linear model that the options describe."""
+    from apu_casadi.apu import Apu
+    from apu_casadi.events import Ambient
+    from apu_casadi.linearisation import (
+        linearise_gas_generator,
+        linearise_generator,
+        linearise_joint,
+    )
+    from apu_casadi.machine.load import ConstantPowerLoad, Load, SeriesLoad
+
+    apu = Apu()
+    load: Load
+    if args.constant_power:
+        load = ConstantPowerLoad(1e3 * args.power)
+    else:
+        load = SeriesLoad.from_power(1e3 * args.power, args.power_factor)
+    if args.model == "generator":
+        w_r = apu.w_r(apu.N_ref)
+        return linearise_generator(apu.generator, apu.generator.steady_state(load, w_r=w_r))
+    ambient = Ambient(altitude=args.altitude, Mach=args.mach, dT_isa=args.disa)
+    point = apu.steady_state(load, ambient=ambient)
+    if args.model == "gas":
+        return linearise_gas_generator(apu.gas_generator, point.gas)
+    return linearise_joint(apu, point)
+
+
+def report(model: LinearModel) -> dict[str, Any]:
+    """Return names, matrices, operating point and eigenvalues as plain numbers."""
+    return {
+        "model": model.name,
+        "names": {k: list(getattr(model, k).names) for k in ("x", "u", "theta", "y")},
+        "units": {k: [s.unit for s in getattr(model, k)] for k in ("x", "u", "theta", "y")},
+        "matrices": {
+            k: getattr(model, k).tolist() for k in ("A", "B_u", "B_theta", "C", "D_u", "D_theta")
+        },
+        "point": {k: getattr(model, k).tolist() for k in ("x0", "u0", "theta0", "y0", "xdot0")},
+        "eigenvalues": [
+            {
+                "real": e.value.real,
+                "imag": e.value.imag,
+                "time_constant": e.time_constant if math.isfinite(e.time_constant) else None,
+                "damping": e.damping,
+                "frequency": e.frequency,
+                "participation": dict(e.participation),
+            }
+            for e in model.eigenvalues()
+        ],
+    }
+
+
+def table(model: LinearModel) -> str:
+    """Return the eigenvalues as a text table."""
+    lines = [
+        f"{model.name}: {len(model.x)} states",
+        f"{'real [1/s]':>12} {'imag [rad/s]':>13} {'time const. [s]':>16} {'damping':>8} "
+        f"{'freq. [Hz]':>11}  participating states",
+    ]
+    for e in model.eigenvalues():
+        who = ", ".join(f"{n} {100 * p:.0f} %" for n, p in e.participation.items())
+        imag = f"±{e.value.imag:.4f}" if e.value.imag else "0"
+        lines.append(
+            f"{e.value.real:12.4f} {imag:>13} {e.time_constant:16.4g} {e.damping:8.3f} "
+            f"{e.frequency:11.4g}  {who}"
+        )
+    return "\n".join(lines)

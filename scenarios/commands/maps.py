@@ -1,0 +1,36 @@
+"""Draw the compressor and the turbine map with operating lines and surge line.
+
+With --trajectory, the file that ``apu run`` wrote, a run is drawn on both.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+NAME = "maps"
+HELP = "draw the component maps with operating lines and a run"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--trajectory", metavar="FILE.nc", help="a run, as 'apu run' writes it")
+    parser.add_argument("--out", metavar="DIR", default="results/maps", help="folder (default %(default)s)")
+    parser.add_argument("--no-lines", action="store_true", help="draw no operating lines")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw both maps and print the paths."""
+    from apu_casadi import results
+    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.mapplots import default_lines, plot_compressor_map, plot_turbine_map
+    from scenarios import registry
+
+    ds = None if args.trajectory is None else results.load(args.trajectory)
+    folder = registry.prepare(args.out)
+    gg = GasGenerator()
+    lines = {} if args.no_lines else default_lines(gg)
+    for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
+        path = folder / f"{name}.png"
+        draw(gg, lines=lines, trajectory=ds).savefig(path)
+        print(path)
+    return 0
