@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.control import GovernorParameters
 from apu_casadi.errors import OperatingPointError, ParameterError, nearest
+from apu_casadi.events import Ambient
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
 from apu_casadi.parameters import Parameters, par
+from apu_casadi.trimming import OperatingPoint, trim_gas_generator
 
 if TYPE_CHECKING:
-    from apu_casadi.events import Ambient
     from apu_casadi.machine.load import Load
-    from apu_casadi.trimming import OperatingPoint
 
 RESIDUAL_JOINT = 1e-9
 
@@ -115,7 +115,7 @@ class Apu:
                 raise ParameterError(f"unknown parameter {key!r} {nearest(key, known)}")
             s, _, name = key.partition(".")
             groups.setdefault(s, {})[name] = value
-        new = {s: p.change(**groups.get(s, {})) for s, p in self._sets().items()}
+        new: dict[str, Any] = {s: p.change(**groups.get(s, {})) for s, p in self._sets().items()}
         gg, gen = self.gas_generator, self.generator
         touched = {"gas_generator", "compressor_map", "turbine_map"} & set(groups)
         if touched:
@@ -132,7 +132,7 @@ class Apu:
             gen = dataclasses.replace(
                 gen, machine=new["machine"], exciter=new["exciter"], neutral=neutral
             )
-        return Apu(gg, gen, new["governor"], new["coupling"])  # type: ignore[arg-type]
+        return Apu(gg, gen, new["governor"], new["coupling"])
 
     def steady_state(
         self,
@@ -144,13 +144,13 @@ class Apu:
     ) -> JointPoint:
         """Solve the steady unit at governed speed: healthy generators under a balanced load.
 
+        ``ambient`` is the paper's ground day, ISA + 5 K, by default.
+
         Raises
         ------
         OperatingPointError : no such point, or it needs fuel beyond the governor's limits.
         """
-        from apu_casadi.trimming import trim_gas_generator
-
-        amb = {} if ambient is None else dataclasses.asdict(ambient)
+        amb = dataclasses.asdict(Ambient() if ambient is None else ambient)
         gen = self.generator.steady_state(load, w_r=self.w_r(self.N_ref), V_ref=V_ref)
         PW = self.PW(gen.y["P_total"])
         gas = trim_gas_generator(

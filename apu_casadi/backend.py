@@ -272,7 +272,11 @@ def compiled(fun: ca.Function, *, backend: str | None = None, build: bool = True
 
 
 def load_or_build(
-    recipe: str, build: Callable[[], ca.Function], *, backend: str | None = None
+    recipe: str,
+    build: Callable[[], ca.Function],
+    *,
+    backend: str | None = None,
+    compile_missing: bool = True,
 ) -> ca.Function:
     """Return the compiled function of a recipe, without building its expressions when it is known.
 
@@ -286,6 +290,7 @@ def load_or_build(
     build : makes the function; called only if the recipe is not known here, or in the virtual
         machine.
     backend : overrides the backend in use.
+    compile_missing : compile if no library is found; False only loads.
 
     Raises
     ------
@@ -303,7 +308,7 @@ def load_or_build(
         if made is not None:
             return made
     fun = build()
-    made = compiled(fun, backend=wanted)
+    made = compiled(fun, backend=wanted, build=compile_missing)
     if made is not fun:
         text = f"{fun.name()}\n{fun.serialize()}"
         key = _library_key(hashlib.sha256(text.encode()).hexdigest(), command)

@@ -97,6 +97,10 @@ class CalibrationPoint:
         if not self.measured:
             raise SignalError(f"{self.name}: nothing is measured at this point")
         for n, pair in self.measured.items():
+            if not isinstance(pair, tuple) or len(pair) != 2:
+                raise SignalError(
+                    f"{self.name}: measured {n} must be (value, standard deviation), got {pair!r}"
+                )
             value, sigma = pair
             if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0):
                 raise SignalError(
@@ -313,7 +317,9 @@ def calibrate(
 
     def model(p: np.ndarray) -> np.ndarray:
         _, trims = solved(p)
-        return np.array([t[n] for t, point in zip(trims, points, strict=True) for n in point.measured])
+        return np.array(
+            [t[n] for t, point in zip(trims, points, strict=True) for n in point.measured]
+        )
 
     def errors(p: np.ndarray) -> np.ndarray:
         try:
@@ -395,9 +401,9 @@ def _determined(J: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, float,
     condition = float(s[0] / s[-1]) if s[-1] > 0 else math.inf
     if not condition < SINGULAR:
         raise ParameterError(
-            f"the points do not determine the numbers: condition {condition:.1e}, and {words(Vt[-1])} "
-            "(each in units of its own effect) shows in no measurement; fit fewer numbers, or add a "
-            "point at another speed, pressure ratio or altitude"
+            f"the points do not determine the numbers: condition {condition:.1e}, and "
+            f"{words(Vt[-1])} (each in units of its own effect) shows in no measurement; fit fewer "
+            "numbers, or add a point at another speed, pressure ratio or altitude"
         )
     weak = tuple(words(Vt[k]) for k in range(len(s) - 1, -1, -1) if s[0] > WEAK * s[k])
     root = (Vt.T / s) / length[:, None]

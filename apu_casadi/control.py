@@ -37,7 +37,11 @@ class GovernorParameters(Parameters):
         doc="upper fuel limit", lo=1e-5,
     )  # fmt: skip
     T_aw: float = par(
-        0.1, unit="s", source="assumed: a quarter of Kp/Ki", doc="anti-windup tracking time", lo=1e-4
+        0.1,
+        unit="s",
+        source="assumed: a quarter of Kp/Ki",
+        doc="anti-windup tracking time",
+        lo=1e-4,
     )
 
     def __post_init__(self) -> None:
@@ -65,5 +69,8 @@ def governor(*, N: Any, N_ref: Any, Wf_I: Any, par: GovernorParameters) -> Gover
     """
     e = (N_ref - N) / N_ref
     demand = par.Kp * e + Wf_I
-    Wf = ca.fmax(par.Wf_min, ca.fmin(par.Wf_max, demand))
+    if isinstance(demand, float):
+        Wf: Any = max(par.Wf_min, min(par.Wf_max, demand))
+    else:
+        Wf = ca.fmax(par.Wf_min, ca.fmin(par.Wf_max, demand))
     return GovernorOut(Wf, par.Ki * e + (Wf - demand) / par.T_aw)

@@ -85,11 +85,13 @@ def plot_eigenvalues(models: Mapping[str, LinearModel]) -> Figure:
         which = dict.fromkeys(m.name.replace("_", " ") for m in models.values())
         title(ax, f"Eigenvalues: {', '.join(which)}")
         if len(models) > 1:
-            ax.legend(loc="lower left", fontsize=8.2, frameon=True, framealpha=0.92, edgecolor="none")
+            ax.legend(
+                loc="lower left", fontsize=8.2, frameon=True, framealpha=0.92, edgecolor="none"
+            )
         caption(
             fig,
-            "Named by the state that takes most part in the mode. Shaded: unstable. Dashed: constant "
-            f"damping ratio. Both axes are logarithmic beyond ±{_LINEAR:g}.",
+            "Named by the state that takes most part in the mode. Shaded: unstable. Dashed: "
+            f"constant damping ratio. Both axes are logarithmic beyond ±{_LINEAR:g}.",
         )
         return fig
 

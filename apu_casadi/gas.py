@@ -8,7 +8,7 @@ and the *change* that burning one kilogram of fuel CHx completely brings to the 
 A mixture is then given by two numbers, both per kilogram of dry air: ``FAR``, the burnt fuel, and
 ``war``, the water vapour.  Every property is linear in them, and exact for lean mixtures.  Gases
 do not dissociate; against chemical equilibrium at 8 bar that is 0.04 % of cp T in enthalpy at
-1200 K, 0.2 % at 1500 K and 1.7 % at 2200 K (tests/test_gas.py).
+1200 K, 0.2 % at 1500 K and 1.7 % at 2200 K (``apu validate --only cantera``).
 
 Two sets of coefficients, one formula:
 
@@ -41,7 +41,7 @@ T_REF = 298.15  # K, reference of sensible enthalpy and of the heating value
 P_STD = 101325.0  # Pa
 T_MID = 1000.0  # K, where the two polynomial ranges meet
 
-# Dry air by mole, as the gas-path tables of the paper were computed with (FACTS: N2 78.084 %,
+# Dry air by mole; closes the flows and temperatures of the paper's tables (N2 78.084 %,
 # O2 20.9476 %, Ar 0.9365 %, CO2 0.0319 %; U.S. Standard Atmosphere 1976).
 DRY_AIR = {"N2": 0.78084, "O2": 0.209476, "Ar": 0.009365, "CO2": 0.000319}
 M_C, M_H = 12.0107, 1.00794  # kg/kmol

@@ -20,6 +20,7 @@ import numpy as np
 
 from apu_casadi import cycle
 from apu_casadi.atmosphere import ALTITUDE_RANGE
+from apu_casadi.backend import Caller, compiled
 from apu_casadi.cycle import RPM, Cycle, DesignPoint, GasGeneratorParameters, solve_design
 from apu_casadi.discretisation import linearly_implicit_midpoint
 from apu_casadi.errors import OperatingPointError, SimulationError
@@ -38,6 +39,7 @@ __all__ = [
     "MapChoice",
 ]
 
+_MACH8 = cycle.Y.index("Mach8")
 RESIDUAL_TOL = 1e-9  # largest residual (dimensionless) with which any result is used
 
 
@@ -74,7 +76,7 @@ class MapChoice:
 # rows W2, T3, P3, T5 and HPCSM of Table 5 and HPCSM of Table 4; all other rows of Table 5 are left
 # for checking.  The Reynolds exponent 0.18 lies in the range 0.1-0.2 known for small compressors.
 COMPRESSOR_CALIBRATION = MapCalibration(
-    a_W=0.03985831, n_Re=0.17623167, k_SM=1.02900434, a_SM=1.0746332
+    a_W=0.03985831, n_Re=0.17623167, k_SM=1.02900428, a_SM=1.07463458
 )
 TURBINE_CALIBRATION = MapCalibration(a_W=0.07937522, c_PR=0.31182386)
 
@@ -211,7 +213,7 @@ class GasGenerator:
         x, z0, u, theta = self.cycle.symbols()
         dt = ca.MX.sym("dt")
         z = self.solve(z0, x, u, theta)
-        ode, A, residual = self.cycle.dfdx(x, z, u, theta)
+        ode, A, residual, _ = self.cycle.dfdx(x, z, u, theta)
         x1 = linearly_implicit_midpoint(x, ode, A, dt)
         return ca.Function(
             "gas_generator_f",
@@ -220,6 +222,23 @@ class GasGenerator:
             ["x", "u", "theta", "dt", "z0"],
             ["x1", "z", "residual"],
         )
+
+    @cached_property
+    def step(self) -> ca.Function:
+        """State update and output in one: (x, u, theta, dt, z0) -> (x1, y, z, residual).
+
+        Eq. (12) as a hot loop needs it; ``residual`` is the sum of update and output.
+        """
+        x, z0, u, theta = self.cycle.symbols()
+        dt = ca.MX.sym("dt")
+        z = self.solve(z0, x, u, theta)
+        ode, A, r, z_x = self.cycle.dfdx(x, z, u, theta)
+        x1 = linearly_implicit_midpoint(x, ode, A, dt)
+        y, z1 = self.g(x1, u, theta, z + ca.mtimes(z_x, x1 - x))  # started along the tangent
+        # a sum, not fmax, which would swallow NaN
+        r = r + y[self.Y.index("residual")]
+        names = ["x", "u", "theta", "dt", "z0"], ["x1", "y", "z", "residual"]
+        return ca.Function("gas_generator_step", [x, u, theta, dt, z0], [x1, y, z1, r], *names)
 
     @cached_property
     def g(self) -> ca.Function:
@@ -233,6 +252,58 @@ class GasGenerator:
 
     # ------------------------------------------------------------------ IGDM (Algorithm 2)
 
+    @cached_property
+    def _f_call(self) -> Caller:
+        return Caller(compiled(self.f, build=False))
+
+    @cached_property
+    def _g_call(self) -> Caller:
+        return Caller(compiled(self.g, build=False))
+
+    @cached_property
+    def stepper(self) -> Caller:
+        """:attr:`step` for hot loops: generated C where there is a compiler, compiled once."""
+        return Caller(compiled(self.step))
+
+    @cached_property
+    def _step_call(self) -> Caller:
+        # a single run is not worth seconds of compiling, but takes a library that is there
+        return Caller(compiled(self.step, build=False))
+
+    def advance(
+        self,
+        x: np.ndarray,
+        u: np.ndarray,
+        theta: np.ndarray,
+        z0: np.ndarray,
+        dt: float,
+        *,
+        step: Caller | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """State update and output in one call: returns (x1, y, z).
+
+        ``step`` is :attr:`stepper` in hot loops; by default nothing is compiled for this.
+
+        Raises
+        ------
+        SimulationError : the cycle could not be solved, or the exhaust is choked.
+        """
+        x1, y, z, r = (step or self._step_call)(x, u, theta, dt, z0)
+        self._check(float(r[0]), x1, u, theta, "step")
+        self._check_exit(y)
+        return x1, y, z
+
+    @cached_property
+    def input_ranges(self) -> dict[str, tuple[float, float]]:
+        """Inputs that the model is meant for, by name: lowest and highest value."""
+        return {
+            "Wf": (1e-6, self.gas.FAR_stoichiometric * 0.89 * self.parameters.W2 * 3),
+            "altitude": ALTITUDE_RANGE,
+            "Mach": (0.0, 0.95),
+            "dT_isa": (-60.0, 60.0),
+            "war": (0.0, 0.1),
+        }
+
     def check_inputs(self, u: np.ndarray) -> None:
         """Refuse inputs outside what the model is meant for, naming each with its range.
 
@@ -242,13 +313,7 @@ class GasGenerator:
             number, ISA deviation or humidity out of range.
         """
         v = self.U.unpack(np.asarray(u, float))
-        ranges = {
-            "Wf": (1e-6, self.gas.FAR_stoichiometric * 0.89 * self.parameters.W2 * 3),
-            "altitude": ALTITUDE_RANGE,
-            "Mach": (0.0, 0.95),
-            "dT_isa": (-60.0, 60.0),
-            "war": (0.0, 0.1),
-        }
+        ranges = self.input_ranges
         for name, (lo, hi) in ranges.items():
             if not np.all((v[name] >= lo) & (v[name] <= hi)):
                 worst = np.ravel(v[name])[np.argmax(np.abs(np.ravel(v[name]) - (lo + hi) / 2))]
@@ -285,10 +350,10 @@ class GasGenerator:
         ------
         SimulationError : the cycle could not be solved; names the residual.
         """
-        start = self.similar(ca.DM(x), ca.DM(u)) if z0 is None else z0
-        x1, z, r = self.f(x, u, theta, self.dt if dt is None else dt, start)
-        self._check(float(r), x, u, theta, "state update")
-        return np.asarray(x1).ravel(), np.asarray(z).ravel()
+        start = self.similar(x, u).full().ravel() if z0 is None else z0
+        x1, z, r = self._f_call(x, u, theta, self.dt if dt is None else dt, start)
+        self._check(float(r[0]), x, u, theta, "state update")
+        return x1, z
 
     def output(
         self, x: np.ndarray, u: np.ndarray, theta: np.ndarray, *, z0: np.ndarray | None = None
@@ -299,16 +364,18 @@ class GasGenerator:
         ------
         SimulationError : the cycle could not be solved, or the exhaust is choked.
         """
-        start = self.similar(ca.DM(x), ca.DM(u)) if z0 is None else z0
-        y, z = self.g(x, u, theta, start)
-        y = np.asarray(y).ravel()
+        start = self.similar(x, u).full().ravel() if z0 is None else z0
+        y, z = self._g_call(x, u, theta, start)
         self._check(float(y[self.Y.index("residual")]), x, u, theta, "output")
-        if y[self.Y.index("Mach8")] > 1.0:
+        self._check_exit(y)
+        return y, z
+
+    def _check_exit(self, y: np.ndarray) -> None:
+        Mach8 = float(y[_MACH8])
+        if Mach8 > 1.0:
             raise SimulationError(
-                f"exhaust exit choked (Mach {y[self.Y.index('Mach8')]:.3f}); the fixed exit is "
-                f"modelled subsonic only"
+                f"exhaust exit choked (Mach {Mach8:.3f}); the fixed exit is modelled subsonic only"
             )
-        return y, np.asarray(z).ravel()
 
     def _check(self, r: float, x: np.ndarray, u: np.ndarray, theta: np.ndarray, where: str) -> None:
         if r <= RESIDUAL_TOL:

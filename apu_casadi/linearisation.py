@@ -355,15 +355,18 @@ def linearise(
         )
     if equations is not None:  # 0 = alg gives dz = -alg_z^-1 alg_w dw
         n = nx + nu + nt
-        dz = -np.linalg.solve(J[nx + ny :, n:], J[nx + ny :, :n])
+        try:
+            dz = -np.linalg.solve(J[nx + ny :, n:], J[nx + ny :, :n])
+        except np.linalg.LinAlgError:
+            raise OperatingPointError(
+                f"{ss.name}: the algebraic equations are singular at {at()}"
+            ) from None
         J = J[: nx + ny, :n] + J[: nx + ny, n:] @ dz
     if not np.all(np.isfinite(J)):
         i, j = (int(k) for k in np.argwhere(~np.isfinite(J))[0])
         rows = [*(f"{n}_dot" for n in ss.x.names), *ss.y.names]
         columns = [*ss.x.names, *ss.u.names, *ss.theta.names]
-        raise OperatingPointError(
-            f"{ss.name}: d {rows[i]}/d {columns[j]} is not finite at {at()}"
-        )
+        raise OperatingPointError(f"{ss.name}: d {rows[i]}/d {columns[j]} is not finite at {at()}")
     cut = (nx, nx + nu)
     (A, B_u, B_theta), (C, D_u, D_theta) = (
         np.split(part, cut, axis=1) for part in (J[:nx], J[nx:])

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.errors import DataError, MapError, OperatingPointError
+from apu_casadi.errors import DataError, MapError, OperatingPointError, SignalError
 from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
 from apu_casadi.maps import map_function
 from apu_casadi.results import phases
@@ -58,17 +58,18 @@ def operating_line(
     Raises
     ------
     OperatingPointError : not one of the points exists.
+    SignalError : no shaft power.
     """
     N = gg.parameters.N if N is None else N
     if PW is None:
         top = trim_gas_generator(gg, {"N": N, "T4": gg.parameters.T4}, theta=health, **ambient)
         PW = np.linspace(0.0, top["PW"], 11)
+    if len(PW) == 0:
+        raise SignalError("an operating line needs at least one shaft power, got none")
     points = []
     for P in PW:
         try:
-            points.append(
-                trim_gas_generator(gg, {"N": N, "PW": float(P)}, theta=health, **ambient)
-            )
+            points.append(trim_gas_generator(gg, {"N": N, "PW": float(P)}, theta=health, **ambient))
         except OperatingPointError as e:
             failure = e
     if not points:
@@ -79,10 +80,9 @@ def operating_line(
 def default_lines(gg: GasGenerator) -> dict[str, list[OperatingPoint]]:
     """Return the operating lines of the design's ambient and of 8000 m, Mach 0.7 (Table 5)."""
     p = gg.parameters
-    ground = {"altitude": p.altitude, "Mach": p.Mach, "dT_isa": p.dT_isa, "war": p.war}
     where = f"{p.altitude:g} m, Mach {p.Mach:g}, ISA {p.dT_isa:+g} K"
     return {
-        where: operating_line(gg, **ground),
+        where: operating_line(gg, altitude=p.altitude, Mach=p.Mach, dT_isa=p.dT_isa, war=p.war),
         "8000 m, Mach 0.7, ISA +5 K": operating_line(gg, altitude=8000.0, Mach=0.7, dT_isa=5.0),
     }
 
@@ -258,14 +258,26 @@ def _draw(
         title(whole, f"{what}: {m.table.name}, scaled and calibrated")
         title(near, "Enlarged")
         (x0, x1), (y0, y1) = box
-        whole.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=MUTED, lw=0.9, ls="--", zorder=6)
-        fig.legend(
-            *whole.get_legend_handles_labels(), loc="lower left", bbox_to_anchor=(0.05, 0.075),
-            ncols=4, fontsize=7.8, frameon=False, columnspacing=1.6, handlelength=2.2,
+        whole.plot(
+            [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=MUTED, lw=0.9, ls="--", zorder=6
         )
-        speeds = f"Grey: lines of relative corrected speed ${symbol}$; shading: isentropic efficiency"
-        words = [f"{what} at Reynolds number index 1. {speeds} inside the table.",
-                 "Operating lines: governed speed, no shaft power (lower end) to design T4."]
+        fig.legend(
+            *whole.get_legend_handles_labels(),
+            loc="lower left",
+            bbox_to_anchor=(0.05, 0.075),
+            ncols=4,
+            fontsize=7.8,
+            frameon=False,
+            columnspacing=1.6,
+            handlelength=2.2,
+        )
+        speeds = (
+            f"Grey: lines of relative corrected speed ${symbol}$; shading: isentropic efficiency"
+        )
+        words = [
+            f"{what} at Reynolds number index 1. {speeds} inside the table.",
+            "Operating lines: governed speed, no shaft power (lower end) to design T4.",
+        ]
         if surge is not None:
             words.append("Surge line: zero stability margin.")
         if run is not None:
@@ -313,9 +325,13 @@ def _map(
         from matplotlib.colors import LinearSegmentedColormap
 
         palette = LinearSegmentedColormap.from_list("eta", _SHADE)
-        ax.contourf(x, y, p.eta, levels=[*levels, best + 1e-6], cmap=palette, extend="min", zorder=0.5)
+        ax.contourf(
+            x, y, p.eta, levels=[*levels, best + 1e-6], cmap=palette, extend="min", zorder=0.5
+        )
         shade = ax.contour(x, y, p.eta, levels=levels, colors="#7da7c4", linewidths=0.7, zorder=1)
-        ax.clabel(shade, fmt="%.3f" if zoomed else "%.2f", fontsize=6.8, colors="#41708f", inline=True)
+        ax.clabel(
+            shade, fmt="%.3f" if zoomed else "%.2f", fontsize=6.8, colors="#41708f", inline=True
+        )
     for v in np.asarray(t.N) / m.N_map_des:
         line = m.lookup(np.full(beta.shape, v), beta, 1.0)
         lx, ly = axes_of(v, line.W, line.PR)

@@ -158,7 +158,7 @@ def simulate_monolithic(
         :func:`apu_casadi.multirate.simulate_joint`; the load balanced at the start.
     dt : output interval, s; events are output instants too.  Means and rms values are over it.
     solver, rtol, atol : integrator and its tolerances; IDAS solves the gas path along with the
-        states, CVODES through a root finder (some twenty times slower).
+        states, CVODES through a root finder, which is slower.
     progress : called with (done, total) seconds after every output interval.
 
     Returns

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -43,8 +44,9 @@ from apu_casadi.events import (
     in_order,
 )
 from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.generator import MeasurementNoise
+from apu_casadi.generator import GeneratorPoint, MeasurementNoise
 from apu_casadi.machine.load import SeriesLoad
+from apu_casadi.propagation import Propagator
 from apu_casadi.results import dataset
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.simulation import stepper
@@ -86,6 +88,12 @@ EXCHANGES = {
 }
 """What ``simulate_joint(exchange=...)`` takes; the last two tell two parts of the error apart."""
 
+SOLVERS = ("cvodes", "idas", "propagator")
+#: Samples in an exchange step of exact propagation when no waveforms are kept, by "is healthy".
+#: Enough for means and rms values to 1e-5 at 20 ms; the samples themselves are exact anyway.
+SUMMARY_SAMPLES = {True: 160, False: 200}
+_HEALTHY = (0.0, math.nan, math.nan)
+_LOG = logging.getLogger("apu_casadi")
 _GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
@@ -114,7 +122,9 @@ class Noise:
         """Check that every standard deviation is a finite number >= 0 of a known signal."""
         for name in self.gas:
             if name not in GasGenerator.Y:
-                raise SignalError(f"Noise.gas: unknown {name!r} {nearest(name, GasGenerator.Y.names)}")
+                raise SignalError(
+                    f"Noise.gas: unknown {name!r} {nearest(name, GasGenerator.Y.names)}"
+                )
         for name, s in {"N": self.N, "w1": self.w1, "w2": self.w2, **self.gas}.items():
             if not (math.isfinite(s) and s >= 0):
                 raise SignalError(f"Noise.{name} must be a standard deviation >= 0, got {s!r}")
@@ -202,7 +212,9 @@ def simulate_joint(
     waveform_dt : sampling of the stored waveforms, s; None stores none.
     noise, seed : uncertainty and the seed of its random numbers.
     hook : processes the rotor speed between state update and output (Algorithm 2).
-    solver, rtol, atol : integrator of the generators and its tolerances.
+    solver, rtol, atol : integrator of the generators and its tolerances: ``"cvodes"``, ``"idas"``,
+        or ``"propagator"``, exact propagation where the load is linear (a hundred times faster
+        than real time with a C compiler; CVODES takes over by itself where it does not hold).
     progress : called with (done, total) seconds after every exchange step.
     attrs : more attributes for the dataset.
 
@@ -220,74 +232,37 @@ def simulate_joint(
     if exchange not in EXCHANGES:
         raise ScenarioError(f"exchange {exchange!r} {nearest(exchange, EXCHANGES)}")
     way = EXCHANGES[exchange]
-    gg, gen = apu.gas_generator, apu.generator
+    if solver not in SOLVERS:
+        raise ScenarioError(f"solver {solver!r} {nearest(solver, SOLVERS)}")
     ambient = Ambient() if ambient is None else ambient
     noise = Noise() if noise is None else noise
     rng = np.random.default_rng(seed)
     events = in_order(events, duration)
     if waveform_dt is not None and not 1e-7 <= waveform_dt <= dt:
         raise ScenarioError(
-            f"waveform_dt = {waveform_dt!r} s must lie between 1e-7 s and the exchange step {dt:g} s"
+            f"waveform_dt = {waveform_dt!r} s must lie between 1e-7 s and the step, {dt:g} s"
         )
     grid = exchange_grid(duration, dt, events)
-    factors = {**dict.fromkeys(gg.THETA.names, 1.0), **health_factors(health or {})}
+    factors = {**dict.fromkeys(GasGenerator.THETA.names, 1.0), **health_factors(health or {})}
 
-    # steady start
     start_load = _balanced_part(load)
     point = apu.steady_state(start_load, ambient=ambient, health=factors)
-    V_ref = point.generator.V_ref
-    w_r = apu.w_r(apu.N_ref)
-    ss, x_sg = point.generator.ss, point.generator.x
-    u_sg = gen.inputs(start_load, w_r=w_r, V_ref=V_ref)
-    th_sg = gen.fault_vector(start_load, None)
-    x, z, u, theta = point.gas.x, point.gas.z, point.gas.u.copy(), point.gas.theta
-    y, z = gg.output(x, u, theta, z0=z)
-    Wf_I = float(point.gas["Wf"])
-
-    K = grid.size - 1
-    Y = np.empty((len(gg.Y), K + 1))
-    Y[:, 0] = y
-    slow = {k: np.empty(K + 1) for k in (*MEANS, *RMS, "mu", "k_rf", "kappa", *gg.THETA.names)}
-    waves: dict[str, list[np.ndarray]] = {k: [] for k in WAVEFORMS}
-    t_waves: list[np.ndarray] = []
+    machine = _Machine(apu, point.generator, start_load, way, dt, waveform_dt, solver, rtol, atol)
+    gg, theta = apu.gas_generator, point.gas.theta
+    x, u = point.gas.x, point.gas.u.copy()
+    y, z = gg.output(x, u, theta, z0=point.gas.z)
+    Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
+    hot = gg.stepper if solver == "propagator" else None
+    book = _Book(gg, grid, machine.samples(grid))
+    book.put(0, y, machine.means_at_rest(point.generator), factors, None)
+    book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
-    now_load, now_fault = start_load, None
-    steps_sg = 0
-
-    def switch(new_load: Load, new_fault: Ttsc | None) -> None:
-        nonlocal ss, x_sg, u_sg, th_sg, now_load, now_fault
-        target = gen.variant(new_load, new_fault)
-        u_new = gen.inputs(new_load, w_r=w_r, V_ref=V_ref)
-        x_sg = gen.transfer(x_sg, ss, target, u=u_sg, theta=th_sg, u_target=u_new)
-        ss, u_sg, th_sg = target, u_new, gen.fault_vector(new_load, new_fault)
-        now_load, now_fault = new_load, new_fault
-
-    def record(k: int, means: Mapping[str, float]) -> None:
-        for name in MEANS:
-            slow[name][k] = means[name]
-        for name, square in RMS.items():
-            slow[name][k] = math.sqrt(means[square])
-        for name in gg.THETA.names:
-            slow[name][k] = factors[name]
-        f = now_fault
-        slow["mu"][k] = 0.0 if f is None else f.mu
-        slow["k_rf"][k] = math.nan if f is None else f.k_rf
-        slow["kappa"][k] = math.nan if f is None else f.kappa
-
-    y0 = point.generator.y
-    V, I = y0["V_t"], math.hypot(*(y0[f"i_{p}"] for p in "abc")) / math.sqrt(3.0)
-    record(0, {**{n: y0[n] for n in MEANS}, **dict.fromkeys(("v_a^2", "v_b^2", "v_c^2"), V**2),
-               **dict.fromkeys(("i_a^2", "i_b^2", "i_c^2"), I**2)})  # fmt: skip
-    if waveform_dt is not None:
-        t_waves.append(np.zeros(1))
-        for name in WAVEFORMS:
-            waves[name].append(np.array([y0[name]]))
     slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
     if load != start_load or fault is not None:
-        switch(load, fault)
+        machine.switch(load, fault)
         slope = None
 
-    for k in range(1, K + 1):
+    for k in range(1, grid.size):
         t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
         while pending and pending[0].t <= t0 + _GRID_TOL:
             event, slope = pending.pop(0), None
@@ -295,69 +270,236 @@ def simulate_joint(
                 factors.update(event.factors)
                 theta = gg.THETA.pack(factors)
             elif isinstance(event, LoadChange):
-                switch(event.load, now_fault)
+                machine.switch(event.load, machine.fault)
             elif isinstance(event, FaultChange):
-                switch(now_load, event.fault)
-        more = {}
+                machine.switch(machine.load, event.fault)
         if noise.w1 or noise.w2:
-            w1, w2 = noise.w1 * rng.standard_normal(3), noise.w2 * rng.standard_normal(3)
-            more = dict(zip(("w1_q", "w1_d", "w1_0", "w2_fd", "w2_kd", "w2_kq"),
-                            [*w1, *w2], strict=True))  # fmt: skip
-        n_out = 1 if waveform_dt is None else max(1, round(h / waveform_dt))
-        model, at_w_r = (ramped(ss) if way.ramp else ss), np.array(ss.u.names) == "w_r"
-        quad = (*MEANS, *RMS.values())
-        step = stepper(model, n_out, quad=quad, solver=solver, rtol=rtol, atol=atol)
-        N, u = float(x[0]), u.copy()
-        w_r = apu.w_r(N)
+            machine.disturb(noise.w1 * rng.standard_normal(3), noise.w2 * rng.standard_normal(3))
+        N = float(x[0])
         passes = 2 if slope is None and way != EXCHANGES["paper"] else way.passes
         slope = slope or 0.0
-        for _ in range(passes):
-            N_mid = N + h / 2 * slope
-            # generators over [t0, t0 + h]: at constant speed (eq. 2), or along the predicted ramp
-            u_sg = gen.inputs(now_load, w_r=w_r, V_ref=V_ref, **more)
-            if way.ramp:
-                ramp = np.where(at_w_r, apu.w_r(slope), u_sg)
-                r = step(np.append(x_sg, w_r), ramp, th_sg, h, t0=t0)
-            else:
-                r = step(x_sg, u_sg, th_sg, h, t0=t0)
-            steps_sg += int(r.stats.get("nsteps", 0))
-            # fuel held over the step, shaft power by eq. (1), then the gas generator's step
-            fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
-            if way.mid_fuel:
-                Wf_I_mid = Wf_I + h / 2 * float(fuel.Wf_I_dot)
-                fuel = governor(N=N_mid, N_ref=apu.N_ref, Wf_I=Wf_I_mid, par=apu.governor)
-            u[0], u[1] = float(fuel.Wf), apu.PW(r.mean["P_total"])
-            try:
-                x_new, z_new = gg.state_update(x, u, theta, z0=z, dt=h)
-            except SimulationError as error:
-                raise SimulationError(f"at t = {grid[k]:.6g} s: {error}") from None
-            slope = (float(x_new[0]) - N) / h
-        x_sg = r.x_end[: len(ss.x)].copy()
-        j = ss.x.index("theta_e")
-        x_sg[j] = math.remainder(x_sg[j], 2 * math.pi)
-        Wf_I = Wf_I + h * float(fuel.Wf_I_dot)
-        x, z = x_new, z_new
         try:
-            if noise.N:
+            for _ in range(passes):
+                # generators over [t0, t0 + h]: at constant speed (eq. 2), or along the ramp
+                x_sg, means, t, w = machine.step(N, slope, h, t0)
+                # fuel held over the step, shaft power by eq. (1), then the gas generator's step
+                fuel = governor(N=N, N_ref=N_ref, Wf_I=Wf_I, par=apu.governor)
+                if way.mid_fuel:
+                    N_mid, Wf_I_mid = N + h / 2 * slope, Wf_I + h / 2 * fuel.Wf_I_dot
+                    fuel = governor(N=N_mid, N_ref=N_ref, Wf_I=Wf_I_mid, par=apu.governor)
+                u[0], u[1] = fuel.Wf, apu.PW(means[0])
+                x_new, y, z_new = gg.advance(x, u, theta, z, h, step=hot)
+                slope = (float(x_new[0]) - N) / h
+            machine.x = x_sg
+            Wf_I, x, z = Wf_I + h * fuel.Wf_I_dot, x_new, z_new
+            if noise.N or hook is not None:
                 x = x + noise.N * rng.standard_normal(1)
-            if hook is not None:
-                x = np.asarray(hook(k, x), float).reshape(1)
-            y, z = gg.output(x, u, theta, z0=z)
+                if hook is not None:
+                    x = np.asarray(hook(k, x), float).reshape(1)
+                y, z = gg.output(x, u, theta, z0=z)
         except SimulationError as error:
             raise SimulationError(f"at t = {grid[k]:.6g} s: {error}") from None
-        Y[:, k] = y
-        record(k, r.mean)
-        if waveform_dt is not None:
-            t_waves.append(r.t)
-            for name in WAVEFORMS:
-                waves[name].append(r.y[ss.y.index(name)].copy())
+        book.put(k, y, means, factors, machine.fault)
+        book.wave(t, w)
         if progress is not None:
             progress(float(grid[k]), duration)
 
-    return _collect(apu, grid, Y, slow, t_waves, waves, noise, rng, attrs, {
-        "solver": solver, "rtol": rtol, "atol": atol, "dt": dt, "nsteps_generator": steps_sg,
-        "residual_max": float(Y[gg.Y.index("residual")].max()), "seed": seed, "V_ref": V_ref,
-    })  # fmt: skip
+    status = {
+        "solver": solver, "rtol": rtol, "atol": atol, "dt": dt, "exchange": exchange,
+        "nsteps_generator": machine.nsteps, "steps_propagated": machine.propagated,
+        "residual_max": float(book.Y[gg.Y.index("residual")].max()), "seed": seed,
+        "V_ref": machine.V_ref,
+    }  # fmt: skip
+    return _collect(apu, book, noise, rng, attrs, status)
+
+
+class _Machine:
+    """The generators between two exchange instants: state, load, fault and integrator.
+
+    ``solver="propagator"`` uses the exact propagation of :mod:`apu_casadi.propagation` where it
+    holds: linear load, speed held, no step shortened by an event, and not in the step after a
+    switch, in which the windings settle within microseconds.  CVODES does the others.
+    """
+
+    def __init__(
+        self,
+        apu: Apu,
+        point: GeneratorPoint,
+        load: Load,
+        way: Exchange,
+        dt: float,
+        waveform_dt: float | None,
+        solver: str,
+        rtol: float,
+        atol: float,
+    ) -> None:
+        self.apu, self.gen, self.way = apu, apu.generator, way
+        self.V_ref, self.w_r = point.V_ref, apu.w_r(apu.N_ref)
+        self.ss, self.x = point.ss, np.asarray(point.x, float)
+        self.u, self.theta = np.array(point.u, float), np.zeros(0)
+        self.load: Load = load
+        self.fault: Ttsc | None = None
+        self.dt, self.waveform_dt = dt, waveform_dt
+        self.solver, self.rtol, self.atol = solver, rtol, atol
+        self.nsteps = self.propagated = 0
+        self._fast: Propagator | None = None
+        self._settled = self.may_propagate
+        self._noisy = False
+        self._index()
+
+    @property
+    def may_propagate(self) -> bool:
+        return self.solver == "propagator" and self.way == EXCHANGES["paper"]
+
+    def _index(self) -> None:
+        self._angle = self.ss.x.index("theta_e")
+        self._w = self.ss.u.index("w_r")
+        self._rows = self.ss.y.indices(WAVEFORMS)
+
+    def n_out(self, h: float) -> int:
+        """Samples stored in a step of length h."""
+        return 1 if self.waveform_dt is None else max(1, round(h / self.waveform_dt))
+
+    def samples(self, grid: np.ndarray) -> int:
+        """Waveform samples of a whole run, the start included; 0 where none are stored."""
+        if self.waveform_dt is None:
+            return 0
+        return 1 + sum(self.n_out(float(h)) for h in np.diff(grid))
+
+    @staticmethod
+    def means_at_rest(point: GeneratorPoint) -> np.ndarray:
+        """What a step's means would be in the steady state of a balanced load."""
+        y = point.y
+        I2 = sum(y[f"i_{p}"] ** 2 for p in "abc") / 3
+        return np.array([*(y[n] for n in MEANS), *[y["V_t"] ** 2] * 3, *[I2] * 3])
+
+    def switch(self, load: Load, fault: Ttsc | None) -> None:
+        """Change load or fault at this instant; the flux linkages stay."""
+        target = self.gen.variant(load, fault)
+        u_new = self.gen.inputs(load, w_r=self.w_r, V_ref=self.V_ref)
+        self.x = self.gen.transfer(
+            self.x, self.ss, target, u=self.u, theta=self.theta, u_target=u_new
+        )
+        self.ss, self.u, self.theta = target, u_new, self.gen.fault_vector(load, fault)
+        self.load, self.fault = load, fault
+        self._fast, self._settled = None, False
+        self._index()
+
+    def disturb(self, w1: np.ndarray, w2: np.ndarray) -> None:
+        """Set the process noise of (5) and (6), V, for the next step."""
+        names = ("w1_q", "w1_d", "w1_0", "w2_fd", "w2_kd", "w2_kq")
+        self.u[self.ss.u.indices(names)] = np.concatenate([w1, w2])
+        self._noisy = True
+
+    def step(
+        self, N: float, slope: float, h: float, t0: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Advance over [t0, t0 + h]: end state, means, sample times and waveforms.
+
+        The own state is left as it was: the caller may repeat the step.
+        """
+        self.w_r = self.apu.w_r(N)
+        self.u[self._w] = self.w_r
+        full = abs(h - self.dt) < _GRID_TOL
+        if self.may_propagate and full and self._settled and not self._noisy:
+            done = self._propagate(t0)
+            if done is not None:
+                return done
+        self._settled = full
+        model = ramped(self.ss) if self.way.ramp else self.ss
+        run = stepper(
+            model,
+            self.n_out(h),
+            quad=(*MEANS, *RMS.values()),
+            solver="cvodes" if self.solver == "propagator" else self.solver,
+            rtol=self.rtol,
+            atol=self.atol,
+        )
+        if self.way.ramp:
+            u = self.u.copy()
+            u[self._w] = self.apu.w_r(slope)
+            r = run(np.append(self.x, self.w_r), u, self.theta, h, t0=t0)
+        else:
+            r = run(self.x, self.u, self.theta, h, t0=t0)
+        self.nsteps += int(r.stats.get("nsteps", 0))
+        means = np.array([r.mean[k] for k in (*MEANS, *RMS.values())])
+        return self._wrapped(r.x_end[: len(self.ss.x)]), means, r.t, r.y[self._rows]
+
+    def _propagate(self, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+        """Advance by exact propagation; None where it does not hold."""
+        if self._fast is None:
+            n = self.n_out(self.dt)
+            outputs: tuple[str, ...] = WAVEFORMS
+            if self.waveform_dt is None:
+                n, outputs = SUMMARY_SAMPLES[self.fault is None], ()
+            try:
+                self._fast = Propagator(
+                    self.gen, self.ss, self.u, self.theta, n_out=n, dt=self.dt, outputs=outputs,
+                    quad=(*MEANS, *RMS.values()),
+                )  # fmt: skip
+            except SimulationError as error:
+                _LOG.info("exact propagation not used, CVODES instead: %s", error)
+                self.solver = "cvodes"
+                return None
+        if not self._fast.valid(self.w_r):
+            return None
+        try:
+            x, w, means = self._fast(self.x, self.u, t0=t0)
+        except SimulationError as error:
+            _LOG.info("exact propagation refused a step, CVODES instead: %s", error)
+            return None
+        self.propagated += 1
+        return self._wrapped(x), means, self._fast.times(t0), w
+
+    def _wrapped(self, x: np.ndarray) -> np.ndarray:
+        """Keep the rotor angle small, so that its cosine stays accurate over hours."""
+        x = x.copy()
+        x[self._angle] = math.remainder(x[self._angle], 2 * math.pi)
+        return x
+
+
+class _Book:
+    """What a run keeps: outputs per exchange, means, health, severity, waveforms."""
+
+    def __init__(self, gg: GasGenerator, grid: np.ndarray, samples: int) -> None:
+        self.gg, self.grid = gg, grid
+        K = grid.size
+        self.Y = np.empty((len(gg.Y), K))
+        self.means = np.empty((len(MEANS) + len(RMS), K))
+        self.factors = np.empty((len(gg.THETA), K))
+        self.severity = np.empty((3, K))
+        self.t_w = np.empty(samples)
+        self.waves = np.empty((len(WAVEFORMS), samples))
+        self._n = 0
+
+    def put(
+        self,
+        k: int,
+        y: np.ndarray,
+        means: np.ndarray,
+        factors: Mapping[str, float],
+        fault: Ttsc | None,
+    ) -> None:
+        """Enter exchange instant k."""
+        self.Y[:, k] = y
+        self.means[:, k] = means
+        self.factors[:, k] = tuple(factors.values())
+        self.severity[:, k] = _HEALTHY if fault is None else (fault.mu, fault.k_rf, fault.kappa)
+
+    def wave(self, t: np.ndarray, w: np.ndarray) -> None:
+        """Append waveform samples, where any are kept."""
+        if self.t_w.size:
+            n = t.size
+            self.t_w[self._n : self._n + n] = t
+            self.waves[:, self._n : self._n + n] = w
+            self._n += n
+
+    def slow(self) -> dict[str, np.ndarray]:
+        """Means, rms values, health and severity by name."""
+        d = dict(zip(MEANS, self.means, strict=False))
+        d |= dict(zip(RMS, np.sqrt(self.means[len(MEANS) :]), strict=True))
+        d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
+        return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
 
 
 def _balanced_part(load: Load) -> Load:
@@ -372,30 +514,28 @@ def _balanced_part(load: Load) -> Load:
 
 def _collect(
     apu: Apu,
-    grid: np.ndarray,
-    Y: np.ndarray,
-    slow: Mapping[str, np.ndarray],
-    t_waves: list[np.ndarray],
-    waves: Mapping[str, list[np.ndarray]],
+    book: _Book,
     noise: Noise,
     rng: np.random.Generator,
     attrs: Mapping[str, Any] | None,
     status: Mapping[str, Any],
 ) -> xr.Dataset:
     """Put the run into a labelled dataset."""
-    gg = apu.gas_generator
-    gas = dict(zip(gg.Y.names, Y, strict=True))
-    measured = {f"{n}_meas": gas[n] + s * rng.standard_normal(grid.size) for n, s in noise.gas.items()}
+    gg, grid = apu.gas_generator, book.grid
+    gas = dict(zip(gg.Y.names, book.Y, strict=True))
+    measured = {
+        f"{n}_meas": gas[n] + s * rng.standard_normal(grid.size) for n, s in noise.gas.items()
+    }
     signals = list(gg.Y)
     signals += [
         dataclasses.replace(gg.Y[n], name=f"{n}_meas", doc=f"measured: {gg.Y[n].doc}")
         for n in noise.gas
     ]
     times = {"time": grid}
-    values: dict[str, dict[str, Any]] = {"time": {**gas, **slow, **measured}}
-    if t_waves:
-        times["time_w"] = np.concatenate(t_waves)
-        w = {n: np.concatenate(v) for n, v in waves.items()}
+    values: dict[str, dict[str, Any]] = {"time": {**gas, **book.slow(), **measured}}
+    if book.t_w.size:
+        times["time_w"] = book.t_w
+        w = dict(zip(WAVEFORMS, book.waves, strict=True))
         w["P_inst"] = w.pop("P_total")
         if noise.terminal is not None:
             y_sg = apu.generator.state_space().y

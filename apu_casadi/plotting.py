@@ -698,8 +698,8 @@ def figure_exchange_error(
             for ex in exchanges
         ]  # fmt: skip
         fig.legend(
-            handles=handles, loc="upper center", ncols=len(handles), frameon=False, fontsize=9,
-            bbox_to_anchor=(0.53, 1.0), columnspacing=1.6, handlelength=2.4,
+            handles=handles, loc="upper center", ncols=len(handles), frameon=False, fontsize=8.8,
+            bbox_to_anchor=(0.53, 1.0), columnspacing=1.2, handlelength=2.4,
         )  # fmt: skip
         text = (
             "Error of the multi-rate exchange against the unit as one model with one solver. "

@@ -42,6 +42,9 @@ from apu_casadi.statespace import StateSpace
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
 MAGNUS_TOL = 1e-8  # largest change of P, relative, when the steps it is made of are halved
 HARMONICS = 24  # highest harmonic resolved; a series that has not converged by then is refused
+DRIVE_TOL = (
+    2e-5  # largest error of E_fd, per unit, at the end of a sample; a quarter acts on average
+)
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
 _NODES = 4  # Chebyshev nodes in speed
 _GAUSS = math.sqrt(3.0) / 6.0
@@ -261,7 +264,7 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
     # -- one sample, SX
     x, P = ca.SX.sym("x", nx), ca.SX.sym("P", n * (n + 4))
     u, th = ca.SX.sym("u", nu), ca.SX.sym("t", nt)
-    h, V = ca.SX.sym("h"), ca.SX.sym("V", 2)
+    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
     u_d = ss.u.unpack(u)
 
     def rates(slow: Any, V_t: Any) -> Any:
@@ -287,8 +290,13 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
     k2 = rates(slow + h / 2 * k1, Vm)
     k3 = rates(slow + h / 2 * k2, Vm)
     k4 = rates(slow + h * k3, V1)
+    E_taken = x1[s.drive]
     x1[s.slow] = slow + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    sample = ca.Function("sample", [x, V, P, u, th, h], [x1, ca.vertcat(V1, V1_dot)], {"cse": True})
+    # V carries the terminal voltage, its rate, and the largest error of the drive so far
+    miss = ca.fmax(V[2], ca.fabs(x1[s.drive] - E_taken))
+    sample = ca.Function(
+        "sample", [x, V, P, u, th, h], [x1, ca.vertcat(V1, V1_dot, miss)], {"cse": True}
+    )
 
     # -- a group of samples unrolled, which spares copies, then all groups
     size = next(k for k in (10, 8, 5, 4, 2, 1) if n_out % k == 0)
@@ -309,9 +317,10 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
     )
     X0, U, TH, H = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt), ca.MX.sym("h")
     PP = ca.MX.sym("P", n_P, 1 if constant else n_out)
-    start = ca.vertcat(X0, *V_of(X0, U, TH), U, TH, H, *([PP] if constant else []))
+    start = ca.vertcat(X0, *V_of(X0, U, TH), 0, U, TH, H, *([PP] if constant else []))
     run = group.mapaccum("run", n_out // size, 1)
-    Xall = run(start)[1] if constant else run(start, PP)[1]
+    last, Xall = run(start) if constant else run(start, PP)
+    miss_all = last[nx + 2, n_out // size - 1]
     # -- outputs and means
     terms = []
     for q in quad:
@@ -319,18 +328,20 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
         v = y[ss.y.index(base)]
         terms.append(v**2 if power else v)
     wanted = ca.vertcat(*(y[ss.y.index(k)] for k in outputs), *terms)
-    out = ca.Function("out", [xo, uo, to], [wanted], {"cse": True})
+    # an empty input mapped over samples makes C code that newer compilers refuse
+    held, HELD = ([uo, to], [U, TH]) if nt else ([uo], [U])
+    out = ca.Function("out", [xo, *held], [wanted], {"cse": True})
     w = gregory(n_out)
-    y0 = out(X0, U, TH)
-    Y = out.map("outs", "serial", n_out, [1, 2], [])(Xall, U, TH)
+    y0 = out(X0, *HELD)
+    Y = out.map("outs", "serial", n_out, list(range(1, 1 + len(held))), [])(Xall, *HELD)
     k = len(outputs)
     means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
     return ca.Function(
         f"advance_{ss.name}_{n_out}",
         [X0, PP, U, TH, H],
-        [Xall[:, n_out - 1], Y[:k, :], means] if k else [Xall[:, n_out - 1], ca.MX(0, 1), means],
+        [Xall[:, n_out - 1], Y[:k, :], means, miss_all],
         ["x0", "P", "u", "theta", "h"],
-        ["x", "y", "mean"],
+        ["x", "y", "mean", "miss"],
     )
 
 
@@ -378,6 +389,7 @@ class Propagator:
         self._constant = constant
         fun = _advance(gen, ss, n_out, self.outputs, self.quad, constant)
         self._call = _caller(fun)
+        self._t = dt * np.arange(1, n_out + 1) / n_out
         self._angle = ss.x.index("theta_e")
         self._iw = ss.u.index("w_r")
         w_rated = gen.machine.w_rated
@@ -400,7 +412,8 @@ class Propagator:
 
         Raises
         ------
-        SimulationError : a result is not finite, or the speed is outside the table.
+        SimulationError : the exciter moves too fast for the samples, a result is not finite, or the
+            speed is outside the table; use a ``Stepper`` for this step.
         """
         w = float(u[self._iw])
         if not self.valid(w):
@@ -418,15 +431,22 @@ class Propagator:
                 T[2 * k - 1] = T[2 * k - 3] * c1 - T[2 * k - 2] * s1
                 T[2 * k] = T[2 * k - 2] * c1 + T[2 * k - 3] * s1
             P = P @ T
-        x, y, mean = self._call(x0, P, u, self.theta, self.h)
-        if not math.isfinite(float(x.sum())):
-            raise SimulationError(f"{self.ss.name}: state not finite in the step from {t0:.6g} s")
+        x, y, mean, miss = self._call(x0, P, u, self.theta, self.h)
+        if not (float(miss[0]) <= DRIVE_TOL and math.isfinite(float(x.sum()))):
+            raise SimulationError(
+                f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
+                f"{self.h:.3g} s misses it by {float(miss[0]):.1e} > {DRIVE_TOL:.0e}"
+            )
         return x, y, mean
+
+    def times(self, t0: float) -> np.ndarray:
+        """Instants of the samples of a step from t0, s."""
+        return t0 + self._t
 
     def result(self, x0: np.ndarray, u: np.ndarray, *, t0: float = 0.0) -> StepResult:
         """Advance one step, returned in the form of a ``Stepper``; ``y`` has the outputs only."""
         x, y, mean = self(x0, u, t0=t0)
-        t = t0 + self.dt * np.arange(1, self.n_out + 1) / self.n_out
+        t = self.times(t0)
         means = dict(zip(self.quad, mean.ravel().tolist(), strict=True))
         return StepResult(t, x.reshape(-1, 1).copy(), y.copy(), means, {"nsteps": self.n_out})
 

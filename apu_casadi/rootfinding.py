@@ -58,6 +58,7 @@ class Newton:
         max_iterations: int = 40,
         max_step: float = 0.3,
     ) -> None:
+        """Build residual and Jacobian as one function; see the class."""
         n = residual.size1_in(0)
         if residual.size1_out(0) != n:
             raise ValueError(f"{residual.size1_out(0)} equations for {n} unknowns")
@@ -77,7 +78,7 @@ class Newton:
         r = np.asarray(self._r(x, p)).ravel()
         norm = _norm(r)
         k = 0
-        for k in range(1, self.max_iterations + 1):  # noqa: B007 - reported below
+        for k in range(1, self.max_iterations + 1):
             if norm <= self.tol * 1e-2 or not np.isfinite(norm):
                 k -= 1
                 break

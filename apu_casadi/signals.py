@@ -50,6 +50,7 @@ class Signals(Sequence[Signal]):
     """An ordered set of :class:`Signal`, with packing and unpacking by name."""
 
     def __init__(self, signals: Sequence[Signal] = ()) -> None:
+        """Keep the signals; a name given twice is a :class:`SignalError`."""
         self._signals = tuple(signals)
         names = [s.name for s in self._signals]
         twice = sorted({n for n in names if names.count(n) > 1})
@@ -99,7 +100,7 @@ class Signals(Sequence[Signal]):
         """Show the names with units."""
         return f"Signals({', '.join(f'{s.name} [{s.unit}]' for s in self._signals)})"
 
-    def index(self, name: str, *_: Any) -> int:  # type: ignore[override]
+    def index(self, name: str, *_: Any) -> int:
         """Return the position of ``name``; raise :class:`SignalError` with the nearest name."""
         try:
             return self._index[name]

@@ -16,6 +16,7 @@ import numpy as np
 
 from apu_casadi import simulation
 from apu_casadi.apu import Apu
+from apu_casadi.errors import OperatingPointError
 from apu_casadi.events import LoadChange
 from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
@@ -166,7 +167,7 @@ def efficiency_form() -> str:
     c_N = float(scipy.optimize.brentq(excess, 0.0, 60.0, xtol=1e-4))
     other = engine(c_N)
     at = {"N": other.parameters.N, "PW": 222e3}
-    points = {
+    points: dict[str, tuple[dict[str, float], dict[str, Any]]] = {
         "6000 m, Mach 0.5, 222 kW": (at, {"altitude": 6000.0, "Mach": 0.5, "dT_isa": 5.0}),
         "ground, ISA - 30 K, 222 kW": (at, {"dT_isa": -30.0}),
     }
@@ -252,13 +253,15 @@ def _PW_100() -> float:
     return float(_apu().PW(Generator().steady_state(KW100).y["P_total"]))
 
 
-@cache
-def _most() -> float:
-    """Shaft power of the healthy unit at the governor's fuel limit, W."""
+def _reachable(PW: float) -> bool:
+    """Whether the healthy gas generator can give a shaft power, W, with the governor's fuel."""
     apu = _apu()
     gg = apu.gas_generator
-    at = {"N": gg.parameters.N, "Wf": apu.governor.Wf_max}
-    return trim_gas_generator(gg, at, dT_isa=5.0)["PW"]
+    try:
+        point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": PW}, dT_isa=5.0)
+    except OperatingPointError:
+        return False
+    return point["Wf"] <= apu.governor.Wf_max
 
 
 def neutral() -> str:
@@ -284,7 +287,7 @@ def severity() -> str:
         s = _settled(KW100, f)
         more = _apu().PW(s["P_total"] - healthy["P_total"])
         kappa = "kappa = mu" if f.kappa == f.mu else f"kappa = {f.kappa:g}"
-        beyond = ", more than the gas generator can give" if more + _PW_100() > _most() else ""
+        beyond = "" if _reachable(more + _PW_100()) else ", more than the gas generator can give"
         text.append(
             f"k_rf = {f.k_rf:g}, {kappa}: shaft power {more / 1e3:+.1f} kW{beyond}, loss "
             f"{s['P_loss_fault'] / 1e3:.2f} kW in each machine, fault branch "

@@ -18,14 +18,15 @@ from apu_casadi.errors import ApuError, DataError, ScenarioError, nearest
 KINDS = ("input", "calibrated", "predicted", "check")
 MODULES = (
     "scenarios.paper_tables",
+    "scenarios.paper_figures",
     "scenarios.checks",
     "scenarios.peers.gas",
     "scenarios.peers.machine",
-#C
+    "scenarios.peers.cycle",
 )
 
 
-class Skipped(ApuError):
+class SkippedError(ApuError):
     """A section cannot run here; the message says what it needs."""
 
 
@@ -92,7 +93,7 @@ def run(name: str) -> list[Row]:
     Raises
     ------
     ScenarioError : no section of that name.
-    Skipped : it needs a program that is not installed.
+    SkippedError : it needs a program that is not installed.
     """
     known = sections()
     if name not in known:

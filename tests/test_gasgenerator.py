@@ -105,7 +105,7 @@ def test_conservation_of_energy_of_the_whole_engine(gg, random_points):
 
 
 def test_losses_scale_with_corrected_flow_squared(random_points):
-    """FACTS 1, exact in Table 5: burner loss 3 % at the design corrected flow, squared law."""
+    """Exact in Table 5: burner loss 3 % at the design corrected flow, squared law."""
     for p in random_points:
         corrected = p["W31"] * np.sqrt(p["T3"]) / p["P3"]
         design = 0.89 * 3.1442 * np.sqrt(568.1749) / 802494.0
@@ -174,7 +174,7 @@ def test_discrete_step_is_second_order(gg):
 
 
 def test_exact_derivatives_equal_central_differences(gg):
-    """Jacobians of f and g through the root finder against differences (h^2 error of the latter)."""
+    """Jacobians of f and g through the root finder against differences (their h^2 error)."""
     ss = gg.state_space
     p = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": 3e5}, **ISA5)
     for fun in (ss.f, ss.g):
@@ -260,4 +260,5 @@ def test_impossible_design_data_are_refused():
 
 def test_speed_unit(gg):
     """Table 3's 36050 r/min in rad/s."""
-    assert gg.parameters.N / RPM == pytest.approx(36050.0, rel=1e-15)
+    speed_rpm = gg.parameters.N / RPM
+    assert speed_rpm == pytest.approx(36050.0, rel=1e-15)

@@ -1,17 +1,17 @@
 """The starter/generator against closed solutions, an independent phase-domain machine, and itself.
 
-The independent machine is the textbook one in phase variables (Krause, Analysis of Electric
-Machinery, ch. 5) with rotor-dependent inductances and the fault as a shunt R-L from a terminal to
-the machine neutral.  It shares no code and no transformation with the package.
+The independent machine, in tests/phase_coordinates.py, is the textbook one in phase variables with
+the fault as a shunt R-L from a terminal to the machine neutral.  It shares no code and no
+transformation with the package.
 """
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.integrate
 from numpy.testing import assert_allclose
+from phase_coordinates import independent_machine
 
 from apu_casadi import simulation
 from apu_casadi.errors import OperatingPointError, ParameterError, SignalError
@@ -126,101 +126,6 @@ def test_steady_state_refuses(arguments, message):
 
 
 # -- an independent machine -------------------------------------------------------------------
-
-
-def krause_inductance(theta):
-    """Phase-domain inductances, motor signs, rows a b c fd kd kq; Krause eqs. 5.2-8 to 5.3-18."""
-    A, B = (P.L_md + P.L_mq) / 3, (P.L_md - P.L_mq) / 3
-    s = 2 * np.pi / 3
-    L = np.zeros((6, 6), dtype=np.result_type(theta, float))
-    for j, k in ((0, 0), (1, 1), (2, 2)):
-        L[j, k] = P.L_ls + A - B * np.cos(2 * (theta - j * s))
-    for j, k, shift in ((0, 1, np.pi / 3), (0, 2, -np.pi / 3), (1, 2, np.pi)):
-        L[j, k] = L[k, j] = -A / 2 - B * np.cos(2 * (theta - shift))
-    for j in range(3):
-        L[j, 3] = L[j, 4] = P.L_md * np.sin(theta - j * s)
-        L[j, 5] = P.L_mq * np.cos(theta - j * s)
-    L[3:, :3] = 2 / 3 * L[:3, 3:].T
-    L[3:5, 3:5] = P.L_md
-    L[3, 3] += P.L_lfd
-    L[4, 4] += P.L_lkd
-    L[5, 5] = P.L_mq + P.L_lkq
-    return L
-
-
-def independent_machine(point, load, fault, t_end, n_out, *, isolated=False):
-    """Healthy phase-domain machine with shunt R-L and AC5A, from the package's steady state.
-
-    Returns phase voltages (3, n), terminal currents (3, n) and the shunt current (n,).
-    """
-    e = ExciterParameters()
-    k = "abc".index(fault.phase)
-    x0 = point.ss.x.unpack(point.x)
-    theta0 = x0["theta_e"]
-    R = np.array(load.R)
-    R_sh, L_sh = fault.R_shunt(P), fault.L_shunt(P)
-    if isolated and L_sh == 0:
-        raise NotImplementedError
-    B = math.log(e.S_E1 / e.S_E2) / (e.E_1 - e.E_2)
-    A = e.S_E2 * math.exp(-B * e.E_2)
-    shifts = np.array([0, 1, 2]) * 2 * np.pi / 3
-    lam0 = np.cos(theta0 - shifts) * x0["lam_sq"] + np.sin(theta0 - shifts) * x0["lam_sd"]
-    rotor0 = [x0["lam_fd"], x0["lam_kd"], x0["lam_kq"]]
-    s0 = np.array([*lam0, *rotor0, 0.0, x0["V_c"], x0["V_R"], x0["E_fd"], x0["x_F1"]])
-    r = np.array([P.r_s] * 3 + [P.r_fd, P.r_kd, P.r_kq])
-
-    def signals(t, s):
-        theta = theta0 + W * t
-        L = krause_inductance(theta)
-        i = np.linalg.solve(L, s[:6])  # motor signs; the stator's output is -i
-        out = -i[:3]
-        V_fd = P.V_fd_base * s[9]
-        if L_sh == 0:  # grounded: the shunt is a resistance beside the load's
-            R_eff = R.copy()
-            R_eff[k] = R[k] * R_sh / (R[k] + R_sh)
-            v = R_eff * out
-            i_sh = v[k] / R_sh
-        else:
-            i_sh = s[6]
-            i_load = out.copy()
-            i_load[k] -= i_sh
-            v = R * i_load
-            if isolated:  # the star point moves so that the load's currents keep adding to zero
-                dL = krause_inductance(theta + 1e-30j).imag / 1e-30 * W
-
-                def drift(v_n):
-                    u = np.concatenate([v + v_n, [V_fd, 0, 0]])
-                    di = np.linalg.solve(L, u - r * i - dL @ i)
-                    return -di[:3].sum() - (v[k] + v_n - R_sh * i_sh) / L_sh
-
-                at_0, at_1 = drift(0.0), drift(1.0)
-                v = v - at_0 / (at_1 - at_0)
-        out_load = out.copy()
-        out_load[k] -= i_sh
-        return v, out_load, i_sh, i, V_fd
-
-    def rates(t, s):
-        v, _, i_sh, i, V_fd = signals(t, s)
-        dlam = np.concatenate([v, [V_fd, 0, 0]]) - r * i
-        di_sh = 0.0 if L_sh == 0 else (v[k] - R_sh * i_sh) / L_sh
-        # space vector without the zero sequence
-        V_t = math.sqrt(2 / 3 * (v @ v - v.sum() ** 2 / 3)) / math.sqrt(2) / P.V_rated_rms
-        V_c, V_R, E, x_F = s[7:]
-        V_F = e.K_F / e.T_F1 * (E - x_F)
-        dV_R = (e.K_A * (point.V_ref - V_c - V_F) - V_R) / e.T_A
-        dV_R = max(min(dV_R, (e.V_R_max - V_R) / e.T_lim), (e.V_R_min - V_R) / e.T_lim)
-        S = A * math.exp(B * E)
-        d_ex = [(V_t - V_c) / e.T_R, dV_R, (V_R - (e.K_E + S) * E) / e.T_E, (E - x_F) / e.T_F1]
-        return np.concatenate([dlam, [di_sh], d_ex])
-
-    t = np.linspace(0, t_end, n_out + 1)
-    sol = scipy.integrate.solve_ivp(
-        rates, (0, t_end), s0, "DOP853", t_eval=t, rtol=1e-10, atol=1e-12
-    )
-    assert sol.success
-    rows = [signals(ti, si)[:3] for ti, si in zip(sol.t, sol.y.T, strict=True)]
-    v, i, i_sh = (np.array(c).T for c in zip(*rows, strict=True))
-    return SimpleNamespace(t=sol.t, v=v, i=i, i_sh=i_sh)
 
 
 @pytest.mark.parametrize(

@@ -94,8 +94,10 @@ def stacked(m):
 
 def models(apu, point):
     gg, gen = apu.gas_generator, apu.generator
-    yield gg.state_space, (point.gas.x, point.gas.u, point.gas.theta), linearise_gas_generator(
-        gg, point.gas
+    yield (
+        gg.state_space,
+        (point.gas.x, point.gas.u, point.gas.theta),
+        linearise_gas_generator(gg, point.gas),
     )
     for load in LOADS.values():
         p = gen.steady_state(load)
@@ -116,7 +118,9 @@ def test_equal_to_central_differences(apu, point):
         keep = [i for i, n in enumerate(rows) if n not in NOT_SMOOTH]
         ours = stacked(m)
         off = np.abs(ours - J)[keep] - error[keep]
-        i, j = np.unravel_index(np.argmax(off / (np.abs(J[keep]) + error[keep] + 1e-300)), off.shape)
+        i, j = np.unravel_index(
+            np.argmax(off / (np.abs(J[keep]) + error[keep] + 1e-300)), off.shape
+        )
         columns = [*ss.x.names, *ss.u.names, *ss.theta.names]
         assert off.max() <= 0, (
             f"{ss.name}: d {rows[keep[i]]}/d {columns[j]} = {ours[keep[i], j]:.9g}, difference "
@@ -161,15 +165,17 @@ def test_steady_point_is_steady(joint, point):
 @pytest.mark.parametrize(
     ("what", "kind", "size", "end", "outputs"),
     [
-        ("N_ref", "u", 8.0, 0.5, ("N", "T3", "Wf")),
-        ("R", "u", 0.02, 0.3, ("N", "V_t", "E_fd")),
-        ("V_ref", "u", 0.01, 0.3, ("V_t", "P_total", "i_fd")),
-        ("f_eta_c", "theta", 0.004, 0.5, ("N", "T4", "SM")),
-        ("f_W_t", "theta", 0.004, 0.5, ("N", "P3", "T5")),
+        ("N_ref", "u", 8.0, 0.25, ("N", "T3", "Wf")),
+        ("R", "u", 0.02, 0.2, ("N", "V_t", "E_fd")),
+        ("V_ref", "u", 0.01, 0.2, ("V_t", "P_total", "i_fd")),
+        ("f_eta_c", "theta", 0.004, 0.25, ("N", "T4", "SM")),
+        ("f_W_t", "theta", 0.004, 0.25, ("N", "P3", "T5")),
         ("h", "theta", 2e-4, 0.3, ("N", "V_t", "P_loss_fault")),
     ],
 )
-def test_error_of_a_step_response_is_of_second_order(apu, point, joint, what, kind, size, end, outputs):
+def test_error_of_a_step_response_is_of_second_order(
+    apu, point, joint, what, kind, size, end, outputs
+):
     """A linear model misses a step by c size^2 + d size^3: half the step, a quarter of the error.
 
     Ratio within 4 +- 0.5: the third order of steps as small as these stays below a tenth.  The
@@ -195,10 +201,13 @@ def test_error_of_a_step_response_is_of_second_order(apu, point, joint, what, ki
 
 
 def test_step_response_of_the_gas_generator(apu, point):
-    """Fuel and load steps of the gas generator alone, as above."""
+    """Fuel and load steps of the gas generator alone, as above.
+
+    Over half a second: without a governor the speed then runs away so far that third order counts.
+    """
     gg = apu.gas_generator
     m = linearise_gas_generator(gg, point.gas)
-    grid = np.linspace(0, 2.0, 9)
+    grid = np.linspace(0, 0.5, 6)
     for name, size in (("Wf", 4e-4), ("PW", 6e3)):
         error = []
         for k in (1.0, 0.5):
@@ -209,7 +218,8 @@ def test_step_response_of_the_gas_generator(apu, point):
             )
             x, _ = m.step_response(grid, u={name: k * size})
             error.append(ds["N"].values[-1] - x[0, -1])
-        assert error[0] / error[1] == pytest.approx(4, abs=0.5), name
+        ratio = error[0] / error[1]
+        assert ratio == pytest.approx(4, abs=0.5), f"after a step of {name}: ratio {ratio:.3f}"
 
 
 def test_eigenvalue_is_the_decay_of_a_simulation(apu, point):
@@ -254,7 +264,9 @@ def test_slow_oscillation_of_the_unit_shows_in_a_simulation(apu):
     root = np.roots([1, -a, b])[0]
     found = np.log(complex(root)) / (T * 1e-4)
     assert abs(found.imag) == pytest.approx(mode.value.imag, rel=0.01)
-    assert found.real == pytest.approx(mode.value.real, rel=0.01 * abs(mode.value / mode.value.real))
+    assert found.real == pytest.approx(
+        mode.value.real, rel=0.01 * abs(mode.value / mode.value.real)
+    )
 
 
 def test_participations_sum_to_one_and_pairs_are_listed_once(joint):
@@ -293,7 +305,7 @@ def test_column_of_h_is_the_period_mean_of_the_faulty_generator(apu):
 
     Simulated with the coupled fault at h = 1e-4 and 2e-4 from the healthy steady state to rest:
     the mean's quotient by h, extrapolated to h = 0, within 1e-3 of the linear model's steady value
-    -C A^-1 B + D (mean over the last 8 periods, 20 ms; the slowest mode, 7 1/s, has gone after 1 s).
+    -C A^-1 B + D.  Means are over 8 periods, 20 ms; after 3 s the slowest mode, 7 1/s, has gone.
     """
     gen = apu.generator
     load = LOADS["resistive"]
@@ -308,7 +320,7 @@ def test_column_of_h_is_the_period_mean_of_the_faulty_generator(apu):
         ss = gen.variant(load, fault)
         step = simulation.stepper(ss, 400, quad=names, rtol=1e-9, atol=1e-11)
         u, theta = gen.inputs(load), gen.fault_vector(load, fault)
-        x = step(p.x, u, theta, 1.2).x_end
+        x = step(p.x, u, theta, 3.0).x_end
         last = step(x, u, theta, 0.02)
         found[h] = {n: (last.mean[n] - p.y[n]) / h for n in names}
         ripple = np.ptp(last.y[ss.y.index("T_e")]) / h
@@ -320,7 +332,7 @@ def test_column_of_h_is_the_period_mean_of_the_faulty_generator(apu):
 
 
 def test_averaged_fault_does_not_depend_on_its_representation(apu):
-    """FACTS 3: only h enters terminal quantities if kappa = mu; and outputs are those on the axes."""
+    """If kappa = mu only h enters terminal quantities, and outputs are means on the axes."""
     gen = apu.generator
     p = gen.steady_state(LOADS["resistive"])
     ss, x, u, _ = generator_vectors(gen, p)
@@ -386,7 +398,9 @@ def test_labelled(joint):
     assert joint.derivative("T3", "f_eta_c") < 0, "a better compressor heats the air less"
     assert str(ds["x_unit"].sel(x="lam_sq").item()) == "Wb"
     assert str(ds["xdot_unit"].sel(xdot="N").item()) == "rad/s/s"
-    empty = linearise_generator(Generator(), Generator().steady_state(LOADS["inductive"])).labelled()
+    empty = linearise_generator(
+        Generator(), Generator().steady_state(LOADS["inductive"])
+    ).labelled()
     assert empty["B_theta"].shape == (len(empty["xdot"]), 0)
 
 
@@ -417,7 +431,7 @@ def test_failures_name_what_is_wrong(apu, point, joint):
         linearise(gg.state_space, x, u, [1, math.nan, 1, 1])
     with pytest.raises(SignalError, match="together"):
         linearise(gg.state_space, x, u, theta, z=point.gas.z)
-    with pytest.raises(OperatingPointError, match="residual of .*N = 3775"):
+    with pytest.raises(OperatingPointError, match=r"residual of .*N = 3775"):
         linearise(gg.state_space, x, u, theta, equations=gg.equations, z=point.gas.z * 1.01)
     with pytest.raises(SignalError, match="did you mean 'T3'"):
         joint.derivative("t3", "N_ref")

@@ -9,7 +9,9 @@ from scenarios import validation
 from scenarios.validation import Row
 
 
-@pytest.mark.parametrize("name", ["table4", "table5", "table7", "table8", "generator", "conservation"])
+@pytest.mark.parametrize(
+    "name", ["table4", "table5", "table7", "table8", "generator", "conservation"]
+)
 def test_every_row_is_within_its_tolerance(name):
     """The goals of the tables and checks; ``apu validate`` prints the rows."""
     rows = validation.run(name)

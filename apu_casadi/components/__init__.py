@@ -1,0 +1,1 @@
+"""The components of the gas path, one module each; pure functions of symbols."""

@@ -77,5 +77,5 @@ def static_state(
 
 
 def _signed_root(y: Any) -> Any:
-    """sqrt(y) to 1e-10 for y > 50 m2/s2; odd and smooth through zero, so that iterates may cross it."""
+    """sqrt(y) to 1e-10 for y > 50 m2/s2; odd and smooth through zero: iterates may cross it."""
     return y / ca.sqrt(ca.sqrt(y**2 + 1e-6))

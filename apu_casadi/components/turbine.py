@@ -1,7 +1,7 @@
 """Cooled turbine: vane cooling 4 -> 41, rotor 41 -> 50, rotor cooling 50 -> 5.
 
 The vane cooling air mixes before the rotor and does work; the rotor cooling air mixes behind it
-and does none (decoded from Tables 4 and 5: FACTS, section 1).
+and does none (decoded from the flows of Tables 4 and 5).
 """
 
 from __future__ import annotations

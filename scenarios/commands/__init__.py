@@ -14,11 +14,15 @@ from typing import Protocol, cast
 MODULES: tuple[str, ...] = (
     "scenarios.commands.calibrate",
     "scenarios.commands.linearise",
+    "scenarios.commands.compile",
+    "scenarios.commands.deck",
     "scenarios.commands.errata",
     "scenarios.commands.list",
     "scenarios.commands.maps",
     "scenarios.commands.multirate",
     "scenarios.commands.run",
+    "scenarios.commands.study",
+    "scenarios.commands.trim",
     "scenarios.commands.validate",
 )
 """The modules of the subcommands, in the order of the help text; add new ones here."""

@@ -42,9 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare arguments and options."""
     parser.add_argument("file", metavar="FILE", nargs="?", help="CSV of points (see above)")
     parser.add_argument(
-        "--free", metavar="A,B", help="numbers to fit, comma separated (default: the six of the code)"
+        "--free",
+        metavar="A,B",
+        help="numbers to fit (default: the six of the code)",
     )
-    parser.add_argument("--write-points", metavar="CSV", help="write the points used, as a template")
+    parser.add_argument("--write-points", metavar="CSV", help="write the points, as a template")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -156,9 +158,13 @@ def text(result: CalibrationResult) -> str:
             f"{result.covariance[i, j] / (spread[i] * spread[j]):+6.2f}" for j in range(i + 1)
         )
         lines.append(f"{n:<{width}}  {row}")
-    lines += ["", f"{'point':<12} {'':>6} {'measured':>14} {'model':>14} {'sigma':>10} {'error/sigma':>12}"]
     lines += [
-        f"{r.point:<12} {r.name:>6} {r.measured:14.7g} {r.model:14.7g} {r.sigma:10.2e} {r.error:12.4f}"
+        "",
+        f"{'point':<12} {'':>6} {'measured':>14} {'model':>14} {'sigma':>10} {'error/sigma':>12}",
+    ]
+    lines += [
+        f"{r.point:<12} {r.name:>6} {r.measured:14.7g} {r.model:14.7g} {r.sigma:10.2e} "
+        f"{r.error:12.4f}"
         for r in result.residuals
     ]
     lines += [

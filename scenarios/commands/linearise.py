@@ -29,9 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--constant-power", action="store_true", help="a load that holds its power")
     parser.add_argument("--altitude", metavar="M", type=float, default=0.0, help="default 0 m")
     parser.add_argument("--mach", metavar="MA", type=float, default=0.0, help="default 0")
-    parser.add_argument("--disa", metavar="K", type=float, default=5.0, help="ISA deviation, default 5 K")
+    parser.add_argument(
+        "--disa", metavar="K", type=float, default=5.0, help="ISA deviation, default 5 K"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON, with all matrices")
-    parser.add_argument("--out", metavar="DIR", default="results/linearise", help="default %(default)s")
+    parser.add_argument(
+        "--out", metavar="DIR", default="results/linearise", help="default %(default)s"
+    )
     parser.add_argument("--no-figures", action="store_true", help="draw no figure")
 
 
@@ -109,7 +113,7 @@ def report(model: LinearModel) -> dict[str, Any]:
 def table(model: LinearModel) -> str:
     """Return the eigenvalues as a text table."""
     lines = [
-        f"{model.name}: {len(model.x)} states",
+        f"{model.name}: {len(model.x)} state{'s' if len(model.x) > 1 else ''}",
         f"{'real [1/s]':>12} {'imag [rad/s]':>13} {'time const. [s]':>16} {'damping':>8} "
         f"{'freq. [Hz]':>11}  participating states",
     ]

@@ -14,7 +14,9 @@ HELP = "draw the component maps with operating lines and a run"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--trajectory", metavar="FILE.nc", help="a run, as 'apu run' writes it")
-    parser.add_argument("--out", metavar="DIR", default="results/maps", help="folder (default %(default)s)")
+    parser.add_argument(
+        "--out", metavar="DIR", default="results/maps", help="folder (default %(default)s)"
+    )
     parser.add_argument("--no-lines", action="store_true", help="draw no operating lines")
 
 

@@ -52,7 +52,9 @@ def run(args: argparse.Namespace) -> int:
     if args.page:
         page = Path(args.page)
         registry.prepare(page.parent / "images")
-        made.append(study.write_figure(rows, page.parent / "images" / "multirate_error.png"))
+        made.append(
+            study.write_figure(rows, page.parent / "images" / "multirate_error.png", dpi=120)
+        )
         made.append(pages.write_text(page, study.page(rows)))
     if args.json:
         print(text)

@@ -1,6 +1,7 @@
 """Recompute the paper's tables and the numerical checks, and print them row by row.
 
-Exit status 1 when a row falls short of its tolerance.
+Exit status 1 when a row falls short of its tolerance, or a section that ``--only`` names cannot
+run; without ``--only``, sections whose peer is not installed are skipped with the reason.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 
 NAME = "validate"
@@ -19,24 +21,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", metavar="A,B", help="sections to run, comma separated")
     parser.add_argument("--list", action="store_true", help="list the sections and stop")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--pycycle-python", metavar="PYTHON", help="a Python that has pyCycle, for section pycycle"
+    )
+    parser.add_argument("--write", metavar="FILE", help="also write the page, VALIDATION.md")
+    parser.add_argument(
+        "--figures", metavar="DIR", help="draw Figures 15 to 25 of the paper there, and stop"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the sections; return 1 if a row falls short."""
     from scenarios import validation
 
+    if args.pycycle_python:
+        os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
     known = validation.sections()
     if args.list:
         for name, (title, _) in known.items():
             print(f"{name:<14} {title}")
         return 0
+    if args.figures:
+        from scenarios import paper_figures
+
+        print(*paper_figures.write_figures(args.figures), sep="\n")
+        return 0
     names = [n.strip() for n in args.only.split(",") if n.strip()] if args.only else list(known)
     report = {}
+    skipped = {}
     failed = 0
     for name in names:
         if name in known and sys.stderr.isatty():
             print(f"running {name} ...", file=sys.stderr)
-        rows = validation.run(name)
+        try:
+            rows = validation.run(name)
+        except validation.SkippedError as reason:
+            skipped[name] = str(reason)
+            if not args.json:
+                print(f"\n{name}: {known[name][0]}\n  skipped: {reason}")
+            continue
         failed += sum(not r.passed for r in rows)
         report[name] = rows
         if not args.json:
@@ -54,13 +77,19 @@ def run(args: argparse.Namespace) -> int:
             ]
             for name, rows in report.items()
         }
-        print(json.dumps({"sections": out, "rows": total, "failed": failed}, indent=2))
+        summary = {"rows": total, "failed": failed, "skipped": skipped}
+        print(json.dumps({"sections": out, **summary}, indent=2))
     else:
-        print(f"\n{total} rows, {failed} short of their tolerance")
-    return 1 if failed else 0
+        left_out = f"; skipped: {', '.join(skipped)}" if skipped else ""
+        print(f"\n{total} rows, {failed} short of their tolerance{left_out}")
+    if args.write:
+        from scenarios import pages, validation_page
+
+        pages.write_text(args.write, validation_page.page(report, skipped))
+    return 1 if failed or (args.only and skipped) else 0
 
 
-def table(rows: list) -> str:  # type: ignore[type-arg]
+def table(rows: list) -> str:
     """Return the rows as a text table."""
     head = (
         "quantity",

@@ -16,6 +16,7 @@ import json
 import os
 import sys
 import time
+from importlib.metadata import version
 from typing import Any
 
 import dpsimpy
@@ -72,9 +73,7 @@ def run(case: dict[str, Any], dt: float) -> dict[str, Any]:
     simulation.set_final_time(case["t_end"] + 5 * dt)
     simulation.set_domain(dpsimpy.Domain.EMT)
     simulation.do_init_from_nodes_and_terminals(False)
-    simulation.add_event(
-        dpsimpy.event.SwitchEvent3Ph(case["t_switch"], switch, not case["closed"])
-    )
+    simulation.add_event(dpsimpy.event.SwitchEvent3Ph(case["t_switch"], switch, not case["closed"]))
     start = time.perf_counter()
     simulation.start()
     v, i = terminal.attr("v"), generator.attr("i_intf")
@@ -98,4 +97,4 @@ if __name__ == "__main__":
     answer = [[run(case, dt) for dt in given["steps"]] for case in given["cases"]]
     sys.stdout.flush()
     os.dup2(keep, 1)
-    json.dump({"version": dpsimpy.__version__, "runs": answer}, sys.stdout)
+    json.dump({"version": version("dpsim"), "runs": answer}, sys.stdout)

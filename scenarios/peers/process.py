@@ -18,7 +18,8 @@ def run_script(python: str, script: str, case: dict[str, Any]) -> dict[str, Any]
 
     A process of its own keeps the peer's prints, log folders (the working directory is a
     temporary one), warnings and package versions away from ours; ``-I`` keeps our modules away
-    from it.
+    from it.  Warnings are not shown: OpenMDAO gives hundreds about bounds met by first iterates.
+    What counts is checked by the scripts, which fail where a solution does not converge.
 
     Parameters
     ----------

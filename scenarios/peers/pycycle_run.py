@@ -168,9 +168,7 @@ class Turboshaft(pyc.Cycle):
         balance = self.add_subsystem("balance", om.BalanceComp())
         if design:
             self.set_input_defaults("inlet.Fl_I:stat:W", val=3.0, units="kg/s")
-            balance.add_balance(
-                "FAR", eq_units="degK", lower=1e-4, val=0.018, rhs_name="T4_target"
-            )
+            balance.add_balance("FAR", eq_units="degK", lower=1e-4, val=0.018, rhs_name="T4_target")
             self.connect("balance.FAR", "burner.Fl_I:FAR")
             self.connect("burner.Fl_O:tot:T", "balance.lhs:FAR")
             balance.add_balance("PR", val=7.3, lower=1.5, upper=20.0, rhs_name="NPR_target")
@@ -218,7 +216,7 @@ class Points(pyc.MPCycle):
 
 
 def one_slice(source: Any) -> Any:
-    """Return a map with its default alpha slice repeated: splines want five points on every axis."""
+    """Return a map with its alpha slice repeated: splines want five points on every axis."""
     table = copy.deepcopy(source)
     alpha = table.param_data[0]
     alpha["values"] = float(alpha["values"][0]) + np.arange(5.0)
@@ -230,8 +228,8 @@ def one_slice(source: Any) -> Any:
 def fuel_enthalpy(x: float, LHV: float) -> float:
     """Return the fuel's enthalpy, J/kg, that gives the heating value LHV at 298.15 K.
 
-    CHx + (1 + x/4) O2 -> CO2 + x/2 H2O, from pyCycle's own species.  Left at its default of zero
-    the fuel flow comes out 4-5 % low.
+    CHx + (1 + x/4) O2 -> CO2 + x/2 H2O, from pyCycle's own species.  Left at its default of zero,
+    the fuel flow comes out 4.0 % low.
     """
     data = pyc.species_data.janaf
     species = pyc.species_data.Properties(data, init_elements={k: 1.0 for k in ("C", "H", "O")})
@@ -319,12 +317,12 @@ def main(case: dict[str, Any]) -> dict[str, Any]:
     put("OD", "turb.map.PRmap", case["turbine_PRmap"])
 
     points = []
-    for k, c in enumerate(case["points"]):
+    for n, c in enumerate(case["points"]):
         ambient("OD", c)
         put("OD", "shaft.HPX", c["P_shaft"], "W")
         prob.run_model()
         points.append(read(prob, "OD"))
-        if k == 0:
+        if n == 0:
             cold = time.perf_counter() - start
     return {
         "design": read(prob, "DESIGN"),

@@ -1,0 +1,64 @@
+"""Compile the hot functions ahead of time, so that nothing is compiled at first use.
+
+The libraries go to the folder that $APU_CACHE_DIR names, by default ~/.cache/apu_casadi.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+
+NAME = "compile"
+HELP = "compile the hot functions to C libraries ahead of time"
+
+HOT: tuple[tuple[str, str], ...] = (("trim", "apu_casadi.trimming:hot_functions"),)
+"""(name, "module:callable"); the callable compiles its functions and returns their names."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--clear", action="store_true", help="delete the libraries and stop")
+    parser.add_argument("--only", metavar="A,B", help="groups to compile, comma separated")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compile every group; return 1 if there is no compiler."""
+    from importlib import import_module
+
+    from apu_casadi import backend
+    from apu_casadi.errors import BackendError, nearest
+
+    if args.clear:
+        n = backend.clear_cache()
+        print(json.dumps({"deleted": n}) if args.json else f"{n} libraries deleted")
+        return 0
+    groups = dict(HOT)
+    only = [n.strip() for n in args.only.split(",")] if args.only else list(groups)
+    for name in only:
+        if name not in groups:
+            raise BackendError(f"--only: unknown group {name!r} {nearest(name, groups)}")
+    folder, compiler = backend.cache_folder(), backend.find_compiler()
+    if backend.backend_in_use() == "vm" or folder is None:
+        print(
+            "apu: no C compiler found, or APU_BACKEND=vm, or no folder to write to: everything "
+            "runs in CasADi's virtual machine",
+            file=sys.stderr,
+        )
+        return 1
+    rows = []
+    for group in only:
+        module, _, function = groups[group].partition(":")
+        t = time.perf_counter()
+        names = getattr(import_module(module), function)()
+        rows.append({"group": group, "functions": names, "seconds": time.perf_counter() - t})
+        if not args.json:
+            print(f"{group:<12} {len(names):3d} functions  {rows[-1]['seconds']:6.1f} s")
+    if args.json:
+        out = {"folder": str(folder), "compiler": compiler, "groups": rows}
+        print(json.dumps(out, indent=2))
+    else:
+        print(f"in {folder}")
+    return 0

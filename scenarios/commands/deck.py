@@ -1,0 +1,93 @@
+"""Write a performance deck: steady points over altitude, Mach number, ISA deviation, shaft power.
+
+An axis is FROM:TO:COUNT or a comma-separated list:
+
+  apu deck --altitude 0:12000:13 --mach 0:0.8:9 --disa=-30:35:14 --power 0:5e5:60 --out deck.nc
+
+Points that do not exist, or lie beyond a limit, are NaN; ``status`` says why.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+NAME = "deck"
+HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
+LARGEST = 5_000_000  # points; outputs alone are then 1.8 GB
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--altitude", default="0:12000:7", metavar="AXIS", help="m")
+    parser.add_argument("--mach", default="0:0.8:5", metavar="AXIS", help="flight Mach number")
+    parser.add_argument("--disa", default="0", metavar="AXIS", help="ISA deviation, K")
+    parser.add_argument("--power", default="0:500e3:11", metavar="AXIS", help="shaft power, W")
+    parser.add_argument("--outputs", metavar="A,B", help="outputs to keep (default: all)")
+    parser.add_argument("--out", default="deck.nc", metavar="FILE", help="netCDF file")
+    parser.add_argument("--threads", type=int, help="default: all cores")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve the grid and write it."""
+    import numpy as np
+
+    from apu_casadi.errors import DataError, ScenarioError
+    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.trimming import MEANING, Status, performance_deck
+
+    axes: dict[str, Any] = {
+        "altitude": _axis("--altitude", args.altitude), "Mach": _axis("--mach", args.mach),
+        "dT_isa": _axis("--disa", args.disa), "PW": _axis("--power", args.power),
+    }  # fmt: skip
+    points = int(np.prod([len(v) for v in axes.values()]))
+    if points > LARGEST:
+        raise ScenarioError(f"{points} points asked for, {LARGEST} at most")
+    keep = None if args.outputs is None else [n.strip() for n in args.outputs.split(",")]
+    t = time.perf_counter()
+    deck = performance_deck(
+        GasGenerator(), **axes, outputs=keep, n_threads=args.threads
+    )  # fmt: skip
+    t = time.perf_counter() - t
+    try:
+        Path(args.out).parent.mkdir(parents=True, exist_ok=True)
+        deck.to_netcdf(args.out)
+    except OSError as e:
+        raise DataError(f"{args.out} cannot be written: {e.strerror or e}") from None
+    status = deck["status"].values
+    counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}
+    if args.json:
+        print(json.dumps({"points": points, "seconds": t, "counts": counts, "file": args.out}))
+        return 0
+    print(f"{points} points in {t:.2f} s ({1e6 * t / points:.0f} us each)")
+    for name, n in counts.items():
+        print(f"  {name:<24}{n:8d}")
+    print(f"written: {args.out}")
+    return 0
+
+
+def _axis(option: str, text: str) -> list[float]:
+    """Read FROM:TO:COUNT or a list."""
+    import numpy as np
+
+    from apu_casadi.errors import ScenarioError
+
+    try:
+        if ":" in text:
+            first, last, count = text.split(":")
+            if int(count) < 1:
+                raise ValueError
+            values = np.linspace(float(first), float(last), int(count))
+        else:
+            values = np.array([float(v) for v in text.split(",")])
+    except ValueError:
+        raise ScenarioError(
+            f"{option}: FROM:TO:COUNT or a list of numbers is expected, got {text!r}"
+        ) from None
+    if not np.all(np.isfinite(values)) or np.unique(values).size != values.size:
+        raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
+    return [float(v) for v in values]

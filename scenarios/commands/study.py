@@ -1,0 +1,40 @@
+"""Run a numerical study; ``apu study trim`` trims random points of the flight envelope.
+
+Exit status 1 when a point is wrong or refused without a reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+
+NAME = "study"
+HELP = "run a numerical study (trim)"
+STUDIES = ("trim",)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("study", choices=STUDIES, help="which study")
+    parser.add_argument("--points", type=int, default=10_000, help="random points (default 10000)")
+    parser.add_argument("--seed", type=int, default=1, help="of the random points (default 1)")
+    parser.add_argument("--threads", type=int, help="default: all cores")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study and print its table."""
+    from apu_casadi.errors import ScenarioError
+    from scenarios import trim_study
+
+    if args.points < 1:
+        raise ScenarioError(f"--points must be >= 1, got {args.points}")
+    if args.threads is not None and args.threads < 1:
+        raise ScenarioError(f"--threads must be >= 1, got {args.threads}")
+    report = trim_study.run(args.points, args.seed, n_threads=args.threads)
+    if args.json:
+        print(json.dumps(dataclasses.asdict(report), indent=2))
+    else:
+        print(trim_study.table(report))
+    return 1 if report.wrong or report.unexplained else 0

@@ -1,0 +1,112 @@
+"""The study of the exchange error: its norms, its page and its command."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from apu_casadi import results
+from apu_casadi.errors import ScenarioError
+from scenarios import multirate_study as study
+from scenarios.cli import main
+
+
+def rows():
+    """Errors that fall with the first power of the step, or with the second."""
+    made = []
+    for case in study.CASES:
+        made.append(study.Measured(case, "one model", math.nan, *[1e-8] * 4, cpu=10.0))
+        for ex, p in (("paper", 1), ("predicted", 2), ("corrected", 2)):
+            made += [study.Measured(case, ex, dt, *[dt**p] * 4, cpu=1.0) for dt in study.STEPS]
+        made += [study.Measured(case, ex, 0.02, *[1e-3] * 4, cpu=1.0)
+                 for ex in ("predicted speed", "predicted fuel")]  # fmt: skip
+    return made
+
+
+def run_of(dt, *, N=1.0, P=1.0, V=1.0):
+    """A joint run sampled every ``dt``; factors on speed excursion, power and voltage."""
+    t = np.arange(round(study.DURATION / dt) + 1) * dt
+    names = ("V_a_rms", "V_b_rms", "V_c_rms")
+    after = t > study.T_EVENT
+    values = {"N": 3775 + 100 * N * after, "P_total": 2e5 * np.where(after, P, 1.0)}
+    values |= {n: 230 * np.where(after, V, 1.0) for n in names}
+    return results.dataset({"time": t}, {"time": values})
+
+
+def test_norms_are_what_they_say():
+    """Known errors of speed, power and voltage, on two different grids."""
+    truth = run_of(0.02)
+    e = study.errors(run_of(0.005, N=1.03, P=1.002, V=0.999), truth)
+    assert e["N"] == pytest.approx(0.03, rel=1e-9), "of the excursion of 100 rad/s"
+    assert e["P"] == pytest.approx(0.002, rel=1e-9)
+    assert e["V"] == pytest.approx(0.001, rel=1e-9)
+    assert e["E"] == pytest.approx(0.002, rel=1e-9), "energy since the event"
+    assert max(study.errors(truth, truth).values()) == 0.0
+
+
+def test_order_is_the_slope():
+    """First and second power come out as orders 1 and 2."""
+    orders = {r["exchange"]: r["N"] for r in study.report(rows())["orders"]}
+    assert orders == pytest.approx({"paper": 1.0, "predicted": 2.0, "corrected": 2.0})
+
+
+def test_report_is_json_and_the_page_holds_every_run():
+    """NaN never reaches a file, and every measured step has its line on the page."""
+    data = rows()
+    report = json.loads(json.dumps(study.report(data), allow_nan=False))
+    assert report["runs"][0]["dt"] is None and report["runs"][1]["times_faster"] == 10.0
+    page = study.page(data)
+    assert page.count("| paper |") == len(study.STEPS) * len(study.CASES)
+    assert "54 Hz" in page, "the regulator's mode at 100 kW, from the eigenvalues"
+    assert "TTSC fault" in study.table(data)
+
+
+def test_figure_has_a_panel_for_each_quantity():
+    """Four logarithmic panels, every exchange in the legend; one step alone is refused."""
+    fig = study.figure(rows())
+    assert [ax.get_title() or ax.texts[0].get_text() for ax in fig.axes] == [
+        "Speed, of its excursion", "Power", "Voltage", "Energy",
+    ]  # fmt: skip
+    words = [t.get_text() for t in fig.legends[0].get_texts()]
+    assert len(words) == len(study.CASES) + len(study.COMPARED)
+    with pytest.raises(ScenarioError, match="two exchange steps"):
+        study.figure([r for r in rows() if r.dt == 0.02])
+
+
+def test_the_staircase_of_the_paper_s_step_is_near_the_regulator_s_mode():
+    """20 ms against the mode's period: within 15 %, which is why power errs most there."""
+    mode = study.regulator_mode()
+    assert 1 / mode.frequency == pytest.approx(0.020, rel=0.15)
+    assert 0 < mode.damping < 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--steps", "7"], "does not divide 80 ms"),
+        (["--steps", "ten"], "numbers in ms"),
+        (["--steps", "10,40", "--page", "x.md"], "20 ms"),
+    ],
+)
+def test_the_command_refuses_before_it_runs(arguments, words, capsys, tmp_path, monkeypatch):
+    """Exit status 2 and one line: what was expected."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["multirate", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_study_itself(tmp_path, capsys):
+    """All cases with three steps: first order as the paper exchanges, second order otherwise."""
+    assert main(["multirate", "--steps", "10,20,40", "--out", str(tmp_path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    for o in report["orders"]:
+        low, high = (0.9, 1.3) if o["exchange"] == "paper" else (1.7, 2.4)
+        if o["case"] != "TTSC fault" or o["exchange"] == "paper":  # else: 800 Hz, see the page
+            assert low < o["N"] < high, o
+    at_20 = {(r["case"], r["exchange"]): r for r in report["runs"] if r["dt"] == 0.02}
+    for case in study.CASES:
+        e = {ex: at_20[case, ex]["N"] for ex in study.COMPARED}
+        assert 0.04 < e["paper"] < 0.07 and e["predicted"] < 0.01 and e["corrected"] < 0.004, e
+    assert (tmp_path / "multirate_error.png").stat().st_size > 10_000
