@@ -73,6 +73,7 @@ def run(
     *,
     out: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
+    solver: str = "cvodes",
     **overrides: Any,
 ) -> xr.Dataset:
     """Run a scenario and return the joint dataset.
@@ -82,6 +83,8 @@ def run(
     scenario : a description, a name of the library, or a file.
     out : folder for the netCDF file, the figures and the summary; None writes nothing.
     progress : called with the simulated and the total time [s].
+    solver : ``"cvodes"``, ``"idas"`` or the fast ``"propagator"``: see
+        :func:`apu_casadi.multirate.simulate_joint`.
     overrides : attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
         ``parameters={"machine.r_s": 0.01}``).
 
@@ -95,7 +98,7 @@ def run(
         s = s.change(**overrides)
     if out is not None:
         prepare(out)
-    ds = _simulate(s, progress)
+    ds = _simulate(s, progress, solver)
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     if out is not None:
@@ -103,7 +106,7 @@ def run(
     return ds
 
 
-def _simulate(s: Scenario, progress: Progress | None) -> xr.Dataset:
+def _simulate(s: Scenario, progress: Progress | None, solver: str) -> xr.Dataset:
     from apu_casadi.apu import Apu
     from apu_casadi.multirate import simulate_joint
 
@@ -120,6 +123,7 @@ def _simulate(s: Scenario, progress: Progress | None) -> xr.Dataset:
         waveform_dt=s.waveform_dt,
         noise=None if s.noise is None else s.noise.build(),
         seed=s.seed,
+        solver=solver,
         progress=progress,
     )
 

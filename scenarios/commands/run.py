@@ -29,6 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-waveforms", action="store_true", help="keep no waveforms: a small file, rms figures"
     )
+    parser.add_argument(
+        "--solver", default="cvodes", metavar="NAME",
+        help="cvodes (default), idas, or propagator: exact and fast where the load is linear",
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
 
 
@@ -42,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with _bar(s.name, s.duration, show=show) as bar, _stoppable(bar) as progress:
-        ds = registry.run(s, progress=progress)
+        ds = registry.run(s, progress=progress, solver=args.solver)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
     if args.json:
