@@ -141,7 +141,7 @@ class Table:
     ----------
     centre, half : middle and half width of the speed range, rad/s.
     series : coefficients of 1, cos k theta, sin k theta, each a polynomial in the relative speed
-        (w - centre)/half, shape (powers, n (n + 4) * (1 + 2 H)).
+        (w - centre)/half, shape (powers, m n (n + 4) (1 + 2 H)), with m leaps (:func:`strides`).
     harmonics : H.
     error : largest relative change when the Magnus steps were halved.
     """
@@ -153,16 +153,18 @@ class Table:
     error: float
 
     def at(self, w: float) -> np.ndarray:
-        """Series at speed w, rad/s, shape (n (n + 4), 1 + 2 H)."""
+        """Series at speed w, rad/s, shape (m n (n + 4), 1 + 2 H)."""
         s = (w - self.centre) / self.half
         powers = np.array([1.0, s, s * s, s * s * s])
         return np.asarray((powers @ self.series).reshape(-1, 1 + 2 * self.harmonics))
 
 
 def transition_table(
-    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float
+    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float, n_out: int
 ) -> Table:
-    """Compute the transition matrices over ``h`` for all rotor angles and nearby speeds.
+    """Compute the transition matrices for all rotor angles and nearby speeds.
+
+    Over h, 2 h, ... up to the exciter's step, one below the other (:func:`strides`).
 
     Raises
     ------
@@ -190,6 +192,7 @@ def transition_table(
     angles = np.zeros(1) if constant else 2 * np.pi * np.arange(2 * HARMONICS) / (2 * HARMONICS)
     w = np.repeat(nodes, angles.size)
     a = np.tile(angles, _NODES)
+    m = strides(n_out, bool(constant))
     # the number of Magnus steps is doubled until a few angles agree, then used for all
     steps, error = 1, 0.0
     if not constant:
@@ -207,8 +210,10 @@ def transition_table(
                     f"(error {error:.1e} with {steps} steps)"
                 )
             last = new
-    P = _transition(M_of, a, w, h, steps)[:, :n, :]
-    P = P.transpose(0, 2, 1).reshape(_NODES, angles.size, -1)  # column-major entries
+    leaps = [_transition(M_of, a, w, (j + 1) * h, (j + 1) * steps)[:, :n, :] for j in range(m)]
+    # column-major entries, one leap after the other
+    P = np.concatenate([L.transpose(0, 2, 1).reshape(a.size, -1) for L in leaps], axis=1)
+    P = P.reshape(_NODES, angles.size, -1)
     if constant:
         return Table(centre, half, to_powers @ P[:, 0, :], 0, error)
     F = np.fft.rfft(P, axis=1) / angles.size
@@ -239,32 +244,38 @@ def gregory(n: int) -> np.ndarray:
     return w / n
 
 
-@lru_cache(maxsize=64)
-def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...],
-             quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
-    """n_out samples at once: (x0, P, u, theta, h) -> (x, y, means).
+def strides(n_out: int, constant: bool) -> int:
+    """Samples for each step of the exciter, of ``n_out`` in all.
 
-    ``P`` holds one column of transition matrix entries for all samples (``constant``) or one for
-    each; means by :func:`gregory`.
+    Where nothing ripples the exciter can take five samples at once; under a fault its drive
+    follows the ripple of the terminal voltage and two are right (``DRIVE_TOL`` guards both).
+    """
+    return next(m for m in ((5, 4, 2, 1) if constant else (2, 1)) if n_out % m == 0)
+
+
+@lru_cache(maxsize=64)
+def _leap(
+    gen: Generator, ss: StateSpace, m: int, constant: bool
+) -> tuple[ca.Function, ca.Function]:
+    """One step of the exciter over m samples, and the terminal voltage with its rate.
+
+    First: (x, V, P, u, theta, h) -> (x at the m samples, V at the end); V holds the terminal
+    voltage, its rate, and the largest error of the drive so far.  Second: (x, u, theta) -> (V_t,
+    dV_t/dt).
     """
     s, n = _split(ss), len(linear_states(ss))
     nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
     p, e = gen.machine, gen.exciter
     names = [ss.x.names[i] for i in s.slow]
     i_E = names.index("E_fd")
-
-    xo, uo, to = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
-    y = ss.g(xo, uo, to)
-    V_t = y[ss.y.index("V_t")]
-    V_dot = ca.jtimes(V_t, xo, ss.f(xo, uo, to))
+    x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
+    V_t = ss.g(x, u, th)[ss.y.index("V_t")]
+    V_dot = ca.jtimes(V_t, x, ss.f(x, u, th))
     if constant:  # nothing depends on the rotor angle; spare its cosines
-        V_t, V_dot = ca.substitute([V_t, V_dot], [xo[s.angle]], [ca.SX(0)])
-    V_of = ca.Function("V_of", [xo, uo, to], [V_t, V_dot])
+        V_t, V_dot = ca.substitute([V_t, V_dot], [x[s.angle]], [ca.SX(0)])
+    V_of = ca.Function("V_of", [x, u, th], [V_t, V_dot])
 
-    # -- one sample, SX
-    x, P = ca.SX.sym("x", nx), ca.SX.sym("P", n * (n + 4))
-    u, th = ca.SX.sym("u", nu), ca.SX.sym("t", nt)
-    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
+    h, V, P = ca.SX.sym("h"), ca.SX.sym("V", 3), ca.SX.sym("P", m * n * (n + 4))
     u_d = ss.u.unpack(u)
 
     def rates(slow: Any, V_t: Any) -> Any:
@@ -273,55 +284,78 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
         return ca.vertcat(*(getattr(d, k) for k in names))
 
     slow = x[s.slow]
-    d_slow = rates(slow, V[0])
-    E, E1 = slow[i_E], d_slow[i_E]
-    E2 = ca.jtimes(E1, slow, d_slow)
-    lin1 = ca.mtimes(ca.reshape(P, n, n + 4), ca.vertcat(x[s.linear], E, E1, E2, 1))
-    angle1 = x[s.angle] + h * u_d["w_r"]
-    x1 = ca.SX(nx, 1)
-    x1[s.linear], x1[s.angle] = lin1, angle1
-    x1[s.slow] = slow
-    x1[s.drive] = E + h * E1 + h**2 / 2 * E2
-    # terminal voltage between the samples: cubic through values and rates at both (Hermite); under
-    # a fault it ripples with twice the frequency, which a straight line would cut by 1 %
-    V1, V1_dot = V_of(x1, u, th)
-    Vm = (V[0] + V1) / 2 + h / 8 * (V[1] - V1_dot)
-    k1 = d_slow
-    k2 = rates(slow + h / 2 * k1, Vm)
-    k3 = rates(slow + h / 2 * k2, Vm)
-    k4 = rates(slow + h * k3, V1)
-    E_taken = x1[s.drive]
-    x1[s.slow] = slow + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    # V carries the terminal voltage, its rate, and the largest error of the drive so far
-    miss = ca.fmax(V[2], ca.fabs(x1[s.drive] - E_taken))
-    sample = ca.Function(
-        "sample", [x, V, P, u, th, h], [x1, ca.vertcat(V1, V1_dot, miss)], {"cse": True}
+    k1 = rates(slow, V[0])
+    E, E1 = slow[i_E], k1[i_E]
+    E2 = ca.jtimes(E1, slow, k1)
+    start = ca.vertcat(x[s.linear], E, E1, E2, 1)
+    samples = []
+    for j in range(m):
+        t = (j + 1) * h
+        block = ca.reshape(P[j * n * (n + 4) : (j + 1) * n * (n + 4)], n, n + 4)
+        x_j = ca.SX(nx, 1)
+        x_j[s.slow] = slow  # only the drive enters outputs between the exciter's steps
+        x_j[s.linear], x_j[s.angle] = ca.mtimes(block, start), x[s.angle] + t * u_d["w_r"]
+        x_j[s.drive] = E + t * E1 + t**2 / 2 * E2
+        samples.append(x_j)
+    end, H = samples[-1], m * h
+    # terminal voltage in between: cubic through values and rates at both ends (Hermite); under a
+    # fault it ripples with twice the frequency, which a straight line would cut by 1 %
+    V1, V1_dot = V_of(end, u, th)
+    Vm = (V[0] + V1) / 2 + H / 8 * (V[1] - V1_dot)
+    k2 = rates(slow + H / 2 * k1, Vm)
+    k3 = rates(slow + H / 2 * k2, Vm)
+    k4 = rates(slow + H * k3, V1)
+    E_taken = end[s.drive]
+    end[s.slow] = slow + H / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    miss = ca.fmax(V[2], ca.fabs(end[s.drive] - E_taken))
+    leap = ca.Function(
+        "leap",
+        [x, V, P, u, th, h],
+        [ca.horzcat(*samples[:-1], end), ca.vertcat(V1, V1_dot, miss)],
+        {"cse": True},
     )
+    return leap, V_of
 
-    # -- a group of samples unrolled, which spares copies, then all groups
-    size = next(k for k in (10, 8, 5, 4, 2, 1) if n_out % k == 0)
-    n_P = n * (n + 4)
-    Ps = ca.SX.sym("P", n_P, 1 if constant else size)
+
+@lru_cache(maxsize=64)
+def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...],
+             quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
+    """n_out samples at once: (x0, P, u, theta, h) -> (x, y, mean, miss).
+
+    ``P`` holds one column of transition matrix entries for the whole step (``constant``) or one
+    for each step of the exciter; means by :func:`gregory`.
+    """
+    n, m = len(linear_states(ss)), strides(n_out, constant)
+    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
+    leap, V_of = _leap(gen, ss, m, constant)
+    n_P = m * n * (n + 4)
+    # a few steps unrolled, which spares copies, then all of them
+    steps = n_out // m
+    size = next(k for k in (5, 4, 2, 1) if steps % k == 0)
+    x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
+    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
+    P = ca.SX.sym("P", n_P, 1 if constant else size)
     xk, Vk, states = x, V, []
     for k in range(size):
-        xk, Vk = sample(xk, Vk, Ps if constant else Ps[:, k], u, th, h)
-        states.append(xk)
-    c = ca.vertcat(u, th, h)
-    fixed = [c, Ps] if constant else [c]
-    carry, moved = ca.vertcat(x, V, *fixed), [] if constant else [Ps]
+        X, Vk = leap(xk, Vk, P if constant else P[:, k], u, th, h)
+        xk = X[:, m - 1]
+        states.append(X)
+    fixed = [u, th, h, *([P] if constant else [])]
     group = ca.Function(
         "group",
-        [carry, *moved],
+        [ca.vertcat(x, V, *fixed), *([] if constant else [P])],
         [ca.vertcat(xk, Vk, *fixed), ca.horzcat(*states)],
         {"cse": True},
     )
     X0, U, TH, H = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt), ca.MX.sym("h")
-    PP = ca.MX.sym("P", n_P, 1 if constant else n_out)
+    PP = ca.MX.sym("P", n_P, 1 if constant else steps)
     start = ca.vertcat(X0, *V_of(X0, U, TH), 0, U, TH, H, *([PP] if constant else []))
-    run = group.mapaccum("run", n_out // size, 1)
-    last, Xall = run(start) if constant else run(start, PP)
-    miss_all = last[nx + 2, n_out // size - 1]
-    # -- outputs and means
+    run = group.mapaccum("run", steps // size, 1)
+    last, X_all = run(start) if constant else run(start, PP)
+    miss = last[nx + 2, steps // size - 1]
+    # outputs and means
+    xo, uo, to = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
+    y = ss.g(xo, uo, to)
     terms = []
     for q in quad:
         base, _, power = q.partition("^")
@@ -333,13 +367,13 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
     out = ca.Function("out", [xo, *held], [wanted], {"cse": True})
     w = gregory(n_out)
     y0 = out(X0, *HELD)
-    Y = out.map("outs", "serial", n_out, list(range(1, 1 + len(held))), [])(Xall, *HELD)
+    Y = out.map("outs", "serial", n_out, list(range(1, 1 + len(held))), [])(X_all, *HELD)
     k = len(outputs)
     means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
     return ca.Function(
         f"advance_{ss.name}_{n_out}",
         [X0, PP, U, TH, H],
-        [Xall[:, n_out - 1], Y[:k, :], means, miss_all],
+        [X_all[:, n_out - 1], Y[:k, :], means, miss],
         ["x0", "P", "u", "theta", "h"],
         ["x", "y", "mean", "miss"],
     )
@@ -384,7 +418,7 @@ class Propagator:
         self.outputs, self.quad = tuple(outputs), tuple(quad)
         self.h = dt / n_out
         self.theta = np.array(theta, dtype=float)
-        self.table = _cached_table(ss, u, self.theta, self.h, gen.machine.w_rated)
+        self.table = _cached_table(ss, u, self.theta, self.h, gen.machine.w_rated, n_out)
         constant = self.table.harmonics == 0
         self._constant = constant
         fun = _advance(gen, ss, n_out, self.outputs, self.quad, constant)
@@ -394,7 +428,9 @@ class Propagator:
         self._iw = ss.u.index("w_r")
         w_rated = gen.machine.w_rated
         self._w_ok = (1 - SPEED_RANGE) * w_rated, (1 + SPEED_RANGE) * w_rated
-        self._trig = np.ones((1 + 2 * self.table.harmonics, n_out))
+        m = strides(n_out, constant)
+        self._starts = self.h * np.arange(0, n_out, m)
+        self._trig = np.ones((1 + 2 * self.table.harmonics, n_out // m))
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the table."""
@@ -423,7 +459,7 @@ class Propagator:
             )
         P = self.table.at(w)
         if not self._constant:
-            phase = float(x0[self._angle]) + w * self.h * np.arange(self.n_out)
+            phase = float(x0[self._angle]) + w * self._starts
             c1, s1 = np.cos(phase), np.sin(phase)
             T = self._trig
             T[1], T[2] = c1, s1
@@ -465,14 +501,14 @@ _TABLES: OrderedDict[tuple[Any, ...], tuple[StateSpace, Table]] = OrderedDict()
 
 
 def _cached_table(
-    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float
+    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float, n_out: int
 ) -> Table:
     """Tables are kept by what they depend on: load, noise, fault, sample; not speed, not V_ref."""
     key_u = np.array(u, dtype=float)
     key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
-    key = (id(ss), key_u.tobytes(), theta.tobytes(), round(h, 15), w_rated)
+    key = (id(ss), key_u.tobytes(), theta.tobytes(), round(h, 15), w_rated, n_out)
     if key not in _TABLES:
-        _TABLES[key] = (ss, transition_table(ss, np.array(u, float), theta, h, w_rated))
+        _TABLES[key] = (ss, transition_table(ss, np.array(u, float), theta, h, w_rated, n_out))
         if len(_TABLES) > 256:
             _TABLES.popitem(last=False)
     _TABLES.move_to_end(key)

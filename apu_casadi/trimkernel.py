@@ -26,7 +26,7 @@ AMBIENT = U.names[2:]
 N_FIRST = len(AMBIENT) + len(THETA)  # parameters before the fixed values
 STEP_TOL = 1e-6  # Newton converges quadratically: after such a step some 1e-12 is left
 MAX_STEP = 0.4  # largest change of an unknown in one step: relative, or of its nominal value
-MAX_ITERATIONS = 25  # of a cold start
+MAX_ITERATIONS = 16  # of a cold start
 WARM_ITERATIONS = 10  # of a start nearby; a continuation rather halves its step
 _COUNT = 1e-12  # what one iteration adds to the counter, far below STEP_TOL
 

@@ -433,8 +433,10 @@ def trim_gas_generator(
     w, y, r, _, count = solver.one("cold", p)
     residual, total, reached = _norm(r), round(float(count[0])), 1.0
     if residual > RESIDUAL_TOL:
-        if _off_speed(gg, spec, y, limits) > 0:
-            _refuse(gg, names, fixed, Status.OFF_MAP, _speed_text(gg, y, limits), None, 0.0)
+        off = float(_off_speed(gg, spec, y))
+        if off > limits.off_map:
+            text = _speed_text(gg, y, off, limits)
+            _refuse(gg, names, fixed, Status.OFF_MAP, text, None, 0.0)
         _require_regular(solver, names)
         w, y, r, s, reached, total = _continue(solver, p, floor=1e-5)
         residual = _norm(r)
@@ -642,7 +644,11 @@ def _words(
         return (
             f"off the {which} map by {y[name]:.3f} table spans{bound} "
             f"(relative corrected speed {y[n]:.4f}, table {speeds[0]:.3f} to {speeds[-1]:.3f}"
-            + (f"; beta {y[beta]:.3f}, table {betas[0]:g} to {betas[-1]:g})" if beta in y else ")")
+            + (
+                f"; beta {y[beta]:.3f}, table {betas[0]:g} to {betas[-1]:g})"
+                if math.isfinite(y.get(beta, math.nan))
+                else ")"
+            )
         )
     if s == Status.SURGE:
         return f"beyond surge: SM = {y[name]:.4f}{bound}"
@@ -653,24 +659,19 @@ def _words(
     return f"needs no fuel: Wf = {y[name]:.3g}{unit}{bound}"
 
 
-def _off_speed(
-    gg: GasGenerator, spec: tuple[str, str], y: np.ndarray, limits: Limits
-) -> np.ndarray | float:
-    """Distance of the corrected speed beyond what is allowed off the map; it is known if N is."""
-    if "N" not in spec or not math.isfinite(limits.off_map):
-        return -1.0 if y.ndim == 1 else np.full(y.shape[1], -1.0)
+def _off_speed(gg: GasGenerator, spec: tuple[str, str], y: np.ndarray) -> np.ndarray | float:
+    """Distance of the corrected speed off the compressor table, in spans; it is known if N is."""
+    if "N" not in spec:
+        return 0.0 if y.ndim == 1 else np.zeros(y.shape[1])
     t = gg.compressor_map.table
     n = y[gg.Y.index("n_c")] * gg.compressor_map.N_map_des
     span = float(t.N[-1] - t.N[0])
-    return np.maximum(n - t.N[-1], t.N[0] - n) / span - limits.off_map
+    return np.maximum(0.0, np.maximum(n - t.N[-1], t.N[0] - n) / span)
 
 
-def _speed_text(gg: GasGenerator, y: np.ndarray, limits: Limits) -> str:
-    values = gg.Y.unpack(y)
-    off = float(np.asarray(_off_speed(gg, ("N", "PW"), y, limits)))
-    return _words(
-        gg, Status.OFF_MAP, "off_c", {**values, "off_c": off + limits.off_map}, limits.off_map
-    )  # fmt: skip
+def _speed_text(gg: GasGenerator, y: np.ndarray, off: float, limits: Limits) -> str:
+    values = {**gg.Y.unpack(y), "off_c": off}
+    return _words(gg, Status.OFF_MAP, "off_c", values, limits.off_map)
 
 
 def _stop_status(
@@ -701,6 +702,9 @@ def _stop_text(
 ) -> str:
     """Return why the way from the design point ended where it did."""
     way = f"the way from the design point has no solution beyond {100 * reached:.1f} %"
+    if s == Status.OFF_MAP and reached == 0.0:  # the given speed is off the table
+        where = _words(gg, s, "off_c", y, limits.off_map)
+        return f"{where}; no solution was found on the continued map"
     broken = _limit_text(gg, limits, y)
     if broken:
         return f"{broken}; {way}"
@@ -749,6 +753,9 @@ def trim_batch(
     **ambient: Any,
 ) -> TrimBatch:
     """Solve many steady points in compiled code; nothing is raised for a point.
+
+    Points are the same as those of :func:`trim_gas_generator`, with one difference: where the given
+    speed lies off the compressor's table and no solution is found cold, none is sought further.
 
     Parameters
     ----------
@@ -825,14 +832,14 @@ def _solve_chunk(
     residual, reached = _norms(r), np.ones(index.size)
     count = count[0].round().astype(np.int32)
     bad = residual > RESIDUAL_TOL
-    far = bad & (np.asarray(_off_speed(gg, solver.kernel.spec, y, limits)) > 0)
+    # no continuation where the given speed itself lies off the table: it finds next to nothing there
+    beyond = np.asarray(_off_speed(gg, solver.kernel.spec, y))
+    far = bad & (beyond > 0)
     status = np.full(index.size, Status.UNEXPLAINED, dtype=np.int8)
     status[far], reached[far] = Status.OFF_MAP, 0.0
     for j in np.flatnonzero(far):
         stop, nowhere = y[:, j].copy(), np.full(NZ + 3, np.nan)
-        stop[gg.Y.index("off_c")] = (
-            _off_speed(gg, solver.kernel.spec, y[:, j], limits) + limits.off_map
-        )
+        stop[gg.Y.index("off_c")] = beyond[j]
         out.stop[first + int(index[j])] = (stop, nowhere)
     lost = np.flatnonzero(bad & ~far)
     if lost.size:
