@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from apu_casadi.events import Ambient
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
 from apu_casadi.parameters import Parameters, par
-from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+from apu_casadi.trimming import Limits, OperatingPoint, trim_gas_generator
 
 if TYPE_CHECKING:
     from apu_casadi.machine.load import Load
@@ -141,10 +142,12 @@ class Apu:
         ambient: Ambient | None = None,
         health: Mapping[str, float] | None = None,
         V_ref: float | None = None,
+        limits: Limits | None = None,
     ) -> JointPoint:
         """Solve the steady unit at governed speed: healthy generators under a balanced load.
 
-        ``ambient`` is the paper's ground day, ISA + 5 K, by default.
+        ``ambient`` is the paper's ground day, ISA + 5 K, by default.  ``limits`` are those of the
+        trim; by default without one of temperature, which is no reason not to simulate.
 
         Raises
         ------
@@ -153,8 +156,9 @@ class Apu:
         amb = dataclasses.asdict(Ambient() if ambient is None else ambient)
         gen = self.generator.steady_state(load, w_r=self.w_r(self.N_ref), V_ref=V_ref)
         PW = self.PW(gen.y["P_total"])
+        limits = Limits(T4_max=math.inf) if limits is None else limits
         gas = trim_gas_generator(
-            self.gas_generator, {"N": self.N_ref, "PW": PW}, theta=health, **amb
+            self.gas_generator, {"N": self.N_ref, "PW": PW}, theta=health, limits=limits, **amb
         )
         Wf, g = gas["Wf"], self.governor
         if not g.Wf_min <= Wf <= g.Wf_max:

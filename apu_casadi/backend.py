@@ -308,7 +308,9 @@ def load_or_build(
         if made is not None:
             return made
     fun = build()
-    made = compiled(fun, backend=wanted, build=compile_missing)
+    if not compile_missing:
+        return fun
+    made = compiled(fun, backend=wanted)
     if made is not fun:
         text = f"{fun.name()}\n{fun.serialize()}"
         key = _library_key(hashlib.sha256(text.encode()).hexdigest(), command)
@@ -612,11 +614,13 @@ class Mapped:
         given = [a.reshape(-1, 1) if a.ndim < 2 else a for a in given]
         lengths = {a.shape[1] for a in given} - {1}
         for i, a in enumerate(given):
-            if a.ndim != 2 or a.shape[0] != fun.size1_in(i) or len(lengths) > 1:
+            if a.ndim != 2 or a.shape[0] != fun.size1_in(i):
                 raise BackendError(
                     f"{fun.name()}: {fun.name_in(i)} must have shape ({fun.size1_in(i)}, N), got "
-                    f"{a.shape}; lengths {sorted(lengths)}"
+                    f"{a.shape}"
                 )
+        if len(lengths) > 1:
+            raise BackendError(f"{fun.name()}: unequal numbers of columns: {sorted(lengths)}")
         N = lengths.pop() if lengths else 1
         given = [np.broadcast_to(a, (a.shape[0], N)) for a in given]
         results = tuple(np.empty((fun.size1_out(i), N)) for i in range(fun.n_out()))

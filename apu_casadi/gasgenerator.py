@@ -10,6 +10,7 @@ Rotor speed is the one state.  The improved method of the paper (IGDM, Algorithm
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -330,9 +331,11 @@ class GasGenerator:
         ------
         OperatingPointError : no such steady point.
         """
-        from apu_casadi.trimming import trim_gas_generator
+        from apu_casadi.trimming import Limits, trim_gas_generator
 
-        point = trim_gas_generator(self, {"N": N, "PW": PW}, theta=theta, **ambient)
+        limits = Limits(T4_max=math.inf)  # hot is no reason not to start
+        fixed = {"N": N, "PW": PW}
+        point = trim_gas_generator(self, fixed, theta=theta, limits=limits, **ambient)
         return GasGeneratorState(point.x, point.z, point.u, point.theta)
 
     def state_update(

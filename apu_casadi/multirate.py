@@ -45,6 +45,7 @@ from apu_casadi.events import (
 )
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import GeneratorPoint, MeasurementNoise
+from apu_casadi.jointstep import BLOCK, BlockResult, JointBlock
 from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.propagation import Propagator
 from apu_casadi.results import dataset
@@ -262,7 +263,10 @@ def simulate_joint(
         machine.switch(load, fault)
         slope = None
 
-    for k in range(1, grid.size):
+    free = hook is None and not (noise.N or noise.w1 or noise.w2)
+    k = 0
+    while k < grid.size - 1:
+        k += 1
         t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
         while pending and pending[0].t <= t0 + _GRID_TOL:
             event, slope = pending.pop(0), None
@@ -273,6 +277,18 @@ def simulate_joint(
                 machine.switch(event.load, machine.fault)
             elif isinstance(event, FaultChange):
                 machine.switch(machine.load, event.fault)
+        until = pending[0].t if pending else duration
+        if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + _GRID_TOL:
+            done = machine.block(x, z, Wf_I, u, theta, grid[k - 1 : k + BLOCK])
+            if done is not None:
+                x, z, Wf_I = done.N, done.z, done.Wf_I
+                book.put_block(k, done, factors)
+                book.wave(machine.block_times(grid[k - 1 : k + BLOCK]), done.waves)
+                k += BLOCK - 1
+                slope = None if way != EXCHANGES["paper"] else 0.0
+                if progress is not None:
+                    progress(float(grid[k]), duration)
+                continue
         if noise.w1 or noise.w2:
             machine.disturb(noise.w1 * rng.standard_normal(3), noise.w2 * rng.standard_normal(3))
         N = float(x[0])
@@ -342,7 +358,9 @@ class _Machine:
         self.dt, self.waveform_dt = dt, waveform_dt
         self.solver, self.rtol, self.atol = solver, rtol, atol
         self.nsteps = self.propagated = 0
-        self._fast: Propagator | None = None
+        self._fast: dict[bool, Propagator | None] = {}
+        self._kept = slice(None)
+        self._block: JointBlock | None = None
         self._settled = self.may_propagate
         self._noisy = False
         self._index()
@@ -382,7 +400,8 @@ class _Machine:
         )
         self.ss, self.u, self.theta = target, u_new, self.gen.fault_vector(load, fault)
         self.load, self.fault = load, fault
-        self._fast, self._settled = None, False
+        self._fast, self._block = {}, None
+        self._settled = False
         self._index()
 
     def disturb(self, w1: np.ndarray, w2: np.ndarray) -> None:
@@ -425,31 +444,71 @@ class _Machine:
         means = np.array([r.mean[k] for k in (*MEANS, *RMS.values())])
         return self._wrapped(r.x_end[: len(self.ss.x)]), means, r.t, r.y[self._rows]
 
-    def _propagate(self, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-        """Advance by exact propagation; None where it does not hold."""
-        if self._fast is None:
-            n = self.n_out(self.dt)
-            outputs: tuple[str, ...] = WAVEFORMS
-            if self.waveform_dt is None:
-                n, outputs = SUMMARY_SAMPLES[self.fault is None], ()
+    def block(
+        self,
+        x: np.ndarray,
+        z: np.ndarray,
+        Wf_I: float,
+        u: np.ndarray,
+        theta: np.ndarray,
+        grid: np.ndarray,
+    ) -> BlockResult | None:
+        """Advance the whole unit over several exchange steps at once; None where that is not on."""
+        ready = self.may_propagate and self._settled and not self._noisy
+        if not ready or grid.size != BLOCK + 1 or np.abs(np.diff(grid) - self.dt).max() > _GRID_TOL:
+            return None
+        fast = self._propagator()
+        if fast is None or not fast.constant:
+            return None
+        if self._block is None:
+            self._block = JointBlock(self.apu, fast)
+        done = self._block(x, z, Wf_I, self.x, u, theta, self.u)
+        if done is not None:
+            self.x = done.x_sg
+            self.propagated += BLOCK
+            done = done._replace(waves=done.waves[:, self._kept])
+        return done
+
+    def block_times(self, grid: np.ndarray) -> np.ndarray:
+        """Instants of the samples of a block."""
+        fast = self._propagator()
+        if self.waveform_dt is None or fast is None:
+            return np.empty(0)
+        return np.concatenate([fast.times(float(t))[self._kept] for t in grid[:-1]])
+
+    def _propagator(self, fine: bool = False) -> Propagator | None:
+        """Return the propagator of this load and fault, or None where there is none."""
+        if fine not in self._fast:
+            # coarse waveforms are every k-th of samples fine enough for the means
+            least = SUMMARY_SAMPLES[self.fault is None]
+            every = 1 if self.waveform_dt is None else -(-least // self.n_out(self.dt))
+            n = least if self.waveform_dt is None else every * self.n_out(self.dt)
+            outputs = () if self.waveform_dt is None else WAVEFORMS
+            self._kept = slice(every - 1, None, every)
             try:
-                self._fast = Propagator(
+                self._fast[fine] = Propagator(
                     self.gen, self.ss, self.u, self.theta, n_out=n, dt=self.dt, outputs=outputs,
-                    quad=(*MEANS, *RMS.values()),
+                    quad=(*MEANS, *RMS.values()), fine=fine,
                 )  # fmt: skip
             except SimulationError as error:
                 _LOG.info("exact propagation not used, CVODES instead: %s", error)
-                self.solver = "cvodes"
+                self._fast[fine] = None
+        return self._fast[fine]
+
+    def _propagate(self, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+        """Advance by exact propagation; None where it does not hold."""
+        for fine in (False, True):
+            fast = self._propagator(fine)
+            if fast is None or not fast.valid(self.w_r):
                 return None
-        if not self._fast.valid(self.w_r):
-            return None
-        try:
-            x, w, means = self._fast(self.x, self.u, t0=t0)
-        except SimulationError as error:
-            _LOG.info("exact propagation refused a step, CVODES instead: %s", error)
-            return None
-        self.propagated += 1
-        return self._wrapped(x), means, self._fast.times(t0), w
+            try:
+                x, w, means = fast(self.x, self.u, t0=t0)
+            except SimulationError as error:
+                _LOG.debug("exact propagation refused a step: %s", error)
+                continue
+            self.propagated += 1
+            return self._wrapped(x), means, fast.times(t0)[self._kept], w[:, self._kept]
+        return None
 
     def _wrapped(self, x: np.ndarray) -> np.ndarray:
         """Keep the rotor angle small, so that its cosine stays accurate over hours."""
@@ -485,6 +544,14 @@ class _Book:
         self.means[:, k] = means
         self.factors[:, k] = tuple(factors.values())
         self.severity[:, k] = _HEALTHY if fault is None else (fault.mu, fault.k_rf, fault.kappa)
+
+    def put_block(self, k: int, done: BlockResult, factors: Mapping[str, float]) -> None:
+        """Enter a block of healthy exchange instants, the first of which is k."""
+        at = slice(k, k + BLOCK)
+        self.Y[:, at] = done.y
+        self.means[:, at] = done.means
+        self.factors[:, at] = np.array(tuple(factors.values()))[:, None]
+        self.severity[:, at] = np.array(_HEALTHY)[:, None]
 
     def wave(self, t: np.ndarray, w: np.ndarray) -> None:
         """Append waveform samples, where any are kept."""

@@ -27,7 +27,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -39,12 +39,13 @@ from apu_casadi.machine import exciter as ac5a
 from apu_casadi.simulation import StepResult
 from apu_casadi.statespace import StateSpace
 
+SETTLING = 1e-3  # s, in which the windings follow a step of speed
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
 MAGNUS_TOL = 1e-8  # largest change of P, relative, when the steps it is made of are halved
 HARMONICS = 24  # highest harmonic resolved; a series that has not converged by then is refused
-DRIVE_TOL = (
-    2e-5  # largest error of E_fd, per unit, at the end of a sample; a quarter acts on average
-)
+#: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; a
+#: quarter acts on average.  Where coefficients are constant a larger one tells of a limit met.
+DRIVE_TOL = {"constant": 1e-5, "periodic": 1e-5, "fine": 2e-5}
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
 _NODES = 4  # Chebyshev nodes in speed
 _GAUSS = math.sqrt(3.0) / 6.0
@@ -141,7 +142,7 @@ class Table:
     ----------
     centre, half : middle and half width of the speed range, rad/s.
     series : coefficients of 1, cos k theta, sin k theta, each a polynomial in the relative speed
-        (w - centre)/half, shape (powers, m n (n + 4) (1 + 2 H)), with m leaps (:func:`strides`).
+        (w - centre)/half, shape (powers, m n (n + 4) (1 + 2 H)), with m leaps (:class:`Strides`).
     harmonics : H.
     error : largest relative change when the Magnus steps were halved.
     """
@@ -160,11 +161,17 @@ class Table:
 
 
 def transition_table(
-    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float, n_out: int
+    ss: StateSpace,
+    u: np.ndarray,
+    theta: np.ndarray,
+    h: float,
+    w_rated: float,
+    n_out: int,
+    fine: bool = False,
 ) -> Table:
     """Compute the transition matrices for all rotor angles and nearby speeds.
 
-    Over h, 2 h, ... up to the exciter's step, one below the other (:func:`strides`).
+    Over h, 2 h, ... up to the exciter's step, one below the other (:class:`Strides`).
 
     Raises
     ------
@@ -192,7 +199,7 @@ def transition_table(
     angles = np.zeros(1) if constant else 2 * np.pi * np.arange(2 * HARMONICS) / (2 * HARMONICS)
     w = np.repeat(nodes, angles.size)
     a = np.tile(angles, _NODES)
-    m = strides(n_out, bool(constant))
+    m = strides(n_out, h, bool(constant), fine).m
     # the number of Magnus steps is doubled until a few angles agree, then used for all
     steps, error = 1, 0.0
     if not constant:
@@ -244,13 +251,33 @@ def gregory(n: int) -> np.ndarray:
     return w / n
 
 
-def strides(n_out: int, constant: bool) -> int:
-    """Samples for each step of the exciter, of ``n_out`` in all.
+class Strides(NamedTuple):
+    """How the exciter steps through the samples: ``head`` single ones, then ``many`` of ``m``.
 
-    Where nothing ripples the exciter can take five samples at once; under a fault its drive
-    follows the ripple of the terminal voltage and two are right (``DRIVE_TOL`` guards both).
+    A new speed at the start of a step lets the terminal voltage jump and settle within a
+    millisecond, which single samples resolve.  After that, where nothing ripples, the exciter can
+    take five samples at once; under a fault its drive follows the ripple of the terminal voltage
+    and two are right.  ``fine`` is single samples throughout: while a regulator limit is met or
+    left, say (``DRIVE_TOL`` tells).
     """
-    return next(m for m in ((5, 4, 2, 1) if constant else (2, 1)) if n_out % m == 0)
+
+    head: int
+    m: int
+    many: int
+
+    def starts(self) -> np.ndarray:
+        """Index of the sample from which each step of the exciter leaves."""
+        return np.concatenate([np.arange(self.head), self.head + self.m * np.arange(self.many)])
+
+
+def strides(n_out: int, h: float, constant: bool, fine: bool) -> Strides:
+    """Choose the strides for n_out samples of length h, s."""
+    if fine:
+        return Strides(n_out, 1, 0)
+    m = 5 if constant else 2
+    head = min(n_out, math.ceil(SETTLING / h))
+    head += (n_out - head) % m
+    return Strides(head, m, (n_out - head) // m)
 
 
 @lru_cache(maxsize=64)
@@ -317,20 +344,13 @@ def _leap(
     return leap, V_of
 
 
-@lru_cache(maxsize=64)
-def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...],
-             quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
-    """n_out samples at once: (x0, P, u, theta, h) -> (x, y, mean, miss).
+def _fold(leap: ca.Function, m: int, steps: int, n_P: int, constant: bool,
+          sizes: tuple[int, int, int]) -> ca.Function:  # fmt: skip
+    """``steps`` steps of the exciter: (start, P) -> (start of the next, x at all samples).
 
-    ``P`` holds one column of transition matrix entries for the whole step (``constant``) or one
-    for each step of the exciter; means by :func:`gregory`.
+    ``start`` holds x, V and what stays; a few steps are unrolled, which spares copies.
     """
-    n, m = len(linear_states(ss)), strides(n_out, constant)
-    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-    leap, V_of = _leap(gen, ss, m, constant)
-    n_P = m * n * (n + 4)
-    # a few steps unrolled, which spares copies, then all of them
-    steps = n_out // m
+    nx, nu, nt = sizes
     size = next(k for k in (5, 4, 2, 1) if steps % k == 0)
     x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
     h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
@@ -347,12 +367,39 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
         [ca.vertcat(xk, Vk, *fixed), ca.horzcat(*states)],
         {"cse": True},
     )
-    X0, U, TH, H = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt), ca.MX.sym("h")
-    PP = ca.MX.sym("P", n_P, 1 if constant else steps)
-    start = ca.vertcat(X0, *V_of(X0, U, TH), 0, U, TH, H, *([PP] if constant else []))
     run = group.mapaccum("run", steps // size, 1)
-    last, X_all = run(start) if constant else run(start, PP)
-    miss = last[nx + 2, steps // size - 1]
+    S = ca.MX.sym("S", nx + 3 + nu + nt + 1)
+    PP = ca.MX.sym("P", n_P, 1 if constant else steps)
+    last, X_all = run(ca.vertcat(S, PP)) if constant else run(S, PP)
+    return ca.Function("fold", [S, PP], [last[: S.numel(), steps // size - 1], X_all])
+
+
+@lru_cache(maxsize=64)
+def _advance(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs: tuple[str, ...],
+             quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
+    """n_out samples at once: (x0, P, u, theta, h) -> (x, y, mean, miss).
+
+    ``P`` holds one column of transition matrix entries for the whole step (``constant``) or one
+    for each step of the exciter; means by :func:`gregory`.
+    """
+    n = len(linear_states(ss))
+    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
+    n_P = n * (n + 4)
+    X0, U, TH, H = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt), ca.MX.sym("h")
+    PP = ca.MX.sym("P", plan.m * n_P, 1 if constant else plan.head + plan.many)
+    single, V_of = _leap(gen, ss, 1, constant)
+    S = ca.vertcat(X0, *V_of(X0, U, TH), 0, U, TH, H)
+    parts = []
+    if plan.head:
+        fold = _fold(single, 1, plan.head, n_P, constant, (nx, nu, nt))
+        S, X = fold(S, PP[:n_P, :] if constant else PP[:n_P, : plan.head])
+        parts.append(X)
+    if plan.many:
+        leap, _ = _leap(gen, ss, plan.m, constant)
+        fold = _fold(leap, plan.m, plan.many, plan.m * n_P, constant, (nx, nu, nt))
+        S, X = fold(S, PP if constant else PP[:, plan.head :])
+        parts.append(X)
+    X_all, miss = ca.horzcat(*parts), S[nx + 2]
     # outputs and means
     xo, uo, to = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
     y = ss.g(xo, uo, to)
@@ -371,7 +418,7 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, outputs: tuple[str, ...
     k = len(outputs)
     means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
     return ca.Function(
-        f"advance_{ss.name}_{n_out}",
+        f"advance_{ss.name}_{n_out}" + ("" if plan.many else "_fine"),
         [X0, PP, U, TH, H],
         [X_all[:, n_out - 1], Y[:k, :], means, miss],
         ["x0", "P", "u", "theta", "h"],
@@ -390,6 +437,7 @@ class Propagator:
     dt : length of every step, s.
     outputs : outputs to be returned at the samples.
     quad : outputs (or squares, ``"v_a^2"``) whose mean over the step is returned.
+    fine : the exciter steps at every sample; for the steps that the usual strides refuse.
 
     Raises
     ------
@@ -408,6 +456,7 @@ class Propagator:
         dt: float,
         outputs: Sequence[str] = (),
         quad: Sequence[str] = (),
+        fine: bool = False,
     ) -> None:
         """Compute or fetch the table, build or fetch the functions."""
         if not applicable(ss):
@@ -418,19 +467,21 @@ class Propagator:
         self.outputs, self.quad = tuple(outputs), tuple(quad)
         self.h = dt / n_out
         self.theta = np.array(theta, dtype=float)
-        self.table = _cached_table(ss, u, self.theta, self.h, gen.machine.w_rated, n_out)
+        w_rated = gen.machine.w_rated
+        self.table = _cached_table(ss, u, self.theta, self.h, w_rated, n_out, fine)
         constant = self.table.harmonics == 0
-        self._constant = constant
-        fun = _advance(gen, ss, n_out, self.outputs, self.quad, constant)
-        self._call = _caller(fun)
-        self._t = dt * np.arange(1, n_out + 1) / n_out
+        self.constant = constant
+        plan = strides(n_out, self.h, constant, fine)
+        self.function = _advance(gen, ss, n_out, plan, self.outputs, self.quad, constant)
+        self.tol = DRIVE_TOL["fine" if fine else "constant" if constant else "periodic"]
+        self.layout = (gen, id(ss))
+        self._compiled: Caller | None = None
+        self._t = dt * (np.arange(1, n_out + 1) / n_out)  # rounded as a Stepper does
         self._angle = ss.x.index("theta_e")
         self._iw = ss.u.index("w_r")
-        w_rated = gen.machine.w_rated
         self._w_ok = (1 - SPEED_RANGE) * w_rated, (1 + SPEED_RANGE) * w_rated
-        m = strides(n_out, constant)
-        self._starts = self.h * np.arange(0, n_out, m)
-        self._trig = np.ones((1 + 2 * self.table.harmonics, n_out // m))
+        self._starts = self.h * plan.starts()
+        self._trig = np.ones((1 + 2 * self.table.harmonics, self._starts.size))
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the table."""
@@ -458,7 +509,7 @@ class Propagator:
                 f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
             )
         P = self.table.at(w)
-        if not self._constant:
+        if not self.constant:
             phase = float(x0[self._angle]) + w * self._starts
             c1, s1 = np.cos(phase), np.sin(phase)
             T = self._trig
@@ -467,11 +518,13 @@ class Propagator:
                 T[2 * k - 1] = T[2 * k - 3] * c1 - T[2 * k - 2] * s1
                 T[2 * k] = T[2 * k - 2] * c1 + T[2 * k - 3] * s1
             P = P @ T
-        x, y, mean, miss = self._call(x0, P, u, self.theta, self.h)
-        if not (float(miss[0]) <= DRIVE_TOL and math.isfinite(float(x.sum()))):
+        if self._compiled is None:  # a run in blocks may never need it
+            self._compiled = _caller(self.function)
+        x, y, mean, miss = self._compiled(x0, P, u, self.theta, self.h)
+        if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
             raise SimulationError(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
-                f"{self.h:.3g} s misses it by {float(miss[0]):.1e} > {DRIVE_TOL:.0e}"
+                f"{self.h:.3g} s misses it by {float(miss[0]):.1e} > {self.tol:.0e}"
             )
         return x, y, mean
 
@@ -501,14 +554,23 @@ _TABLES: OrderedDict[tuple[Any, ...], tuple[StateSpace, Table]] = OrderedDict()
 
 
 def _cached_table(
-    ss: StateSpace, u: np.ndarray, theta: np.ndarray, h: float, w_rated: float, n_out: int
+    ss: StateSpace,
+    u: np.ndarray,
+    theta: np.ndarray,
+    h: float,
+    w_rated: float,
+    n_out: int,
+    fine: bool,
 ) -> Table:
     """Tables are kept by what they depend on: load, noise, fault, sample; not speed, not V_ref."""
     key_u = np.array(u, dtype=float)
     key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
-    key = (id(ss), key_u.tobytes(), theta.tobytes(), round(h, 15), w_rated, n_out)
+    key = (id(ss), key_u.tobytes(), theta.tobytes(), round(h, 15), w_rated, n_out, fine)
     if key not in _TABLES:
-        _TABLES[key] = (ss, transition_table(ss, np.array(u, float), theta, h, w_rated, n_out))
+        _TABLES[key] = (
+            ss,
+            transition_table(ss, np.array(u, float), theta, h, w_rated, n_out, fine),
+        )
         if len(_TABLES) > 256:
             _TABLES.popitem(last=False)
     _TABLES.move_to_end(key)

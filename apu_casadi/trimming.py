@@ -51,6 +51,7 @@ __all__ = [
 ]
 
 COMPILE_FROM = 300  # points from which compiling pays; below, a library is used if there is one
+FLOORS = (1e-3, 1e-5)  # smallest steps of a continuation; the second where the end is not clear
 CHUNK = 16384  # points solved at once by a batch
 GIVEN = ("T0", "P0", "T1", "P1", "T2", "P2", "off_c", "off_t", "residual", "P_acceleration")
 """Outputs that cannot be fixed: the ambient gives them, or the equations."""
@@ -94,7 +95,8 @@ class Limits:
         (the paper gives none).
     T5_max : highest turbine outlet temperature, K; none by default.
     Mach8_max : the fixed exit is modelled subsonic only.
-    Wf_min : smallest fuel flow, kg/s; below it a flame would be out.
+    Wf_min : smallest fuel flow, kg/s; None is 0.5 % of the design value, where no flame burns any
+        more: such a point is driven, not fired; *assumed*.
     """
 
     off_map: float = 0.25
@@ -102,16 +104,17 @@ class Limits:
     T4_max: float | None = None
     T5_max: float = math.inf
     Mach8_max: float = 1.0
-    Wf_min: float = 1e-6
+    Wf_min: float | None = None
 
     @classmethod
     def none(cls) -> Limits:
         """No limits but the model's own: a subsonic exit and fuel to burn."""
-        return cls(off_map=math.inf, SM_min=-math.inf, T4_max=math.inf)
+        return cls(off_map=math.inf, SM_min=-math.inf, T4_max=math.inf, Wf_min=0.0)
 
     def rows(self, gg: GasGenerator) -> list[tuple[Status, str, float, float]]:
         """Return (status, output, sign, limit): refused where sign * (value - limit) > 0."""
         T4 = 1.1 * gg.parameters.T4 if self.T4_max is None else self.T4_max
+        Wf = 5e-3 * gg.design.values["Wf"] if self.Wf_min is None else self.Wf_min
         return [
             (Status.CHOKED, "Mach8", 1.0, self.Mach8_max),
             (Status.OFF_MAP, "off_c", 1.0, self.off_map),
@@ -119,7 +122,7 @@ class Limits:
             (Status.SURGE, "SM", -1.0, self.SM_min),
             (Status.TEMPERATURE, "T4", 1.0, T4),
             (Status.TEMPERATURE, "T5", 1.0, self.T5_max),
-            (Status.FUEL, "Wf", -1.0, self.Wf_min),
+            (Status.FUEL, "Wf", -1.0, Wf),
         ]
 
 
@@ -438,7 +441,7 @@ def trim_gas_generator(
             text = _speed_text(gg, y, off, limits)
             _refuse(gg, names, fixed, Status.OFF_MAP, text, None, 0.0)
         _require_regular(solver, names)
-        w, y, r, s, reached, total = _continue(solver, p, floor=1e-5)
+        w, y, r, s, reached, total = _continue(solver, limits, p)
         residual = _norm(r)
         if reached < 1.0:
             there = _named(gg, y, w)
@@ -490,7 +493,7 @@ def _refuse(
     if point is not None:
         label = "the point" if reached >= 1.0 else "best point"
         keys = ("N", "Wf", "PW", "T4", "SM", "n_c", "off_c")
-        best = f"; {label}: " + ", ".join(f"{k} = {point[k]:.6g}" for k in keys)
+        best = f"; {label} " + ", ".join(f"{k} = {point[k]:.6g}" for k in keys)
     error = Refusal(f"no steady point with {asked}: {text}{best}")
     error.status, error.point, error.reached = status, point, reached
     raise error
@@ -530,23 +533,30 @@ def _mix(solver: _Solver, p: np.ndarray, t: float) -> np.ndarray:
 
 
 def _continue(
-    solver: _Solver, p: np.ndarray, *, floor: float
+    solver: _Solver, limits: Limits, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, int]:
     """Move from the design point to p in adaptive steps; return w, y, r, s, share, iterations."""
     origin, s = _origin(solver)
     w, y, r, s, n = solver.one("warm", s, origin)
     total, t, dt = int(n[0]), 0.0, 0.25
-    while t < 1.0:
-        t_try = min(1.0, t + dt)
-        trial = solver.one("warm", s, origin + t_try * (p - origin))
-        total += round(float(trial[4][0]))
-        if _norm(trial[2]) <= RESIDUAL_TOL:
-            (w, y, r, s), t, dt = trial[:4], t_try, dt * 1.7
-        else:
-            dt /= 2
-            if dt < floor:
-                break
+    for floor in FLOORS:
+        while t < 1.0 and dt >= floor:
+            t_try = min(1.0, t + dt)
+            trial = solver.one("warm", s, origin + t_try * (p - origin))
+            total += round(float(trial[4][0]))
+            if _norm(trial[2]) <= RESIDUAL_TOL:
+                (w, y, r, s), t, dt = trial[:4], t_try, dt * 1.7
+            else:
+                dt /= 2
+        if t >= 1.0 or _explained(solver.gg, limits, y[:, None])[0]:
+            break
     return w, y, r, s, t, total
+
+
+def _explained(gg: GasGenerator, limits: Limits, y: np.ndarray) -> np.ndarray:
+    """Whether the outputs tell why the way ends there: a limit is broken, or a map left."""
+    off = np.maximum(y[gg.Y.index("off_c")], y[gg.Y.index("off_t")]) > 0
+    return off | (_limit_status(gg, limits, y) != Status.SOLVED)
 
 
 def _continue_many(
@@ -690,8 +700,6 @@ def _stop_status(
     v = y[:, 0]
     if max(v[gg.Y.index("off_c")], v[gg.Y.index("off_t")]) > 0:
         return Status.OFF_MAP
-    if v[gg.Y.index("Wf")] < 1e-3 * gg.design.values["Wf"]:
-        return Status.FUEL
     if _fold(solver, s[:, 0], _mix(solver, p, reached)) < 0.2:
         return Status.NO_BALANCE
     return Status.UNEXPLAINED
@@ -701,7 +709,7 @@ def _stop_text(
     gg: GasGenerator, limits: Limits, s: Status, y: Mapping[str, float], reached: float
 ) -> str:
     """Return why the way from the design point ended where it did."""
-    way = f"the way from the design point has no solution beyond {100 * reached:.1f} %"
+    way = f"stopped at {100 * reached:.1f} % of the way from the design point"
     if s == Status.OFF_MAP and reached == 0.0:  # the given speed is off the table
         where = _words(gg, s, "off_c", y, limits.off_map)
         return f"{where}; no solution was found on the continued map"
@@ -711,8 +719,6 @@ def _stop_text(
     if s == Status.OFF_MAP:
         name = "off_c" if y["off_c"] >= y["off_t"] else "off_t"
         return f"{_words(gg, s, name, y, None)}, where the continued map has no solution; {way}"
-    if s == Status.FUEL:
-        return f"{_words(gg, s, 'Wf', y, limits.Wf_min)}; {way}"
     if s == Status.NO_BALANCE:
         return (
             f"no power balance: the fixed quantities have an extreme value near the best point and "
@@ -832,7 +838,7 @@ def _solve_chunk(
     residual, reached = _norms(r), np.ones(index.size)
     count = count[0].round().astype(np.int32)
     bad = residual > RESIDUAL_TOL
-    # no continuation where the given speed itself lies off the table: it finds next to nothing there
+    # no continuation where the given speed is off the table: it finds next to nothing there
     beyond = np.asarray(_off_speed(gg, solver.kernel.spec, y))
     far = bad & (beyond > 0)
     status = np.full(index.size, Status.UNEXPLAINED, dtype=np.int8)
@@ -845,12 +851,9 @@ def _solve_chunk(
     if lost.size:
         _require_regular(solver, solver.kernel.spec)
         q = p[:, lost]
-        state = _continue_many(solver, q, floor=0.06, n_threads=n_threads)
-        for floor in (1e-2, 1e-5):  # closer to where it ends, until it is seen what is there
-            y_l = state[1]
-            clear = _limit_status(gg, limits, y_l) != Status.SOLVED
-            clear |= np.maximum(y_l[gg.Y.index("off_c")], y_l[gg.Y.index("off_t")]) > 0
-            again = np.flatnonzero((state[4] < 1.0) & ~clear)
+        state = _continue_many(solver, q, floor=FLOORS[0], n_threads=n_threads)
+        for floor in FLOORS[1:]:
+            again = np.flatnonzero((state[4] < 1.0) & ~_explained(gg, limits, state[1]))
             if not again.size:
                 break
             part = tuple(a[..., again] for a in state)

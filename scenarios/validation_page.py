@@ -59,8 +59,8 @@ def cells(r: Row) -> tuple[str, ...]:
 
 
 def _error(x: float, sign: str = "") -> str:
-    """Show an error; below 1e-12 it is rounding, and another number on every processor."""
-    return "0" if x == 0 else "< 1e-12" if abs(x) < 1e-12 else f"{x:{sign}.1e}"
+    """Show an error; below 1e-10 it is rounding, and another number on every processor."""
+    return "0" if x == 0 else "< 1e-10" if abs(x) < 1e-10 else f"{x:{sign}.1e}"
 
 
 def _tested(rows: Sequence[Row]) -> list[Row]:

@@ -27,6 +27,7 @@ LAYERS = (
     ("components", "machine"),
     ("cycle",),
     ("gasgenerator", "generator"),
+    ("trimkernel",),
     ("trimming", "propagation"),
     ("calibration",),
     ("control", "events"),

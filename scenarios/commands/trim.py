@@ -162,6 +162,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
             SeriesLoad.from_power(args.load, args.power_factor),
             ambient=Ambient(**ambient),
             health=health,
+            limits=limits,
         )
         point, g = joint.gas, joint.generator
         extra = {"V_t": g.V_t, "V_ref": g.V_ref, **_scalars(g.y)}

@@ -1,0 +1,357 @@
+"""Steady points: every way of fixing one gives the same, none is wrong, every refusal says why."""
+
+import itertools
+import pickle
+import threading
+
+import numpy as np
+import pytest
+
+from apu_casadi import backend
+from apu_casadi.errors import OperatingPointError, SignalError
+from apu_casadi.gasgenerator import RPM, GasGenerator
+from apu_casadi.trimkernel import LAW, TrimKernel
+from apu_casadi.trimming import (
+    MEANING,
+    Limits,
+    LoadLaw,
+    Refusal,
+    Status,
+    maximum_power,
+    performance_deck,
+    trim_batch,
+    trim_gas_generator,
+)
+from scenarios import trim_study
+
+N_DESIGN = 36050 * RPM
+CRUISE = {"altitude": 8000.0, "Mach": 0.7, "dT_isa": 5.0}
+WORN = {"f_eta_c": 0.97, "f_W_c": 0.98, "f_eta_t": 0.98, "f_W_t": 1.03}
+
+needs_compiler = pytest.mark.skipif(
+    backend.find_compiler() is None, reason="no C compiler ($CC, cc, gcc, clang) found"
+)
+
+
+@pytest.fixture(scope="module")
+def gg():
+    return GasGenerator()
+
+
+@pytest.fixture(scope="module")
+def reference(gg):
+    """Cruise of Table 5, a little off speed and worn, so that nothing is special."""
+    fixed = {"N": 0.985 * N_DESIGN, "PW": 222e3}
+    return trim_gas_generator(gg, fixed, theta=WORN, **CRUISE)
+
+
+FIXABLE = ("N", "PW", "Wf", "T3", "P3", "T4", "T41", "T5", "SM", "W2", "SFC", "PR_t")
+
+
+@pytest.mark.parametrize(
+    "pair", [p for p in itertools.combinations(FIXABLE, 2) if p[0] in ("N", "PW", "Wf", "T5")]
+)
+def test_every_pair_gives_the_same_point(gg, reference, pair):
+    """The equations do not know what was fixed: any two values of a point give it back.
+
+    1e-8: errors below the residual's tolerance are magnified by the pair's conditioning.  Pairs
+    with two solutions may give the other one, which must then have both values.
+    """
+    fixed = {n: reference[n] for n in pair}
+    point = trim_gas_generator(gg, fixed, theta=WORN, **CRUISE)
+    assert point.residual < 1e-9
+    for n in pair:
+        assert point[n] == pytest.approx(reference[n], rel=1e-9)
+    if abs(point["N"] / reference["N"] - 1) < 1e-3:
+        for n in FIXABLE:
+            assert point[n] == pytest.approx(reference[n], rel=1e-7), n
+    else:
+        assert "N" not in pair
+
+
+def test_speed_and_another_quantity_give_the_point_itself(gg, reference):
+    """Guards the test above: with the speed fixed there is no second solution to hide behind."""
+    for n in FIXABLE[1:]:
+        point = trim_gas_generator(gg, {"N": reference["N"], n: reference[n]}, theta=WORN, **CRUISE)
+        assert point["Wf"] == pytest.approx(reference["Wf"], rel=1e-8)
+
+
+def test_design_point_comes_back(gg):
+    """Table 4's design speed and T4 give the design calculation's own values, without maps."""
+    p, d = gg.parameters, gg.design.values
+    point = trim_gas_generator(gg, {"N": p.N, "T4": p.T4}, dT_isa=p.dT_isa)
+    for n in ("W2", "T3", "P3", "T5", "Wf"):
+        assert point[n] == pytest.approx(d[n], rel=1e-9)
+
+
+def test_load_law_meets_the_law_and_the_other_value(gg, reference):
+    """Power ~ speed cubed through a point: that point is found from its fuel flow and its speed."""
+    law = LoadLaw(reference["PW"], reference["N"])
+    for other in ("Wf", "T4", "N"):
+        point = trim_gas_generator(
+            gg, {"PW": law, other: reference[other]}, theta=WORN, **CRUISE
+        )  # fmt: skip
+        assert point["PW"] == pytest.approx(law.PW_ref * (point["N"] / law.N_ref) ** 3, rel=1e-9)
+        assert point["N"] == pytest.approx(reference["N"], rel=1e-7)
+    part = trim_gas_generator(gg, {"PW": LoadLaw(5e5, N_DESIGN), "Wf": 0.04})
+    assert part["PW"] == pytest.approx(5e5 * (part["N"] / N_DESIGN) ** 3, rel=1e-9)
+    assert part["N"] < N_DESIGN
+    with pytest.raises(SignalError, match="load law needs finite"):
+        LoadLaw(5e5, 0.0)
+    with pytest.raises(SignalError, match="a load law fixes PW, not Wf"):
+        trim_gas_generator(gg, {"Wf": LoadLaw(5e5, N_DESIGN), "N": N_DESIGN})
+
+
+def test_maximum_power_is_at_the_limit_and_higher_is_refused(gg):
+    """The lower of two limits counts; one kilowatt more breaks it."""
+    top = maximum_power(gg, T5_max=760.0, dT_isa=15.0)
+    assert top["T5"] == pytest.approx(760.0, rel=1e-10)
+    both = maximum_power(gg, T4_max=1250.0, T5_max=760.0, dT_isa=15.0)
+    assert both["PW"] <= top["PW"] * (1 + 1e-12) and both["T4"] <= 1250.0 + 1e-6
+    with pytest.raises(Refusal, match=r"temperature limit: T5 = 76\d\.\d K, limit 760 K"):
+        trim_gas_generator(
+            gg, {"N": N_DESIGN, "PW": top["PW"] + 1e3}, dT_isa=15.0, limits=Limits(T5_max=760.0)
+        )
+    with pytest.raises(SignalError, match="T4_max or T5_max"):
+        maximum_power(gg)
+
+
+REFUSED = {
+    "temperature": (
+        {"N": N_DESIGN, "PW": 700e3}, {}, Status.TEMPERATURE, r"T4 = 1\d{3}\.\d K, limit 1320",
+    ),
+    "surge": ({"N": 0.8 * N_DESIGN, "PW": 4e5}, {}, Status.SURGE, r"beyond surge: SM = -0\.\d+"),
+    "speed off the table": (
+        {"N": 1.5 * N_DESIGN, "PW": 3e5}, {}, Status.OFF_MAP,
+        r"off the compressor map by 0\.\d+ table spans, limit 0.25 \(relative corrected speed 1\.5",
+    ),
+    "cold and high": (
+        {"N": N_DESIGN, "PW": 2e3}, {"altitude": 12e3, "dT_isa": -30.0}, Status.OFF_MAP,
+        r"off the compressor map by .* table 0\.400 to 1\.100",
+    ),
+    "power that the fuel cannot give": (
+        {"PW": 3e5, "Wf": 0.02}, {}, Status.NO_BALANCE,
+        r"no power balance.*stopped at \d+\.\d % of the way .* best point N = ",
+    ),
+    "driven": ({"N": N_DESIGN, "PW": -4e5}, {}, Status.OFF_MAP, r"needs no fuel: Wf = "),
+    "altitude": (
+        {"N": N_DESIGN, "PW": 3e5}, {"altitude": 2e4}, Status.INPUT,
+        r"altitude = 20000 m is outside \[-1000, 15000\]",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(REFUSED))
+def test_refusals_name_reason_number_and_limit(gg, case):
+    """Each is an OperatingPointError with status and best point; a batch has the same status."""
+    fixed, ambient, status, words = REFUSED[case]
+    with pytest.raises(OperatingPointError, match=words) as caught:
+        trim_gas_generator(gg, fixed, **ambient)
+    assert caught.value.status == status
+    point = caught.value.point
+    if point is not None:
+        assert point.residual < 1e-9 and (caught.value.reached == 1.0) == (
+            abs(point["N"] / fixed.get("N", point["N"]) - 1) < 1e-9
+            and abs(point["PW"] / fixed["PW"] - 1) < 1e-9
+        )
+    batch = trim_batch(gg, fixed, **ambient)
+    assert len(batch) == 1 and batch.status[0] == status
+    assert batch.reason(0) and np.isnan(batch["T4"]).all()
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert str(copy) == str(caught.value) and copy.status == status
+
+
+@pytest.mark.parametrize(
+    ("fixed", "words"),
+    [
+        ({"N": 3775.0}, "needs two fixed quantities, got 1"),
+        ({"N": 3775.0, "PW": 1e5, "T4": 1e3}, "got 3"),
+        ({"N": 3775.0, "t4": 1e3}, r"unknown signal 't4' \(did you mean 'T4'\?\)"),
+        ({"N": 3775.0, "T1": 300.0}, "T1 cannot be fixed: the ambient"),
+        ({"N": 3775.0, "n_c": 1.01}, "N and n_c do not determine a point together"),
+        ({"T5": 700.0, "T8": 710.0}, "T5 and T8 do not determine"),
+        ({"N": 3775.0, "PW": float("nan")}, "must be finite"),
+        ({"N": 3775.0, "PW": np.ones(3)}, "must be numbers"),
+    ],
+)
+def test_wrong_questions_are_refused_as_such(gg, fixed, words):
+    """A SignalError, not an operating point that cannot be found."""
+    with pytest.raises(SignalError, match=words):
+        trim_gas_generator(gg, fixed)
+
+
+def test_limits_can_be_moved_and_removed(gg):
+    """A limit refuses; without it the same point is returned, solved as well as any."""
+    fixed = {"N": N_DESIGN, "PW": 700e3}
+    with pytest.raises(Refusal) as caught:
+        trim_gas_generator(gg, fixed)
+    free = trim_gas_generator(gg, fixed, limits=Limits.none())
+    assert free["T4"] == caught.value.point["T4"] > 1320.0
+    with pytest.raises(Refusal, match=r"beyond surge: SM = 0\.2"):
+        trim_gas_generator(gg, {"N": N_DESIGN, "PW": 5e5}, limits=Limits(SM_min=0.3))
+
+
+@pytest.fixture(scope="module")
+def envelope(gg):
+    """A few hundred random points of the envelope, solved cold; more in ``apu study trim``."""
+    asked = trim_study.sample(gg, 400, seed=7)
+    return asked, trim_batch(gg, **asked)
+
+
+def test_random_points_are_solved_or_refused_with_a_reason(gg, envelope):
+    """None wrong by the plain model in the virtual machine, none unexplained; most solved."""
+    _, batch = envelope
+    solved = batch.ok
+    assert solved.mean() > 0.85
+    assert trim_study.recheck(gg, batch)[solved].max() < 1e-9
+    assert (batch.status != Status.UNEXPLAINED).all()
+    assert all(batch.reason(i) for i in np.flatnonzero(~solved))
+    assert all(batch.reason(i) == "" for i in np.flatnonzero(solved))
+    assert sum(batch.counts().values()) == len(batch) == 400
+    assert set(batch.counts()) == set(MEANING.values())
+
+
+def test_cold_starts_take_few_steps(envelope):
+    """The first guess is good: measured 4.7 steps on average, and no solved point needs another."""
+    _, batch = envelope
+    steps = batch.iterations[batch.ok]
+    assert steps.mean() < 6 and (steps > 0).mean() > 0.99
+
+
+def test_batch_equals_single(gg, envelope):
+    """Same status and the same numbers, point by point; a chunk knows nothing of its neighbours."""
+    asked, batch = envelope
+    for i in range(0, 400, 10):
+        ambient = {k: asked[k][i] for k in ("altitude", "Mach", "dT_isa")}
+        theta = {k: v[i] for k, v in asked["theta"].items()}
+        fixed = {"N": asked["fixed"]["N"], "PW": asked["fixed"]["PW"][i]}
+        try:
+            point = trim_gas_generator(gg, fixed, theta=theta, **ambient)
+        except Refusal as e:
+            assert e.status == batch.status[i]
+            continue
+        assert batch.ok[i]
+        for n in ("T4", "Wf", "SM"):
+            assert batch[n][i] == pytest.approx(point[n], rel=1e-9)
+
+
+def test_batch_in_chunks_equals_batch_at_once(gg, monkeypatch, envelope):
+    """Chunks bound the memory and change nothing."""
+    asked, batch = envelope
+    monkeypatch.setattr("apu_casadi.trimming.CHUNK", 77)
+    again = trim_batch(gg, outputs=("T4", "SM"), **asked)
+    assert again.names == ("T4", "SM")
+    np.testing.assert_array_equal(again.status, batch.status)
+    np.testing.assert_allclose(again["T4"], batch["T4"], rtol=1e-12)
+    with pytest.raises(SignalError, match=r"'T5' was not kept"):
+        _ = again["T5"]
+
+
+@needs_compiler
+def test_c_equals_vm(gg, envelope):
+    """The generated C and CasADi's virtual machine: the same points to rounding."""
+    asked, batch = envelope
+    with backend.use_backend("vm"):
+        slow = trim_batch(gg, **asked)
+        point = trim_gas_generator(gg, {"N": N_DESIGN, "PW": 222e3}, **CRUISE)
+    np.testing.assert_array_equal(slow.status, batch.status)
+    np.testing.assert_allclose(slow["T4"], batch["T4"], rtol=1e-9)
+    with backend.use_backend("c"):
+        fast = trim_batch(gg, {"N": N_DESIGN, "PW": np.full(500, 222e3)}, **CRUISE)
+    np.testing.assert_allclose(fast["T4"], point["T4"], rtol=1e-12)
+
+
+def test_bad_points_do_not_disturb_a_batch(gg):
+    """Not a number, or out of range: flagged with the reason, and the neighbours are solved."""
+    batch = trim_batch(
+        gg, {"N": N_DESIGN, "PW": [3e5, np.nan, 3e5, 3e5]}, altitude=[0.0, 0.0, 3e4, 0.0]
+    )
+    assert batch.status.tolist() == [Status.SOLVED, Status.INPUT, Status.INPUT, Status.SOLVED]
+    assert batch.reason(1) == "a fixed value is not finite"
+    assert batch.reason(2) == "altitude = 30000 m is outside [-1000, 15000]"
+    assert batch["T4"][0] == batch["T4"][3]
+    with pytest.raises(SignalError, match=r"unknown Altitude \(did you mean 'altitude'\?\)"):
+        trim_batch(gg, {"N": N_DESIGN, "PW": 3e5}, Altitude=0.0)
+    with pytest.raises(SignalError, match="batch of N, PW"):
+        trim_batch(gg, {"N": N_DESIGN, "PW": np.ones(3)}, altitude=np.zeros(4))
+
+
+def test_batch_broadcasts_and_becomes_a_dataset(gg):
+    """Arrays of several dimensions keep their shape; the dataset carries units and meanings."""
+    batch = trim_batch(
+        gg, {"N": N_DESIGN, "PW": np.array([[2e5], [3e5]])}, dT_isa=np.array([-10.0, 0.0, 10.0])
+    )
+    assert batch["T4"].shape == (2, 3) and np.all(np.diff(batch["T4"], axis=0) > 0)
+    ds = batch.to_dataset()
+    assert ds["T4"].dims == ("d0", "d1") and ds["T4"].attrs["units"] == "K"
+    assert "beyond_surge" in ds["status"].attrs["flag_meanings"]
+    assert float(ds["trim_residual"].max()) < 1e-9
+
+
+def test_deck_is_a_grid_of_single_points(gg):
+    """Axes by name; what cannot be had is NaN with its status."""
+    deck = performance_deck(
+        gg, altitude=[0.0, 6000.0], Mach=[0.0, 0.5], dT_isa=[0.0], PW=[1e5, 3e5, 9e5]
+    )
+    assert dict(deck.sizes) == {"altitude": 2, "Mach": 2, "dT_isa": 1, "PW": 3}
+    there = deck.sel(altitude=6000.0, Mach=0.5, dT_isa=0.0, PW=1e5)
+    point = trim_gas_generator(gg, {"N": N_DESIGN, "PW": 1e5}, altitude=6000.0, Mach=0.5)
+    assert float(there["Wf"]) == pytest.approx(point["Wf"], rel=1e-9)
+    lost = deck.sel(PW=9e5)
+    assert np.isnan(lost["Wf"]).all() and (lost["status"] == Status.TEMPERATURE).any()
+
+
+def test_threads_may_share_the_solver(gg):
+    """The buffers belong to the solver; a lock guards them."""
+    want = {p: trim_gas_generator(gg, {"N": N_DESIGN, "PW": p})["T4"] for p in (1e5, 2e5, 3e5)}
+    wrong = []
+
+    def work(power):
+        for _ in range(50):
+            got = trim_gas_generator(gg, {"N": N_DESIGN, "PW": power})["T4"]
+            if got != want[power]:
+                wrong.append((power, got))
+
+    threads = [threading.Thread(target=work, args=(p,)) for p in want]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert not wrong
+
+
+@pytest.mark.parametrize("spec", [("N", "PW"), ("T4", "Wf"), ("N", "SM"), (LAW, "Wf")])
+def test_kernel_jacobian_is_the_derivative_of_its_residual(gg, spec):
+    """Differences of the residual along random directions, at a point that is no solution."""
+    import casadi as ca
+
+    k = TrimKernel(gg.cycle, spec)
+    s, p = ca.MX.sym("s", len(k.free)), ca.MX.sym("p", k.n_p)
+    r = ca.Function("r", [s, p], [k._system(s, p, k._ambient(p), derivatives=False)[0]])
+    values = {"N": [N_DESIGN], "PW": [4e5], "T4": [1150.0], "Wf": [0.045], "SM": [0.3]}
+    values[LAW] = [4e5, 3500.0, 2.5]
+    at = np.array(
+        [2000.0, 0.3, 5.0, 0.0, 0.98, 1.0, 1.01, 1.0, *(v for n in spec for v in values[n])]
+    )
+    s0 = k.design_start() + 0.01
+    J = k.jacobian(s0, at).full()
+    rng = np.random.default_rng(3)
+    for _ in range(4):
+        d, h = rng.normal(size=s0.size), 1e-5
+        slope = (r(s0 + h * d, at) - r(s0 - h * d, at)).full().ravel() / (2 * h)
+        np.testing.assert_allclose(J @ d, slope, rtol=1e-6, atol=1e-7)
+
+
+def test_the_map_tables_are_part_of_the_recipe(gg):
+    """Another engine must not be given this one's library: the digest tells maps apart."""
+    import dataclasses
+
+    from apu_casadi.trimming import _digest
+
+    table = gg.compressor_map.table
+    other = dataclasses.replace(table, eta=table.eta * 0.99)
+    changed = dataclasses.replace(
+        gg, compressor_map=dataclasses.replace(gg.compressor_map, table=other)
+    )
+    assert _digest(changed) != _digest(gg)
+    assert _digest(GasGenerator()) == _digest(gg)
