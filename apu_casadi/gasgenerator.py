@@ -4,14 +4,13 @@ Paper, section 5, Fig. 8 and Tables 2-5.  The equations are in :mod:`apu_casadi.
 point fixes areas and map scales, off design everything follows from the residuals.
 
 Rotor speed is the one state.  The improved method of the paper (IGDM, Algorithm 2, eq. 12) is
-:meth:`GasGenerator.initialise`, :meth:`~GasGenerator.state_update` and
+:func:`apu_casadi.trimming.initialise`, :meth:`GasGenerator.state_update` and
 :meth:`~GasGenerator.output`, with a hook between the last two in :meth:`~GasGenerator.run`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
@@ -322,22 +321,6 @@ class GasGenerator:
                     f"{name} = {worst:g} {self.U[name].unit} is outside [{lo:g}, {hi:g}]"
                 )
 
-    def initialise(
-        self, *, N: float, PW: float, theta: Mapping[str, float] | None = None, **ambient: float
-    ) -> GasGeneratorState:
-        """Solve the steady start (TransitionInitialize_I): which fuel flow holds N against PW?
-
-        Raises
-        ------
-        OperatingPointError : no such steady point.
-        """
-        from apu_casadi.trimming import Limits, trim_gas_generator
-
-        limits = Limits(T4_max=math.inf)  # hot is no reason not to start
-        fixed = {"N": N, "PW": PW}
-        point = trim_gas_generator(self, fixed, theta=theta, limits=limits, **ambient)
-        return GasGeneratorState(point.x, point.z, point.u, point.theta)
-
     def state_update(
         self,
         x: np.ndarray,
@@ -406,7 +389,7 @@ class GasGenerator:
 
         Parameters
         ----------
-        start : from :meth:`initialise`.
+        start : from :func:`apu_casadi.trimming.initialise`.
         inputs : u at t_1 ... t_K, shape (6, K), columns packed by ``U``.
         theta : health factors, shape (4,) or (4, K); those of ``start`` by default.
         hook : ``StateProcess``: (k, x(k)) -> x(k); state noise, Monte Carlo, an estimator.

@@ -30,7 +30,12 @@ import numpy as np
 
 from apu_casadi import backend
 from apu_casadi.errors import OperatingPointError, SignalError, nearest
-from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator, MapChoice
+from apu_casadi.gasgenerator import (
+    RESIDUAL_TOL,
+    GasGenerator,
+    GasGeneratorState,
+    MapChoice,
+)
 from apu_casadi.trimkernel import AMBIENT, LAW, N_FIRST, NZ, TrimKernel
 
 if TYPE_CHECKING:
@@ -981,3 +986,22 @@ def hot_functions(gg: GasGenerator | None = None) -> list[str]:
         solver = _solver(gg, pair)
         names += [solver.function(which, compile=True).name() for which in ("cold", "warm")]
     return names
+
+
+def initialise(
+    gg: GasGenerator,
+    *,
+    N: float,
+    PW: float,
+    theta: Mapping[str, float] | None = None,
+    **ambient: float,
+) -> GasGeneratorState:
+    """Solve the steady start of Algorithm 2 (TransitionInitialize_I): which fuel holds N at PW?
+
+    Raises
+    ------
+    OperatingPointError : no such steady point.
+    """
+    limits = Limits(T4_max=math.inf)  # hot is no reason not to start
+    point = trim_gas_generator(gg, {"N": N, "PW": PW}, theta=theta, limits=limits, **ambient)
+    return GasGeneratorState(point.x, point.z, point.u, point.theta)

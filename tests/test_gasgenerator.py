@@ -15,7 +15,7 @@ from apu_casadi.errors import (
 )
 from apu_casadi.gasgenerator import RPM, GasGenerator, GasGeneratorParameters
 from apu_casadi.mapfiles import read_map, shipped, write_map_csv
-from apu_casadi.trimming import trim_gas_generator
+from apu_casadi.trimming import initialise, trim_gas_generator
 
 ISA5 = {"dT_isa": 5.0}
 
@@ -118,7 +118,7 @@ def test_explicit_and_implicit_method_agree(gg):
     The earlier method hides the state; its one function is written out here.  Same trajectory to
     the solver's tolerance.
     """
-    start = gg.initialise(N=gg.parameters.N, PW=230e3, **ISA5)
+    start = initialise(gg, N=gg.parameters.N, PW=230e3, **ISA5)
     K = 40
     inputs = np.tile(start.u[:, None], (1, K))
     inputs[0, 10:] *= 1.1
@@ -141,7 +141,7 @@ def test_explicit_and_implicit_method_agree(gg):
 
 def test_hook_and_output_noise_enter_where_algorithm_2_puts_them(gg):
     """The hook moves the state, so outputs follow it; output noise leaves the state alone."""
-    start = gg.initialise(N=gg.parameters.N, PW=230e3, **ISA5)
+    start = initialise(gg, N=gg.parameters.N, PW=230e3, **ISA5)
     inputs = np.tile(start.u[:, None], (1, 3))
     X0, Y0 = gg.run(start, inputs)
     X1, Y1 = gg.run(start, inputs, hook=lambda k, x: x + (5.0 if k == 2 else 0.0))
@@ -156,7 +156,7 @@ def test_hook_and_output_noise_enter_where_algorithm_2_puts_them(gg):
 
 def test_discrete_step_is_second_order(gg):
     """Halving the step quarters the error against CVODES on the continuous model (rtol 1e-11)."""
-    start = gg.initialise(N=gg.parameters.N, PW=230e3, **ISA5)
+    start = initialise(gg, N=gg.parameters.N, PW=230e3, **ISA5)
     u = start.u.copy()
     u[0] *= 1.05
     ss = gg.state_space
@@ -244,7 +244,7 @@ def test_impossible_points_are_refused_with_the_best_point(gg):
 
 def test_a_step_off_the_maps_raises(gg):
     """No result with a residual above 1e-9 is used: far off the map the run stops with numbers."""
-    start = gg.initialise(N=gg.parameters.N, PW=230e3, **ISA5)
+    start = initialise(gg, N=gg.parameters.N, PW=230e3, **ISA5)
     inputs = np.tile(start.u[:, None], (1, 800))
     inputs[0] *= 1.15
     with pytest.raises(SimulationError, match=r"residual .* at N = "):

@@ -12,7 +12,9 @@ from importlib import import_module
 from typing import Protocol, cast
 
 MODULES: tuple[str, ...] = (
+    "scenarios.commands.bench",
     "scenarios.commands.calibrate",
+    "scenarios.commands.campaign",
     "scenarios.commands.linearise",
     "scenarios.commands.compile",
     "scenarios.commands.deck",

@@ -13,7 +13,10 @@ import time
 NAME = "compile"
 HELP = "compile the hot functions to C libraries ahead of time"
 
-HOT: tuple[tuple[str, str], ...] = (("trim", "apu_casadi.trimming:hot_functions"),)
+HOT: tuple[tuple[str, str], ...] = (
+    ("gas_generator", "scenarios.commands.compile:gas_generator_functions"),
+    ("trim", "apu_casadi.trimming:hot_functions"),
+)
 """(name, "module:callable"); the callable compiles its functions and returns their names."""
 
 
@@ -62,3 +65,12 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"in {folder}")
     return 0
+
+
+def gas_generator_functions() -> list[str]:
+    """Compile state update, output and their combination of the default engine."""
+    from apu_casadi.backend import compiled
+    from apu_casadi.gasgenerator import GasGenerator
+
+    gg = GasGenerator()
+    return [str(compiled(f).name()) for f in (gg.f, gg.g, gg.step)]

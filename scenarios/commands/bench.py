@@ -1,0 +1,80 @@
+"""Measure times against their targets, with the accuracy of every answer beside them.
+
+Takes some minutes, the campaign of 1000 runs most of them; ``--only`` and ``--runs`` do less.
+``--peers`` adds dpsim (machine) and pyCycle (trim) where they are installed.
+
+  apu bench --only trim,joint
+  apu bench --page BENCHMARKS.md
+
+The page has its plot in docs/images beside it.  Exit status 1 when an answer is inaccurate; a
+missed time is no failure, since it depends on the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+
+NAME = "bench"
+HELP = "measure times and their accuracy (takes minutes)"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--only", metavar="A,B", help="parts to measure, comma separated")
+    parser.add_argument("--list", action="store_true", help="list the parts and stop")
+    parser.add_argument("--peers", action="store_true", help="also measure dpsim and pyCycle")
+    parser.add_argument(
+        "--pycycle-python", metavar="PYTHON", help="a Python that has pyCycle, for --peers"
+    )
+    parser.add_argument("--runs", type=int, help="joint runs of the campaign (default 1000)")
+    parser.add_argument("--json", action="store_true", help="print JSON only")
+    parser.add_argument("--page", metavar="FILE", help="also write the page, BENCHMARKS.md")
+    parser.add_argument("--quiet", action="store_true", help="do not say what is being measured")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print, write."""
+    from apu_casadi.errors import ScenarioError
+    from scenarios import bench, pages, registry
+
+    if args.list:
+        print("\n".join(bench.known()))
+        return 0
+    if args.runs is not None and args.runs < 1:
+        raise ScenarioError(f"--runs must be >= 1, got {args.runs}")
+    if args.pycycle_python:
+        os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
+    size = bench.Size()
+    if args.runs is not None:
+        size = dataclasses.replace(size, runs=args.runs)
+    names = None
+    if args.only is not None:
+        names = [n.strip() for n in args.only.split(",") if n.strip()]
+        names += [n for n in bench.PEERS if args.peers and n not in names]
+    if args.page:
+        registry.prepare(Path(args.page).parent)
+    show = not args.quiet and not args.json and sys.stderr.isatty()
+
+    def say(name: str) -> None:
+        print(f"measuring {name} ...", file=sys.stderr)
+
+    report = bench.run(names, size=size, peers=args.peers, say=say if show else None)
+    made = []
+    if args.page:
+        page, image = Path(args.page), None
+        if report.curves:
+            image = "docs/images/bench_linear.png"
+            made.append(bench.write_plot(report.curves, size, page.parent / image))
+        made.append(pages.write_text(page, bench.page(report, image)))
+    if args.json:
+        print(json.dumps(report.to_dict(), indent=2, allow_nan=False))
+    else:
+        print(bench.table(report))
+        if made:
+            print("\nwritten:", *(f"  {path}" for path in made), sep="\n")
+    return 0 if all(r.accurate for rows in report.rows.values() for r in rows) else 1

@@ -1,0 +1,91 @@
+"""Run many joint scenarios with random faults over all cores, and collect their summaries.
+
+Health factors, severity (mu, k_rf, kappa), phase and time of the short circuit are drawn at random.
+Each finished run is kept in DIR/runs.jsonl at once: after an interruption the same command goes on.
+The result is DIR/campaign.nc, with the reason of every run that was refused.
+
+  apu campaign --runs 1000 --seed 1 --out results/campaign
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+NAME = "campaign"
+HELP = "run many joint scenarios with random faults"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--runs", type=int, default=1000, help="number of runs (default 1000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default 0)")
+    parser.add_argument(
+        "--base", default="joint", metavar="SCENARIO", help="scenario that is varied (joint)"
+    )
+    parser.add_argument("--workers", type=int, help="processes (default: all cores)")
+    parser.add_argument(
+        "--out", default="results/campaign", metavar="DIR", help="folder (results/campaign)"
+    )
+    parser.add_argument("--fresh", action="store_true", help="do not take up what DIR already has")
+    parser.add_argument(
+        "--waveforms", action="store_true", help="keep the full dataset of each run (large)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the campaign; status 0 even if runs were refused, which the result tells."""
+    from pathlib import Path
+
+    from scenarios import campaigns, registry
+
+    runs = campaigns.random_faults(args.runs, args.seed, base=registry.get(args.base))
+    t = time.perf_counter()
+    with _bar(args.runs, show=not args.quiet and sys.stderr.isatty()) as progress:
+        ds = campaigns.run_campaign(
+            runs, workers=args.workers, out=args.out, summary_only=not args.waveforms,
+            progress=progress, resume=not args.fresh,
+        )  # fmt: skip
+    t = time.perf_counter() - t
+    n = campaigns.counts(ds)
+    reasons = {
+        str(name): str(why)
+        for name, why, s in zip(ds["run"].values, ds["reason"].values, ds["status"].values)
+        if s
+    }
+    path = Path(args.out) / campaigns.DATASET
+    if args.json:
+        report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": n}
+        print(json.dumps({**report, "reasons": reasons, "file": str(path)}, indent=2))
+        return 0
+    print(f"{args.runs} runs in {t:.1f} s: " + ", ".join(f"{v} {k}" for k, v in n.items() if v))
+    for name, why in list(reasons.items())[:10]:
+        print(f"  {name}: {why}")
+    if len(reasons) > 10:
+        print(f"  ... and {len(reasons) - 10} more, in the file")
+    print(f"written: {path}")
+    return 0
+
+
+@contextmanager
+def _bar(total: int, *, show: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Yield a callback that moves a progress bar on stderr; None where none is shown."""
+    if not show:
+        yield None
+        return
+    from tqdm import tqdm
+
+    columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
+    with tqdm(total=total, desc=NAME, unit="run", ncols=columns, file=sys.stderr) as bar:
+
+        def progress(done: int, _: int) -> None:
+            bar.update(done - bar.n)
+
+        yield progress

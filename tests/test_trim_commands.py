@@ -1,0 +1,101 @@
+"""The commands trim, deck, study and compile: what they print, and how they refuse."""
+
+import json
+
+import pytest
+import xarray as xr
+
+from apu_casadi import backend
+from scenarios.cli import main
+
+
+def out(capsys, *argv):
+    """Run the command; return status, standard output and standard error."""
+    status = main(list(argv))
+    got = capsys.readouterr()
+    return status, got.out, got.err
+
+
+def test_trim_prints_table_5(capsys):
+    """The paper's cruise point (Table 5), by shaft power; JSON holds every output."""
+    ambient = ("--altitude", "8000", "--mach", "0.7", "--disa", "5")
+    status, text, _ = out(capsys, "trim", *ambient, "--power", "222e3", "--json")
+    report = json.loads(text)
+    assert status == 0
+    assert report["outputs"]["T3"] == pytest.approx(534.3, rel=2e-3)
+    assert report["residual"] < 1e-9
+    status, text, _ = out(capsys, "trim", *ambient, "--power", "222e3")
+    assert status == 0 and "T3              534" in text and "residual" in text
+
+
+def test_trim_by_other_quantities(capsys):
+    """Two fixed outputs, a cubic load, a temperature limit, an electrical load, one generator."""
+    for argv in (
+        ("--fix", "N_rpm=36050", "--fix", "T4=1150"),
+        ("--fix", "Wf=0.04,PW=cube"),
+        ("--max-power", "T5=720", "--altitude", "3000"),
+        ("--load", "200e3", "--disa", "5"),
+        ("--power", "300e3", "--health", "f_eta_c=0.97", "--limit", "T4_max=1500"),
+    ):
+        status, text, err = out(capsys, "trim", *argv, "--json")
+        assert status == 0, (argv, err)
+        assert json.loads(text)["outputs"]["PW"] > 1e5
+    status, text, _ = out(capsys, "trim", "--load", "100e3", "--voltage", "230", "--json")
+    assert status == 0 and json.loads(text)["generator"]["V_t"] == pytest.approx(230.0)
+
+
+@pytest.mark.parametrize(
+    ("argv", "status", "words"),
+    [
+        (("--power", "900e3"), 1, "temperature limit: T4 = "),
+        (("--load", "225e3", "--power", "1e5"), 2, "give one of --power, --load"),
+        ((), 2, "got none"),
+        (("--fix", "N=3775,t4=1000"), 2, "did you mean 'T4'?"),
+        (("--power", "1e5", "--limit", "SMmin=0"), 2, "did you mean 'SM_min'?"),
+        (("--power", "1e5", "--health", "f_eta_c"), 2, "NAME=VALUE is expected"),
+        (("--power", "1e5", "--voltage", "230"), 2, "needs --load"),
+    ],
+)
+def test_trim_refuses_with_the_reason(capsys, argv, status, words):
+    """Status 1: no such point; 2: a wrong question."""
+    got, _, err = out(capsys, "trim", *argv)
+    assert got == status and words in err
+
+
+def test_deck_writes_the_grid(capsys, tmp_path):
+    """Axes by range and by list; refused points are counted."""
+    path = tmp_path / "d" / "deck.nc"
+    status, text, _ = out(
+        capsys, "deck", "--altitude", "0:6000:3", "--mach", "0,0.4", "--power", "1e5,9e5",
+        "--outputs", "T4,Wf", "--out", str(path), "--json",
+    )  # fmt: skip
+    report = json.loads(text)
+    assert status == 0 and report["points"] == 12 == sum(report["counts"].values())
+    with xr.open_dataset(path) as deck:
+        assert dict(deck.sizes) == {"altitude": 3, "Mach": 2, "dT_isa": 1, "PW": 2}
+        assert {"T4", "Wf", "status"} <= set(deck.data_vars)
+    status, _, err = out(capsys, "deck", "--mach", "0:x:3", "--out", str(path))
+    assert status == 2 and "FROM:TO:COUNT" in err
+
+
+def test_study_reports_shares(capsys):
+    """A small run of the large study; status 1 if a point were wrong or unexplained."""
+    status, text, _ = out(capsys, "study", "trim", "--points", "300", "--seed", "3", "--json")
+    report = json.loads(text)
+    assert status == 0
+    assert report["wrong"] == report["unexplained"] == 0
+    assert report["cold"] > 0.8 * report["points"]
+    status, text, _ = out(capsys, "study", "trim", "--points", "300", "--seed", "3")
+    assert status == 0 and "wrong (residual > 1e-9)         0" in text
+
+
+def test_compile_without_a_compiler_says_so(capsys, monkeypatch, tmp_path):
+    """Nothing to do is status 1, not a failure; an unknown group is a wrong question."""
+    monkeypatch.setenv("APU_CACHE_DIR", str(tmp_path))
+    with backend.use_backend("vm"):
+        status, _, err = out(capsys, "compile")
+    assert status == 1 and "virtual machine" in err
+    status, _, err = out(capsys, "compile", "--only", "trimm")
+    assert status == 2 and "did you mean 'trim'?" in err
+    status, text, _ = out(capsys, "compile", "--clear")
+    assert status == 0 and text.startswith("0 libraries")
