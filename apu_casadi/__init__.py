@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from apu_casadi.apu import Apu
+    from apu_casadi.apu import Apu, trim
     from apu_casadi.errors import ApuError
     from apu_casadi.events import Ambient, FaultChange, HealthChange, LoadChange
     from apu_casadi.gasgenerator import GasGenerator
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from apu_casadi.multirate import Noise, simulate_joint
     from apu_casadi.signals import Signal, Signals
     from apu_casadi.statespace import StateSpace
-    from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+    from apu_casadi.trimming import OperatingPoint, trim_batch
 
     __version__: str
 
@@ -45,7 +45,8 @@ __all__ = [
     "Ttsc",
     "__version__",
     "simulate_joint",
-    "trim_gas_generator",
+    "trim",
+    "trim_batch",
 ]
 
 _HOME = {
@@ -67,7 +68,8 @@ _HOME = {
     "StateSpace": "apu_casadi.statespace",
     "Ttsc": "apu_casadi.machine.ttsc",
     "simulate_joint": "apu_casadi.multirate",
-    "trim_gas_generator": "apu_casadi.trimming",
+    "trim": "apu_casadi.apu",
+    "trim_batch": "apu_casadi.trimming",
 }
 
 

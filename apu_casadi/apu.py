@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.control import GovernorParameters
-from apu_casadi.errors import OperatingPointError, ParameterError, nearest
+from apu_casadi.errors import OperatingPointError, ParameterError, SignalError, nearest
 from apu_casadi.events import Ambient
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
@@ -167,3 +167,46 @@ class Apu:
                 f"governor's limits [{g.Wf_min:g}, {g.Wf_max:g}]"
             )
         return JointPoint(gas, gen)
+
+
+def trim(
+    model: GasGenerator | Generator | Apu,
+    fixed: Mapping[str, Any] | None = None,
+    *,
+    load: Load | None = None,
+    **conditions: Any,
+) -> OperatingPoint | GeneratorPoint | JointPoint:
+    """Solve a steady operating point of any of the models; no guess is asked for.
+
+    Parameters
+    ----------
+    model : what is to be trimmed.
+    fixed : of a gas generator, two outputs by name with their values, SI; see
+        :func:`apu_casadi.trimming.trim_gas_generator`.
+    load : of a generator, or of each generator of a unit: a balanced load.
+    conditions : of a gas generator ``theta``, ``limits``, altitude (m), Mach, dT_isa (K), war;
+        of a generator ``w_r`` (rad/s, electrical) and ``V_t`` (V rms) or ``V_ref``; of a unit
+        ``ambient``, ``health``, ``V_ref``, ``limits``.
+
+    Raises
+    ------
+    SignalError : arguments that this model does not take, or too few.
+    OperatingPointError : no such point; says why, and the best point reached.
+
+    Examples
+    --------
+    >>> from apu_casadi.machine.load import SeriesLoad
+    >>> round(trim(Apu(), load=SeriesLoad.from_power(100e3)).gas["Wf"], 4)
+    0.0297
+    """
+    if isinstance(model, GasGenerator):
+        if fixed is None or load is not None:
+            raise SignalError("a gas generator is trimmed by two fixed outputs, not by a load")
+        return trim_gas_generator(model, fixed, **conditions)
+    if not isinstance(model, Generator | Apu):
+        raise SignalError(
+            f"a GasGenerator, Generator or Apu can be trimmed, got {type(model).__name__}"
+        )
+    if load is None or fixed is not None:
+        raise SignalError(f"{type(model).__name__} is trimmed by its load: give load=...")
+    return model.steady_state(load, **conditions)

@@ -36,7 +36,8 @@ PUBLIC = {
     "Ttsc",
     "__version__",
     "simulate_joint",
-    "trim_gas_generator",
+    "trim",
+    "trim_batch",
 }
 
 
