@@ -8,8 +8,7 @@ A run that is refused, fails, or takes its process down leaves its status and it
 missing from the result.  Finished runs are kept in ``runs.jsonl`` of the folder, one checked line
 each, as soon as they are there: a campaign that was interrupted goes on where it stopped.
 
-The processes are started afresh (spawn) and import the calling script: protect its body by
-``if __name__ == "__main__":``.
+The processes are started afresh (spawn) and import this module, not the calling script.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import math
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.errors import ApuError, DataError, ScenarioError, nearest
+from apu_casadi.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
 from scenarios import registry
 from scenarios.schema import FaultSpec, Scenario
 
@@ -171,7 +171,7 @@ def simulate(s: Scenario, *, solver: str = "propagator") -> xr.Dataset:
 
 def _run_one(task: _Task) -> dict[str, Any]:
     """Run one scenario; return its record, whatever happens."""
-    from apu_casadi.errors import OperatingPointError, SimulationError
+    from apu_casadi.errors import OperatingPointError
     from apu_casadi.results import phase_summary, save
 
     t = time.perf_counter()
@@ -241,10 +241,8 @@ def run_campaign(
     if not scenarios:
         raise ScenarioError("a campaign needs at least one scenario")
     names = [s.name for s in scenarios]
-    twice = next((n for n in names if names.count(n) > 1), None) if len(set(names)) < len(
-        names
-    ) else None  # fmt: skip
-    if twice is not None:
+    if len(set(names)) < len(names):
+        twice = next(n for n in names if names.count(n) > 1)
         raise ScenarioError(f"two scenarios of one name in a campaign: {twice!r}")
     if workers is not None and workers < 1:
         raise ScenarioError(f"workers must be >= 1, got {workers}")
@@ -313,10 +311,14 @@ def _pooled(
 ) -> Iterator[dict[str, Any]]:  # fmt: skip
     """Yield records of tasks run by a pool; those under way when a process died go to suspects."""
     waiting = tasks[::-1]
+    fruitless = 0
     while waiting:
-        with _one_thread_each(), _pool(workers) as pool:
+        with _plain_children(), _pool(workers) as pool:
             under_way: dict[Future[dict[str, Any]], _Task] = {}
             broken = False
+            fruitless += 1
+            if fruitless > 3:
+                raise SimulationError("the processes of the campaign end before they have run")
             while (waiting or under_way) and not broken:
                 # few under way, so that an interrupt is answered within a run or two
                 while waiting and len(under_way) < 2 * workers and not broken:
@@ -333,6 +335,7 @@ def _pooled(
                         suspects.append(task)
                         broken = True
                     else:
+                        fruitless = 0
                         yield record
             suspects.extend(under_way.values())
 
@@ -355,13 +358,20 @@ def _ignore_interrupt() -> None:
 
 
 @contextlib.contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes started inside the block use one thread each in linear algebra."""
+def _plain_children() -> Iterator[None]:
+    """Let processes started inside the block use one thread each, and not run our main script.
+
+    The latter is what spawning does, for functions that the script may define; ours are here.
+    """
     before = {k: os.environ.get(k) for k in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
+    main = sys.modules["__main__"]
+    held = {k: vars(main).pop(k) for k in ("__file__", "__spec__") if k in vars(main)}
+    main.__spec__ = None
     try:
         yield
     finally:
+        vars(main).update(held)
         for k, v in before.items():
             if v is None:
                 os.environ.pop(k, None)

@@ -1,0 +1,111 @@
+"""The benchmark on tiny settings: every part runs, and its accuracy holds; no time is judged."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from apu_casadi.benchplot import fit, plot_costs
+from apu_casadi.errors import ScenarioError, SignalError
+from scenarios import bench
+from scenarios.cli import main
+from scenarios.schema import Scenario
+
+SHORT = Scenario.from_dict(
+    {
+        "name": "short",
+        "duration": 0.4,
+        "phase": [
+            {"name": "healthy", "start": 0.0, "load": {"kind": "R", "power_kW": 150.0}},
+            {"name": "gas path", "start": 0.1, "health": {"f_eta_c": 0.99}},
+            {"name": "short circuit", "start": 0.2, "fault": {"mu": 0.05, "k_rf": 20.0}},
+        ],
+    }
+)
+TINY = bench.Size(
+    trims=10, batch=20, deck=(2, 2, 1, 3), calls=60, joint=SHORT, repeats=1, runs=1, checked=1,
+    hour=0.5, durations=(0.4, 0.8), counts=(1, 2), rates=(0.0, 2e4),
+)  # fmt: skip
+ROW = bench.Row("it", 2.0, "ms", 3.0, 1e-7, 1e-6, "relative")
+
+
+@pytest.mark.parametrize("name", ["trim", "deck", "derivatives", "linearisation", "shell"])
+def test_the_parts_run_and_are_accurate(name):
+    rows = bench.PARTS[name](TINY)
+    assert rows and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
+    assert all(math.isfinite(r.value) and r.value > 0 for r in rows)
+
+
+def test_the_joint_parts_run_and_are_accurate(monkeypatch):
+    """The process without compiled code is left out: it takes its time to build everything."""
+    monkeypatch.setattr(bench, "_virtual_machine", lambda *_: [])
+    rows = bench.joint(TINY) + bench.campaign(TINY)
+    assert len(rows) == 3 and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
+
+
+def test_errors_leave_out_the_first_half_millisecond():
+    t = np.arange(0, 0.01, 1e-4)
+    ref = {"time_w": t, **{n: np.ones(5) for n in bench.SLOW}, **{n: 0 * t + 2 for n in bench.FAST}}
+    off = {**ref, "v_a": ref["v_a"] + 0.5 * (np.abs(t - 0.0052) < 1e-9), "N": ref["N"] * 1.1}
+    assert bench.errors(off, ref, [0.005])["v_a"] == 0.0
+    e = bench.errors(off, ref, [])
+    assert e["v_a"] == pytest.approx(0.25) and e["N"] == pytest.approx(0.1) and e["v_b"] == 0.0
+
+
+def test_a_fast_wrong_answer_is_not_met():
+    assert ROW.met
+    assert not dataclasses.replace(ROW, error=1e-5).met
+    assert not dataclasses.replace(ROW, error=math.nan).met
+    assert not dataclasses.replace(ROW, value=4.0).met
+    assert dataclasses.replace(ROW, value=4.0, more=True).met
+    assert bench.cells(dataclasses.replace(ROW, error=1.0))[5] == "inaccurate"
+
+
+def test_memory_is_that_of_this_process():
+    assert 20 < bench.peak_memory() < 1e5
+
+
+def test_page_and_table_and_json(tmp_path):
+    where = {**bench.machine(), "load_before": 2.0}
+    curves = {"rate": (np.array([0.0, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]))}
+    rows = {"trim": [ROW, dataclasses.replace(ROW, target=None, peer="other", ratio=12.0)]}
+    rows["linear"] = bench.linear_rows(curves)
+    r = bench.Report(rows, curves, {"pycycle": "not here"}, where, 3.0)
+    text = bench.page(r, "docs/images/bench_linear.png")
+    assert "| it | <= 3 ms | 2 ms | 1.0e-07 | 1e-06 | met | - | - | relative |" in text
+    assert "Other programs were running" in text and "pycycle: not here" in text
+    assert "12" in bench.table(r) and "load before the start 2.0" in bench.table(r)
+    assert json.loads(json.dumps(r.to_dict(), allow_nan=False))["rows"]["trim"][0]["met"] is True
+    assert rows["linear"][0].value == pytest.approx(0.0, abs=1e-9)
+    path = bench.write_plot(curves, TINY, tmp_path / "a" / "b.png")
+    assert path.stat().st_size > 5000
+
+
+def test_plot_refuses_what_is_no_curve():
+    with pytest.raises(SignalError, match="two points"):
+        fit(np.array([1.0]), np.array([1.0]))
+    with pytest.raises(SignalError, match="one to four"):
+        plot_costs([], "")
+
+
+def test_the_command(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "PARTS", {"trim": lambda size: [ROW]})
+    monkeypatch.setattr(bench, "linear", lambda size: {"rate": (np.arange(3.0), np.arange(3.0))})
+    assert main(["bench", "--list"]) == 0
+    assert "dpsim" in capsys.readouterr().out
+    page = tmp_path / "BENCHMARKS.md"
+    assert main(["bench", "--page", str(page)]) == 0
+    assert "2 ms" in capsys.readouterr().out
+    assert "bench_linear.png" in page.read_text(encoding="utf-8")
+    assert (tmp_path / "docs" / "images" / "bench_linear.png").exists()
+    assert main(["bench", "--only", "trim", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"]["trim"][0]["value"] == 2.0
+    monkeypatch.setattr(
+        bench, "PARTS", {"trim": lambda size: [dataclasses.replace(ROW, error=1.0)]}
+    )
+    assert main(["bench", "--only", "trim"]) == 1
+    assert main(["bench", "--runs", "0"]) == 2
+    with pytest.raises(ScenarioError, match="unknown part"):
+        bench.run(["trin"])

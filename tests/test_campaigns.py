@@ -1,0 +1,217 @@
+"""Campaigns: reproducible draws, nothing lost, resumed where they stopped."""
+
+import json
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from apu_casadi import results
+from apu_casadi.errors import ScenarioError
+from scenarios import campaigns, registry
+from scenarios.campaigns import RUNS, counts, random_faults, run_campaign
+from scenarios.cli import main
+from scenarios.schema import FaultSpec, Scenario
+
+BASE = {
+    "name": "short",
+    "duration": 0.4,
+    "phase": [
+        {"name": "healthy", "start": 0.0, "load": {"kind": "R", "power_kW": 100.0}},
+        {"name": "gas path", "start": 0.1, "health": {"f_eta_c": 0.99}},
+        {"name": "short circuit", "start": 0.3, "fault": {"mu": 0.05, "k_rf": 20.0}},
+    ],
+}
+
+
+@pytest.fixture
+def base():
+    return Scenario.from_dict(BASE)
+
+
+def refused(base):
+    """No gas generator carries twice 500 kW: refused at the start."""
+    table = base.to_dict()
+    table["name"], table["phase"][0]["load"]["power_kW"] = "too-much", 500.0
+    return Scenario.from_dict(table)
+
+
+def same(a, b):
+    """All but the times of two campaigns."""
+    return a.drop_vars("seconds").identical(b.drop_vars("seconds"))
+
+
+def test_draws_depend_on_seed_and_index_alone(base):
+    long, short = random_faults(40, 7, base=base), random_faults(3, 7, base=base)
+    assert long[:3] == short
+    assert random_faults(1, 8, base=base)[0].phases[1] != long[0].phases[1]
+    assert len({s.name for s in long}) == 40
+    faults = [s.phases[2].fault for s in long]
+    assert all(isinstance(f, FaultSpec) and f.mu <= f.kappa <= 1 for f in faults)
+    assert {f.phase for f in faults} == set("abc")
+    full = sum(f.kappa == f.mu for f in faults)
+    assert 0 < full < 40
+    assert len({s.phases[2].start for s in long}) > 20
+    assert all(0.2 <= s.phases[2].start < 0.4 for s in long)
+
+
+def test_a_base_without_faults_is_refused():
+    with pytest.raises(ScenarioError, match="no a? ?phase with"):
+        random_faults(1, base="quiet")
+    with pytest.raises(ScenarioError, match="n >= 1"):
+        random_faults(0)
+
+
+def test_summaries_are_those_of_single_runs(base, tmp_path):
+    runs = random_faults(2, 1, base=base)
+    ds = run_campaign(runs, workers=1, out=tmp_path)
+    assert counts(ds)["done"] == 2
+    alone = registry.run(runs[1].change(waveform_dt=None), solver="propagator")
+    for j, row in enumerate(results.phase_summary(alone)):
+        for k in ("T4", "N_rpm_min", "V_a_rms", "h", "f_W_t"):
+            assert float(ds[k][1, j]) == pytest.approx(row[k], rel=1e-12)
+    assert np.isnan(ds["k_rf"].values[:, 0]).all()
+    assert ds["fault_phase"].values[1, 2] == runs[1].phases[2].fault.phase
+    assert all("units" in v.attrs or v.dtype.kind in "Ui" for v in ds.data_vars.values())
+    assert same(results.load(tmp_path / campaigns.DATASET), ds)
+
+
+def test_a_refused_run_is_recorded_with_its_reason(base):
+    ds = run_campaign([random_faults(1, base=base)[0], refused(base)], workers=1)
+    assert counts(ds) == {"done": 1, "refused": 1, "failed": 0, "invalid": 0, "crashed": 0}
+    assert "beyond surge" in str(ds["reason"].values[1]) and str(ds["reason"].values[0]) == "-"
+    assert np.isnan(ds["T4"].values[1]).all() and np.isfinite(ds["T4"].values[0]).all()
+
+
+def test_an_unforeseen_error_is_recorded_and_tried_again(base, tmp_path, monkeypatch):
+    runs = random_faults(2, base=base)
+    right = campaigns.simulate
+
+    def wrong(s, **how):
+        if s.name == runs[0].name:
+            raise ZeroDivisionError("never mind")
+        return right(s, **how)
+
+    monkeypatch.setattr(campaigns, "simulate", wrong)
+    ds = run_campaign(runs, workers=1, out=tmp_path)
+    assert counts(ds)["crashed"] == 1
+    assert str(ds["reason"].values[0]) == "ZeroDivisionError: never mind"
+    monkeypatch.setattr(campaigns, "simulate", right)
+    assert counts(run_campaign(runs, workers=1, out=tmp_path))["done"] == 2
+
+
+def test_an_interrupted_campaign_goes_on_where_it_stopped(base, tmp_path, monkeypatch):
+    runs = random_faults(3, base=base)
+    whole = run_campaign(runs, workers=1)
+    right = campaigns._run_one
+    ran = []
+
+    def counted(task):
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        ran.append(task.table["name"])
+        return right(task)
+
+    monkeypatch.setattr(campaigns, "_run_one", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(runs, workers=1, out=tmp_path)
+    # the second line was changed on disk, and a third one cut short
+    lines = (tmp_path / RUNS).read_text().splitlines()
+    assert len(lines) == 2
+    (tmp_path / RUNS).write_text(f"{lines[0]}\n{lines[1].replace('done', 'gone')}\n{lines[0][:99]}")
+    ran.clear()
+    seen = []
+    again = run_campaign(
+        runs, workers=1, out=tmp_path, progress=lambda done, total: seen.append((done, total))
+    )
+    assert ran == [runs[1].name, runs[2].name]
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert same(again, whole)
+    ran.clear()
+    assert same(run_campaign(runs, workers=1, out=tmp_path), whole) and ran == []
+    with pytest.raises(KeyboardInterrupt):  # anew: the third one interrupts
+        run_campaign(runs, workers=1, out=tmp_path, resume=False)
+
+
+def test_a_changed_scenario_runs_again(base, tmp_path):
+    runs = random_faults(1, base=base)
+    run_campaign(runs, workers=1, out=tmp_path)
+    longer = runs[0].change(duration=0.42)
+    ds = run_campaign([longer], workers=1, out=tmp_path)
+    assert float(ds["end"][0, -1]) == 0.42
+    assert len((tmp_path / RUNS).read_text().splitlines()) == 2
+
+
+def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path):
+    (run,) = random_faults(1, base=base.change(waveform_dt=1e-3))
+    run_campaign([run], workers=1, out=tmp_path, summary_only=False)
+    ds = results.load(tmp_path / "runs" / f"{run.name}.nc")
+    assert abs(ds.sizes["time_w"] - 401) <= 1
+    with pytest.raises(ScenarioError, match="need a folder"):
+        run_campaign([run], summary_only=False)
+
+
+def test_processes_give_the_same_and_one_that_dies_is_told(base, monkeypatch):
+    """Three workers' worth of tasks over two processes; one kills its process."""
+    before = (dict(os.environ), sys.modules["__main__"].__dict__.get("__file__"))
+    runs = random_faults(2, base=base)
+    ds = run_campaign(runs, workers=2)
+    assert same(ds, run_campaign(runs, workers=1))
+    assert (dict(os.environ), sys.modules["__main__"].__dict__.get("__file__")) == before
+
+
+def test_a_dead_process_costs_one_run(base, monkeypatch):
+    """The pool is replaced by one whose process dies for one scenario."""
+    from concurrent.futures import Future
+    from concurrent.futures.process import BrokenProcessPool
+
+    runs = random_faults(4, base=base)
+
+    class Pool:
+        def __init__(self, *_, **__):
+            self.dead = False
+
+        def submit(self, call, task):
+            if self.dead:
+                raise BrokenProcessPool
+            f = Future()
+            if task.table["name"] == runs[1].name:
+                self.dead = True
+                f.set_exception(BrokenProcessPool())
+            else:
+                f.set_result(call(task))
+            return f
+
+        def shutdown(self, **_):
+            pass
+
+    monkeypatch.setattr(campaigns, "ProcessPoolExecutor", Pool)
+    ds = run_campaign(runs, workers=2)
+    assert counts(ds)["done"] == 3 and counts(ds)["crashed"] == 1
+    assert str(ds["reason"].values[1]).startswith("the process ended")
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [({"workers": 0}, "workers"), ({"solver": "cvode"}, "did you mean 'cvodes'")],
+)
+def test_wrong_options_are_refused(base, how, message):
+    with pytest.raises(ScenarioError, match=message):
+        run_campaign(random_faults(1, base=base), **how)
+    with pytest.raises(ScenarioError, match="two scenarios of one name"):
+        run_campaign([base, base])
+    with pytest.raises(ScenarioError, match="at least one"):
+        run_campaign([])
+
+
+def test_the_command(base, tmp_path, monkeypatch, capsys):
+    table = tmp_path / "short.py"
+    table.write_text(f"scenario = {BASE!r}\n")
+    argv = ["campaign", "--runs", "2", "--workers", "1", "--base", str(table), "--out"]
+    assert main([*argv, str(tmp_path / "out"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["counts"]["done"] == 2 and report["reasons"] == {}
+    assert main([*argv, str(tmp_path / "out")]) == 0
+    assert "2 runs in" in capsys.readouterr().out
+    assert (tmp_path / "out" / campaigns.DATASET).exists()
