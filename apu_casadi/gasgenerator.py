@@ -76,7 +76,7 @@ class MapChoice:
 # rows W2, T3, P3, T5 and HPCSM of Table 5 and HPCSM of Table 4; all other rows of Table 5 are left
 # for checking.  The Reynolds exponent 0.18 lies in the range 0.1-0.2 known for small compressors.
 COMPRESSOR_CALIBRATION = MapCalibration(
-    a_W=0.03985831, n_Re=0.17623167, k_SM=1.02900428, a_SM=1.07463458
+    a_W=0.03985831, n_Re=0.17623167, k_SM=1.02900428, a_SM=0.11723597
 )
 TURBINE_CALIBRATION = MapCalibration(a_W=0.07937522, c_PR=0.31182386)
 

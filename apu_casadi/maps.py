@@ -36,6 +36,7 @@ from apu_casadi.parameters import Parameters, par
 
 REACH = 2.0  # table spans from the table's edge to where everything is held
 LOWEST = 0.05  # held below this fraction of the table's lowest speed
+TILT_WIDTH = 0.1  # of relative speed, over which the tilt of the surge line saturates
 _MARGIN = 1e-9  # of the whole range: bspline is 0 at and beyond its last knot, stay inside
 
 
@@ -222,9 +223,9 @@ class MapCalibration(Parameters):
         0.0,
         unit="1",
         source="identity",
-        doc="PR_surge - 1 is multiplied by n**a_SM",
-        lo=-20.0,
-        hi=20.0,
+        doc="PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)",
+        lo=-0.9,
+        hi=0.9,
     )
 
 
@@ -326,7 +327,10 @@ class ScaledMap:
         if t.kind == "compressor":
             W_map = W / self.W_des * ca.exp(des[0])
             surge = (surge_function(t)(W_map) - 1) * (self.PR_des - 1) / ca.exp(des[1])
-            PR_surge = 1 + surge * cal.k_SM * held**cal.a_SM
+            # a tilt about n = 1 that saturates: a power law fitted above the design speed would
+            # move the whole surge line at part speed, about which it knows nothing
+            tilt = 1 + cal.a_SM * ca.tanh((held - 1) / TILT_WIDTH)
+            PR_surge = 1 + surge * cal.k_SM * tilt
             out["SM"] = PR_surge / PR - 1
         return out
 

@@ -94,7 +94,7 @@ def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> l
     short = next((i for i, p in enumerate(s.phases) if isinstance(p.fault, FaultSpec)), None)
     if sick is None or short is None:
         what = "a phase with health factors" if sick is None else "a phase with a fault"
-        raise ScenarioError(f"scenario {s.name!r} has no {what} to draw at random")
+        raise ScenarioError(f"scenario {s.name!r} lacks {what} to draw at random")
     return [_drawn(s, sick, short, seed, i) for i in range(n)]
 
 
@@ -366,7 +366,9 @@ def _plain_children() -> Iterator[None]:
     before = {k: os.environ.get(k) for k in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     main = sys.modules["__main__"]
-    held = {k: vars(main).pop(k) for k in ("__file__", "__spec__") if k in vars(main)}
+    held: dict[str, Any] = {
+        k: vars(main).pop(k) for k in ("__file__", "__spec__") if k in vars(main)
+    }
     main.__spec__ = None
     try:
         yield

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     n = campaigns.counts(ds)
     reasons = {
         str(name): str(why)
-        for name, why, s in zip(ds["run"].values, ds["reason"].values, ds["status"].values)
+        for name, why, s in zip(*(ds[k].values for k in ("run", "reason", "status")), strict=True)
         if s
     }
     path = Path(args.out) / campaigns.DATASET
