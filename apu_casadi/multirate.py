@@ -93,6 +93,7 @@ SOLVERS = ("cvodes", "idas", "propagator")
 #: Samples in an exchange step of exact propagation when no waveforms are kept, by "is healthy".
 #: Enough for means and rms values to 1e-5 at 20 ms; the samples themselves are exact anyway.
 SUMMARY_SAMPLES = {True: 160, False: 200}
+FINE_SAMPLE = 50e-6  # s; what stored waveforms are computed with, at most
 _HEALTHY = (0.0, math.nan, math.nan)
 _LOG = logging.getLogger("apu_casadi")
 _GRID_TOL = 1e-9  # s; instants closer than this are one
@@ -479,8 +480,10 @@ class _Machine:
     def _propagator(self, fine: bool = False) -> Propagator | None:
         """Return the propagator of this load and fault, or None where there is none."""
         if fine not in self._fast:
-            # coarse waveforms are every k-th of samples fine enough for the means
+            # coarse waveforms are every k-th of samples fine enough for 1e-5 of peak
             least = SUMMARY_SAMPLES[self.fault is None]
+            if self.waveform_dt is not None:
+                least = max(least, round(self.dt / FINE_SAMPLE))
             every = 1 if self.waveform_dt is None else -(-least // self.n_out(self.dt))
             n = least if self.waveform_dt is None else every * self.n_out(self.dt)
             outputs = () if self.waveform_dt is None else WAVEFORMS

@@ -42,7 +42,7 @@ from apu_casadi.statespace import StateSpace
 SETTLING = 1e-3  # s, in which the windings follow a step of speed
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
 MAGNUS_TOL = 1e-8  # largest change of P, relative, when the steps it is made of are halved
-HARMONICS = 24  # highest harmonic resolved; a series that has not converged by then is refused
+HARMONICS = (24, 48)  # harmonics resolved, in turn; a series that still goes on is refused
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; a
 #: quarter acts on average.  Where coefficients are constant a larger one tells of a limit met.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 1e-5, "fine": 2e-5}
@@ -117,21 +117,31 @@ def _expm(M: np.ndarray) -> np.ndarray:
     return E
 
 
-def _transition(M_of: Any, theta0: np.ndarray, w: np.ndarray, h: float, steps: int) -> np.ndarray:
-    """Transition matrices over h from angles theta0 at speeds w, by Magnus steps of order 4.
+def _transition(
+    M_of: Any, theta0: np.ndarray, w: np.ndarray, h: float, steps: int, leaps: int = 1
+) -> list[np.ndarray]:
+    """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Magnus steps.
 
-    (Blanes, Casas, Oteo, Ros, Physics Reports 470, 2009: two Gauss points and one commutator.)
+    Order 4, ``steps`` of them in h (Blanes, Casas, Oteo, Ros, Physics Reports 470, 2009: two Gauss
+    points and one commutator).
     """
     hs = h / steps
-    P = None
-    for k in range(steps):
+    P, out = None, []
+    for k in range(leaps * steps):
         M1 = M_of(theta0 + w * hs * (k + 0.5 - _GAUSS), w)
         M2 = M_of(theta0 + w * hs * (k + 0.5 + _GAUSS), w)
         Omega = hs / 2 * (M1 + M2) + math.sqrt(3.0) / 12 * hs * hs * (M2 @ M1 - M1 @ M2)
         E = _expm(Omega)
         P = E if P is None else E @ P
-    assert P is not None
-    return P
+        if (k + 1) % steps == 0:
+            out.append(P)
+    return out
+
+
+@lru_cache(maxsize=128)
+def _coefficients_at(ss: StateSpace, count: int) -> Caller:
+    """:func:`_coefficients` at ``count`` angles at once."""
+    return Caller(compiled(_coefficients(ss).map(count), build=False))
 
 
 @dataclass(frozen=True)
@@ -178,7 +188,7 @@ def transition_table(
     SimulationError : the Fourier series or the Magnus steps do not converge (a load so light
         that the windings settle within a small part of h while the coefficients turn).
     """
-    M_fun, n = _coefficients(ss), len(linear_states(ss))
+    n = len(linear_states(ss))
     iw = ss.u.index("w_r")
     centre, half = w_rated, SPEED_RANGE * w_rated
     k = np.arange(_NODES)
@@ -189,24 +199,20 @@ def transition_table(
         U = np.repeat(u[:, None], angle.size, axis=1)
         U[iw] = w
         TH = np.repeat(theta.reshape(-1, 1), angle.size, axis=1)
-        out = M_fun.map(angle.size)(angle[None, :], U, TH).full()
-        m = n + 4
-        return np.asarray(out.reshape(m, angle.size, m).transpose(1, 0, 2))
+        out = _coefficients_at(ss, angle.size)(angle.reshape(1, -1), U, TH)[0]
+        return np.asarray(out.reshape(n + 4, angle.size, n + 4).transpose(1, 0, 2))
 
     probe = np.array([0.1, 0.9, 2.3])
     Mp = M_of(probe, np.full(3, centre))
     constant = np.abs(Mp - Mp[0]).max() <= 1e-12 * np.abs(Mp[0]).max()
-    angles = np.zeros(1) if constant else 2 * np.pi * np.arange(2 * HARMONICS) / (2 * HARMONICS)
-    w = np.repeat(nodes, angles.size)
-    a = np.tile(angles, _NODES)
     m = strides(n_out, h, bool(constant), fine).m
     # the number of Magnus steps is doubled until a few angles agree, then used for all
     steps, error = 1, 0.0
     if not constant:
         pw = np.full(3, nodes[0])
-        last = _transition(M_of, probe, pw, h, steps)
+        last = _transition(M_of, probe, pw, h, steps)[0]
         while True:
-            new = _transition(M_of, probe, pw, h, 2 * steps)
+            new = _transition(M_of, probe, pw, h, 2 * steps)[0]
             error = float(np.abs(new - last).max() / np.abs(new[:, :n, :n]).max()) / 15
             steps *= 2
             if error <= MAGNUS_TOL:
@@ -217,21 +223,30 @@ def transition_table(
                     f"(error {error:.1e} with {steps} steps)"
                 )
             last = new
-    leaps = [_transition(M_of, a, w, (j + 1) * h, (j + 1) * steps)[:, :n, :] for j in range(m)]
-    # column-major entries, one leap after the other
-    P = np.concatenate([L.transpose(0, 2, 1).reshape(a.size, -1) for L in leaps], axis=1)
-    P = P.reshape(_NODES, angles.size, -1)
+
+    def sampled(angles: np.ndarray) -> np.ndarray:
+        """Entries for every node and angle: column-major, one leap after the other."""
+        a, w = np.tile(angles, _NODES), np.repeat(nodes, angles.size)
+        leaps = _transition(M_of, a, w, h, steps, m)
+        entries = [L[:, :n, :].transpose(0, 2, 1).reshape(a.size, -1) for L in leaps]
+        P = np.concatenate(entries, axis=1)
+        return P.reshape(_NODES, angles.size, -1)
+
     if constant:
-        return Table(centre, half, to_powers @ P[:, 0, :], 0, error)
-    F = np.fft.rfft(P, axis=1) / angles.size
-    size = np.abs(F).max(axis=(0, 2))
-    kept = np.nonzero(size > TAIL * size[0])[0]
-    H = int(kept[-1])
-    if H >= HARMONICS - 1:
+        return Table(centre, half, to_powers @ sampled(np.zeros(1))[:, 0, :], 0, error)
+    for resolved in HARMONICS:
+        P = sampled(np.pi * np.arange(2 * resolved) / resolved)
+        F = np.fft.rfft(P, axis=1) / (2 * resolved)
+        size = np.abs(F).max(axis=(0, 2))
+        highest = int(np.nonzero(size > TAIL * size[0])[0][-1])
+        if highest < resolved - 1:
+            break
+    else:
         raise SimulationError(
-            f"{ss.name}: the transition matrix over {h:.3g} s has {H} harmonics of the rotor angle "
-            f"above {TAIL:g}: the load is too light for this step"
+            f"{ss.name}: the transition matrix over {h:.3g} s has over {highest} harmonics of the "
+            f"rotor angle above {TAIL:g}: the load is too light for this step"
         )
+    H = highest
     series = np.empty((_NODES, P.shape[2], 1 + 2 * H))
     series[:, :, 0] = F[:, 0].real
     series[:, :, 1::2] = 2 * F[:, 1 : H + 1].real.transpose(0, 2, 1)

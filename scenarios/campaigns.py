@@ -26,7 +26,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +38,6 @@ from scenarios.schema import FaultSpec, Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.apu import Apu
 
 RUNS = "runs.jsonl"
 DATASET = "campaign.nc"
@@ -139,36 +137,6 @@ class _Task:
     keep: str | None  # folder for the run's own netCDF file
 
 
-@lru_cache(maxsize=8)
-def _unit(parameters: tuple[tuple[str, Any], ...]) -> Apu:
-    """One unit for all runs with the same parameters: building its functions takes a while."""
-    from apu_casadi.apu import Apu
-
-    apu = Apu()
-    return apu.change(dict(parameters)) if parameters else apu
-
-
-def simulate(s: Scenario, *, solver: str = "propagator") -> xr.Dataset:
-    """Run a scenario as :func:`scenarios.registry.run`, with a unit kept between the calls."""
-    from apu_casadi.multirate import simulate_joint
-
-    ds = simulate_joint(
-        _unit(tuple(sorted(s.parameters.items()))),
-        duration=s.duration,
-        **s.start(),
-        ambient=s.ambient,
-        events=s.events(),
-        dt=s.dt,
-        waveform_dt=s.waveform_dt,
-        noise=None if s.noise is None else s.noise.build(),
-        seed=s.seed,
-        solver=solver,
-    )
-    ds.attrs["scenario"] = s.to_json()
-    ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
-    return ds
-
-
 def _run_one(task: _Task) -> dict[str, Any]:
     """Run one scenario; return its record, whatever happens."""
     from apu_casadi.errors import OperatingPointError
@@ -178,7 +146,7 @@ def _run_one(task: _Task) -> dict[str, Any]:
     record: dict[str, Any] = {"key": task.key, "name": task.table["name"], "reason": ""}
     try:
         s = Scenario.from_dict(task.table)
-        ds = simulate(s, solver=task.solver)
+        ds = registry.run(s, solver=task.solver)
         record["phases"] = phase_summary(ds)
         solver = json.loads(ds.attrs["solver"])
         record["residual"] = float(solver["residual_max"])

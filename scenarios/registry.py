@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,8 @@ from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from apu_casadi.apu import Apu
 
 Progress = Callable[[float, float], None]
 """Called with the simulated and the total time [s]."""
@@ -106,13 +108,18 @@ def run(
     return ds
 
 
-def _simulate(s: Scenario, progress: Progress | None, solver: str) -> xr.Dataset:
+@lru_cache(maxsize=4)
+def _unit(parameters: str) -> Apu:
+    """Return the unit with some parameters changed (JSON); kept, since building takes longer."""
     from apu_casadi.apu import Apu
+
+    return Apu().change(json.loads(parameters))
+
+
+def _simulate(s: Scenario, progress: Progress | None, solver: str) -> xr.Dataset:
     from apu_casadi.multirate import simulate_joint
 
-    apu = Apu()
-    if s.parameters:
-        apu = apu.change(s.parameters)
+    apu = _unit(json.dumps(dict(s.parameters), sort_keys=True))
     return simulate_joint(
         apu,
         duration=s.duration,

@@ -274,6 +274,8 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     multirate.simulate_joint = simulate_joint
     monkeypatch.setitem(sys.modules, "apu_casadi.apu", apu)
     monkeypatch.setitem(sys.modules, "apu_casadi.multirate", multirate)
+    # units are kept between runs: this stand-in must not stay
+    monkeypatch.setattr(registry, "_unit", registry._unit.__wrapped__)
     ds = registry.run(
         "joint",
         waveform_dt=None,
