@@ -86,18 +86,18 @@ def test_a_refused_run_is_recorded_with_its_reason(base):
 
 def test_an_unforeseen_error_is_recorded_and_tried_again(base, tmp_path, monkeypatch):
     runs = random_faults(2, base=base)
-    right = campaigns.simulate
+    right = registry.run
 
     def wrong(s, **how):
         if s.name == runs[0].name:
             raise ZeroDivisionError("never mind")
         return right(s, **how)
 
-    monkeypatch.setattr(campaigns, "simulate", wrong)
+    monkeypatch.setattr(registry, "run", wrong)
     ds = run_campaign(runs, workers=1, out=tmp_path)
     assert counts(ds)["crashed"] == 1
     assert str(ds["reason"].values[0]) == "ZeroDivisionError: never mind"
-    monkeypatch.setattr(campaigns, "simulate", right)
+    monkeypatch.setattr(registry, "run", right)
     assert counts(run_campaign(runs, workers=1, out=tmp_path))["done"] == 2
 
 
