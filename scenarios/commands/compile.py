@@ -16,6 +16,7 @@ HELP = "compile the hot functions to C libraries ahead of time"
 HOT: tuple[tuple[str, str], ...] = (
     ("gas_generator", "scenarios.commands.compile:gas_generator_functions"),
     ("trim", "apu_casadi.trimming:hot_functions"),
+    ("joint", "scenarios.commands.compile:joint_functions"),
 )
 """(name, "module:callable"); the callable compiles its functions and returns their names."""
 
@@ -74,3 +75,24 @@ def gas_generator_functions() -> list[str]:
 
     gg = GasGenerator()
     return [str(compiled(f).name()) for f in (gg.f, gg.g, gg.step)]
+
+
+def joint_functions() -> list[str]:
+    """Compile what joint runs by exact propagation use, with a healthy and a faulted machine."""
+    from apu_casadi import jointstep, propagation
+    from apu_casadi.apu import Apu
+    from apu_casadi.events import FaultChange
+    from apu_casadi.machine.load import SeriesLoad
+    from apu_casadi.machine.ttsc import Ttsc
+    from apu_casadi.multirate import simulate_joint
+
+    apu, load = Apu(), SeriesLoad.from_power(100e3)
+    for waveform_dt in (50e-6, None):
+        for fault in (Ttsc(0.05, 20.0), Ttsc(0.05, 1.0, 1.0)):
+            events = [FaultChange(0.3, fault)]
+            simulate_joint(
+                apu, duration=0.4, load=load, events=events, solver="propagator",
+                waveform_dt=waveform_dt,
+            )  # fmt: skip
+    callers = [c for _, c in propagation._CALLERS.values()] + list(jointstep._CALLERS.values())
+    return [c.fun.name() for c in callers]
