@@ -395,7 +395,8 @@ def joint(size: Size) -> list[Row]:
         ("50 us waveforms", 100.0, {}),
         ("summary outputs only", 300.0, {"waveform_dt": None}),
     ):
-        _simulate(s, solver="propagator", **how)
+        for _ in range(2):  # the first compiles and loads, the second still faults memory in
+            _simulate(s, solver="propagator", **how)
         wall, ds = timed(partial(_simulate, s, solver="propagator", **how), size.repeats)
         e = errors(_arrays(ds), kept, instants)
         what = f"joint {s.duration:g} s scenario, {label}"
