@@ -10,7 +10,6 @@ the steps of the ordinary loop costs as much there as the models themselves.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -46,10 +45,8 @@ class BlockResult(NamedTuple):
     waves: np.ndarray
 
 
-@lru_cache(maxsize=32)
-def _function(apu: Apu, key: tuple[object, ...]) -> ca.Function:
-    """Build the block for one propagator layout: (carry, constants) -> (carry, y, ..., checks)."""
-    propagator: Propagator = key[0]  # type: ignore[assignment]
+def _function(apu: Apu, propagator: Propagator) -> ca.Function:
+    """Build the block for one propagator layout: carry -> (last, y, means, waves, checks)."""
     advance, table = propagator.function, propagator.table
     gg, ss, gov = apu.gas_generator, propagator.ss, apu.governor
     n_x, n_z, n_u, n_sg = len(gg.X), len(gg.z), len(gg.U), len(ss.x)
@@ -92,8 +89,7 @@ class JointBlock:
     def __init__(self, apu: Apu, propagator: Propagator) -> None:
         """Build or fetch the compiled block; ``propagator.constant`` must hold."""
         self.apu, self.propagator = apu, propagator
-        layout = (propagator.layout, propagator.n_out, propagator.outputs, propagator.quad)
-        self._call = _caller(apu, layout, propagator)
+        self._call = _caller(apu, propagator)
 
     def __call__(
         self,
@@ -140,8 +136,9 @@ class JointBlock:
 _CALLERS: dict[tuple[object, ...], Caller] = {}
 
 
-def _caller(apu: Apu, layout: tuple[object, ...], propagator: Propagator) -> Caller:
-    key = (apu, *layout)
+def _caller(apu: Apu, propagator: Propagator) -> Caller:
+    """One compiled block for each unit and layout."""
+    key = (apu, *propagator.layout)
     if key not in _CALLERS:
-        _CALLERS[key] = Caller(compiled(_function(apu, (propagator,))))
+        _CALLERS[key] = Caller(compiled(_function(apu, propagator)))
     return _CALLERS[key]

@@ -489,7 +489,7 @@ class Propagator:
         plan = strides(n_out, self.h, constant, fine)
         self.function = _advance(gen, ss, n_out, plan, self.outputs, self.quad, constant)
         self.tol = DRIVE_TOL["fine" if fine else "constant" if constant else "periodic"]
-        self.layout = (gen, id(ss))
+        self.layout = (gen, ss, plan, self.outputs, self.quad)  # what ``function`` depends on
         self._compiled: Caller | None = None
         self._t = dt * (np.arange(1, n_out + 1) / n_out)  # rounded as a Stepper does
         self._angle = ss.x.index("theta_e")
