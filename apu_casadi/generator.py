@@ -705,22 +705,13 @@ def _build(gen: Generator, load_kind: str, faulted: str | None) -> StateSpace:
     f_v, g_v = ca.substitute([ode_v, y_v], [zv], [z_expr])
     name = "_".join(["generator", load_kind, faulted or "healthy"])
     name += "" if grounded else "_isolated"
-    args, names = [xv, uv, tv], ["x", "u", "theta"]
-    return StateSpace(
-        name=name,
-        x=X,
-        z=Z,
-        u=U,
-        theta=TH,
-        y=_OUTPUTS,
-        residual=ca.Function(
-            f"{name}_residual",
-            [xv, zv, uv, tv],
-            [ode_v, alg_v],
-            ["x", "z", "u", "theta"],
-            ["ode", "alg"],
-        ),
-        f=ca.Function(f"{name}_f", args, [f_v], names, ["xdot"], {"cse": True}),
-        g=ca.Function(f"{name}_g", args, [g_v], names, ["y"], {"cse": True}),
-        z_of=ca.Function(f"{name}_z", args, [z_expr], names, ["z"], {"cse": True}),
+    return StateSpace.of(
+        name,
+        (X, Z, U, TH, _OUTPUTS),
+        (xv, zv, uv, tv),
+        dae=(ode_v, alg_v),
+        f=f_v,
+        g=g_v,
+        z=z_expr,
+        cse=True,
     )

@@ -251,24 +251,10 @@ def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
     sizes = (("x", X), ("z", Z), ("u", U), ("theta", TH))
     x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in sizes)
     ode, alg, _ = equations(x, z, u, theta)
-    f, _, y = equations(x, z_of(x, u, theta), u, theta)
-    name = f"joint_averaged_{load_kind}"
-    args, names = [x, u, theta], ["x", "u", "theta"]
-    return StateSpace(
-        name=name,
-        x=X,
-        z=Z,
-        u=U,
-        theta=TH,
-        y=Y,
-        residual=ca.Function(
-            f"{name}_residual", [x, z, u, theta], [ode, alg], ["x", "z", "u", "theta"],
-            ["ode", "alg"],
-        ),
-        f=ca.Function(f"{name}_f", args, [f], names, ["xdot"]),
-        g=ca.Function(f"{name}_g", args, [y], names, ["y"]),
-        z_of=z_of,
-    )  # fmt: skip
+    z_sol = z_of(x, u, theta)
+    f, _, y = equations(x, z_sol, u, theta)
+    name, signals = f"joint_averaged_{load_kind}", (X, Z, U, TH, Y)
+    return StateSpace.of(name, signals, (x, z, u, theta), dae=(ode, alg), f=f, g=y, z=z_sol)
 
 
 def joint_vectors(

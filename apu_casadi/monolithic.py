@@ -104,23 +104,8 @@ def joint_state_space(
     z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
     ode, alg, _ = model(z)
     f, _, y = model(z_sol)
-    name = f"joint_{gen.name}"
-    args, names = [x, u, theta], ["x", "u", "theta"]
-    return StateSpace(
-        name=name,
-        x=X,
-        z=gg.z,
-        u=U,
-        theta=TH,
-        y=Y,
-        residual=ca.Function(
-            f"{name}_residual", [x, z, u, theta], [ode, alg], ["x", "z", "u", "theta"],
-            ["ode", "alg"],
-        ),
-        f=ca.Function(f"{name}_f", args, [f], names, ["xdot"]),
-        g=ca.Function(f"{name}_g", args, [y], names, ["y"]),
-        z_of=ca.Function(f"{name}_z", args, [z_sol], names, ["z"]),
-    )  # fmt: skip
+    signals, symbols = (X, gg.z, U, TH, Y), (x, z, u, theta)
+    return StateSpace.of(f"joint_{gen.name}", signals, symbols, dae=(ode, alg), f=f, g=y, z=z_sol)
 
 
 def _integral(gen: StateSpace, name: str) -> Signal:

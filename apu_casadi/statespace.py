@@ -8,6 +8,7 @@ Solvers and estimators see only this; they know nothing of turbines or windings.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 
@@ -62,3 +63,39 @@ class StateSpace:
                     f"{self.name}.{label}: expected sizes {n_in} -> {n_out}, "
                     f"got {got_in} -> {got_out}"
                 )
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        signals: tuple[Signals, Signals, Signals, Signals, Signals],
+        symbols: tuple[Any, Any, Any, Any],
+        *,
+        dae: tuple[Any, Any],
+        f: Any,
+        g: Any,
+        z: Any,
+        cse: bool = False,
+    ) -> StateSpace:
+        """Make the functions from one set of expressions.
+
+        Parameters
+        ----------
+        name : of the model; its functions are named after it.
+        signals, symbols : (x, z, u, theta, y), and the symbols (x, z, u, theta).
+        dae : (ode, alg) in the symbols.
+        f, g, z : rate, outputs and algebraic unknowns, with z eliminated.
+        cse : share common subexpressions (SX).
+        """
+        x, _, u, theta = symbols
+        args, names, options = [x, u, theta], ["x", "u", "theta"], {"cse": True} if cse else {}
+        return cls(
+            name,
+            *signals,
+            residual=ca.Function(
+                f"{name}_residual", [*symbols], [*dae], ["x", "z", "u", "theta"], ["ode", "alg"]
+            ),
+            f=ca.Function(f"{name}_f", args, [f], names, ["xdot"], options),
+            g=ca.Function(f"{name}_g", args, [g], names, ["y"], options),
+            z_of=ca.Function(f"{name}_z", args, [z], names, ["z"], options),
+        )
