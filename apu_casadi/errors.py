@@ -42,6 +42,10 @@ class BackendError(ApuError, RuntimeError):
     """Compiled code was demanded and cannot be had, or a compiled function was called wrongly."""
 
 
+class EstimationError(ApuError, RuntimeError):
+    """A filter or a fit lost its belief, did not converge, or cannot be told from its data."""
+
+
 class DataError(ApuError, ValueError):
     """A file is missing, damaged, or lacks a column."""
 

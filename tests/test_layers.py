@@ -53,7 +53,8 @@ ONLY = {
 # Upward imports that are known, with the reason; an entry that is no longer needed fails.
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 # apu_casadi/__init__.py is the front door: it names modules, and no module comes in through it.
-ESTIMATORS = {"statespace", "signals", "results", "errors"}
+# Estimators know f, g and names; of the solvers only how to make a step of f, and how to compile it.
+ESTIMATORS = {"statespace", "signals", "results", "errors", "backend", "discretisation"}
 
 RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}
 

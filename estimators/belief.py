@@ -1,0 +1,114 @@
+"""What is believed of a state: mean and covariance, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.errors import SignalError, nearest
+from apu_casadi.signals import Signals
+
+__all__ = ["Belief"]
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A Gaussian belief of named states.
+
+    Parameters
+    ----------
+    x : the states.
+    mean : shape (nx,).
+    cov : covariance, shape (nx, nx), symmetric, positive semidefinite.
+
+    Raises
+    ------
+    SignalError : wrong shapes, values not finite, or not a covariance; names the state.
+    """
+
+    x: Signals
+    mean: np.ndarray
+    cov: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check shapes, finiteness, symmetry and that no direction has negative variance."""
+        n = len(self.x)
+        if np.shape(self.mean) != (n,) or np.shape(self.cov) != (n, n):
+            raise SignalError(
+                f"belief of {n} states: mean ({n},) and cov ({n}, {n}) expected, got "
+                f"{np.shape(self.mean)} and {np.shape(self.cov)}"
+            )
+        bad = [s for s, m, v in zip(self.x.names, self.mean, np.diag(self.cov), strict=True)
+               if not (np.isfinite(m) and np.isfinite(v) and v >= 0)]  # fmt: skip
+        if bad or not np.isfinite(self.cov).all():
+            raise SignalError(f"belief: mean not finite or variance negative of {', '.join(bad)}")
+        # judged in correlations, so that units do not matter
+        sigma = np.sqrt(np.diag(self.cov))
+        scale = np.where(sigma > 0, sigma, 1.0)
+        corr = self.cov / np.outer(scale, scale)
+        if not np.allclose(corr, corr.T, atol=1e-9):
+            raise SignalError("belief: the covariance is not symmetric")
+        low = float(np.linalg.eigvalsh((corr + corr.T) / 2).min()) if n else 0.0
+        if low < -1e-9:
+            raise SignalError(
+                f"belief: no covariance, its correlations have the eigenvalue {low:.1e} < 0"
+            )
+
+    @classmethod
+    def of(
+        cls, x: Signals, mean: Mapping[str, float], sigma: Mapping[str, float]
+    ) -> Belief:
+        """Make an uncorrelated belief from means and standard deviations by name.
+
+        Raises
+        ------
+        SignalError : unknown or missing names.
+        """
+        s = Signals(
+            [type(q)(q.name, q.unit, q.doc, None, q.nominal) for q in x]
+        )  # a standard deviation has no default
+        return cls(x, x.pack(mean), np.diag(s.pack(sigma) ** 2))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviations, shape (nx,)."""
+        return np.sqrt(np.diag(self.cov))
+
+    def __getitem__(self, name: str) -> tuple[float, float]:
+        """Return (mean, standard deviation) of one state."""
+        i = self.x.index(name)
+        return float(self.mean[i]), float(np.sqrt(self.cov[i, i]))
+
+    def change(
+        self, mean: Mapping[str, float] | None = None, sigma: Mapping[str, float] | None = None
+    ) -> Belief:
+        """Return the belief with some means, and some (then uncorrelated) standard deviations.
+
+        Raises
+        ------
+        SignalError : unknown name.
+        """
+        m, P = self.mean.copy(), self.cov.copy()
+        for name, value in (mean or {}).items():
+            m[self.x.index(name)] = value
+        for name, value in (sigma or {}).items():
+            i = self.x.index(name)
+            P[i, :] = P[:, i] = 0.0
+            P[i, i] = value**2
+        return Belief(self.x, m, P)
+
+    def marginal(self, names: Any) -> Belief:
+        """Return the belief of some states.
+
+        Raises
+        ------
+        SignalError : unknown name, with the nearest one.
+        """
+        unknown = [f"{n} {nearest(n, self.x.names)}" for n in names if n not in self.x]
+        if unknown:
+            raise SignalError(f"belief: unknown {'; '.join(unknown)}")
+        i = self.x.indices(names)
+        return Belief(Signals([self.x[k] for k in i]), self.mean[i], self.cov[np.ix_(i, i)])

@@ -1,0 +1,207 @@
+"""The extended Kalman filter, plain and iterated, with exact Jacobians.
+
+Schmidt (1966) and Jazwinski (1970), Stochastic Processes and Filtering Theory, chapter 8; the
+update in Joseph's form, which is right for any gain and so also for considered parameters
+(Schmidt-Kalman).  The iterated update is Gauss-Newton on the *prior* and the sample (Bell and
+Cathey 1993): the prior is never replaced by the posterior, which would count the sample twice.
+
+State and noise w are corrected together, since w acts on the output and on the transition that
+follows; with w absent from the output this is the usual filter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.errors import ParameterError
+
+from estimators.algebra import backward, cholesky, forward, symmetric
+from estimators.belief import Belief
+from estimators.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
+from estimators.model import FilterModel
+from estimators.recording import Recording
+
+__all__ = ["Corrected", "correct", "ekf_step", "extended_kalman_filter", "projected"]
+
+
+class Corrected(NamedTuple):
+    """A Gaussian after a linear update.
+
+    Parameters
+    ----------
+    d : change of the mean, (n,).
+    P : covariance, (n, n).
+    S : covariance of the innovation; 1 on the diagonal where nothing was measured.
+    nis, loglik : normalised innovation squared, log-likelihood.
+    measured : number of outputs measured.
+    """
+
+    d: Any
+    P: Any
+    S: Any
+    nis: Any
+    loglik: Any
+    measured: Any
+
+
+@lru_cache(maxsize=64)
+def _kernel(n: int, ny: int, fixed: tuple[int, ...]) -> ca.Function:
+    """The update as an SX Function (P, H, nu, R) -> Corrected; ``fixed`` rows have no gain."""
+    P, H, nu, R = ca.SX.sym("P", n, n), ca.SX.sym("H", ny, n), ca.SX.sym("nu", ny), ca.SX.sym(
+        "R", ny
+    )
+    return ca.Function("correct", [P, H, nu, R], list(_corrected(P, H, nu, R, fixed)))
+
+
+def _corrected(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) -> Corrected:
+    n, ny = P.shape[0], H.shape[0]
+    there = R >= 0
+    H = ca.diag(there) @ H
+    nu = there * nu
+    R = ca.if_else(there, R, 0)
+    PH = P @ H.T
+    S = symmetric(H @ PH + ca.diag(ca.if_else(there, R, 1)))
+    L = cholesky(S)
+    a = forward(L, nu)
+    K = backward(L, forward(L, PH.T)).T
+    if fixed:
+        keep = ca.SX.ones(n)
+        keep[list(fixed)] = 0
+        K = ca.diag(keep) @ K
+    A = ca.SX.eye(n) - K @ H
+    P1 = symmetric(A @ P @ A.T + K @ ca.diag(R) @ K.T)
+    nis = ca.dot(a, a)
+    measured = ca.sum1(there)
+    logdet = 2 * sum((ca.log(L[i, i]) for i in range(ny)), ca.SX(0))
+    loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
+    return Corrected(K @ nu, P1, S, nis, loglik, measured)
+
+
+def correct(P: Any, H: Any, nu: Any, R: Any, fixed: tuple[int, ...] = ()) -> Corrected:
+    """Update a covariance P (n, n) with a sample, Joseph's form.
+
+    Parameters
+    ----------
+    P : covariance before.
+    H : output Jacobian, (ny, n).
+    nu : innovation, (ny,).
+    R : variances of the sample, (ny,); negative where nothing was measured.
+    fixed : rows of considered states, whose mean and variance stay.
+    """
+    if isinstance(P, ca.SX):
+        return _corrected(P, H, nu, R, fixed)
+    return Corrected(*_kernel(P.shape[0], H.shape[0], fixed)(P, H, nu, R))
+
+
+def projected(m: Any, P: Any, lower: np.ndarray, upper: np.ndarray) -> Any:
+    """Return the mean moved into its bounds, one after the other, along the covariance.
+
+    The nearest point of each bound in the metric of P; the covariance is left as it is, which is
+    on the safe side.
+    """
+    for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)):
+        inside = ca.fmin(ca.fmax(m[int(i)], lower[i]), upper[i])
+        move = inside - m[int(i)]
+        v = P[int(i), int(i)]
+        m = m + P[:, int(i)] * ca.if_else(v > 0, move / v, 0)
+    return m
+
+
+def kind_of(model: FilterModel) -> Any:
+    """SX if both functions are in scalar operations, else MX."""
+    scalar = all(f.is_a("SXFunction") for f in (model.transition, model.output))
+    return ca.SX if scalar else ca.MX
+
+
+def step_symbols(model: FilterModel, kind: Any) -> list[Any]:
+    """Fresh symbols for ``STEP_IN``."""
+    nx, nu, np_, _, ny = model.sizes
+    shapes = [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)]
+    return [kind.sym(n, *s) for n, s in zip(STEP_IN, shapes, strict=True)]
+
+
+@lru_cache(maxsize=64)
+def ekf_step(model: FilterModel, iterations: int = 1) -> FilterStep:
+    """Build the filter's step for a model.
+
+    Parameters
+    ----------
+    model : the model.
+    iterations : Gauss-Newton iterations of the update; 1 is the plain filter.
+
+    Raises
+    ------
+    ParameterError : iterations not a whole number from 1 to 10.
+    """
+    if not (isinstance(iterations, int) and 1 <= iterations <= 10):
+        raise ParameterError(f"iterations must be a whole number from 1 to 10, got {iterations!r}")
+    model = model.expanded()
+    kind = kind_of(model)
+    nx, _, _, nw, _ = model.sizes
+    fixed = tuple(model.x.indices(model.consider))
+    m, P, u, p, y, R, dt = step_symbols(model, kind)
+    prior = ca.vertcat(m, kind.zeros(nw))
+    Pa = ca.diagcat(P, kind.eye(nw)) if nw else P
+
+    s = kind.sym("s", nx + nw)
+    h, check_h = model.output(s[:nx], u, p, s[nx:])
+    outputs = ca.Function("outputs", [s, u, p], [h, ca.jacobian(h, s), check_h])
+    x1, check_f = model.transition(s[:nx], u, p, s[nx:], dt)
+    forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_f])
+
+    at, check, first = prior, kind(0), None
+    done = None
+    for _ in range(iterations):
+        h, H, c = outputs(at, u, p)
+        # linearised at the iterate, but always an update of the prior
+        done = correct(Pa, H, y - h + H @ (at - prior), R, fixed)
+        if first is None:
+            first = done, y - h
+        at, check = prior + done.d, check + c
+    assert done is not None and first is not None
+    at = projected(at, done.P, *(np.append(b, np.full(nw, s)) for b, s in
+                                 ((model.lower, -np.inf), (model.upper, np.inf))))  # fmt: skip
+    x1, F, c = forecast(at, u, p, dt)
+    C = done.P[:nx, :] @ F.T
+    P1 = F @ done.P @ F.T + ca.diag(ca.DM(model.walk**2)) * dt
+    nu = ca.if_else(R >= 0, first[1], 0)
+    stats = ca.vertcat(check + c, first[0].nis, first[0].loglik, first[0].measured)
+    out = [x1, (P1 + P1.T) / 2, at[:nx], done.P[:nx, :nx], C, nu, first[0].S, stats]
+    out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
+    name = f"ekf{'' if iterations == 1 else iterations}_{model.name}"
+    return FilterStep(model, ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT))
+
+
+def extended_kalman_filter(
+    model: FilterModel,
+    prior: Belief,
+    data: Recording,
+    *,
+    iterations: int = 1,
+    full: bool = False,
+    backend: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> FilterResult:
+    """Filter a recording: p(x(k) | y(0..k)) as Gaussians.
+
+    Parameters
+    ----------
+    model : the model.
+    prior : belief at the first instant, before its sample.
+    data : the recording.
+    iterations : Gauss-Newton iterations of each update; 1 is the plain filter.
+    full, backend, progress : see :func:`estimators.filtering.run`.
+
+    Raises
+    ------
+    DataError, SignalError, EstimationError : see :func:`estimators.filtering.run`.
+    """
+    return run(
+        ekf_step(model, iterations), prior, data, full=full, backend=backend, progress=progress
+    )
