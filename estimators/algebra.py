@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-__all__ = ["as_symbols_of", "cholesky", "forward", "backward", "qr_lower", "symmetric"]
+__all__ = ["as_symbols_of", "backward", "cholesky", "forward", "qr_lower", "symmetric"]
 
 
 def cholesky(S: ca.SX) -> ca.SX:
@@ -84,8 +84,8 @@ def qr_lower(A: ca.SX) -> ca.SX:
     for i in range(n):
         for j in range(i + 1):
             # the sign of a column of L is free
-            L[i, j] = rows[i][j] * ca.if_else(rows[j][j] < 0, -1, 1) if i != j else ca.fabs(
-                rows[i][i]
+            L[i, j] = (
+                rows[i][j] * ca.if_else(rows[j][j] < 0, -1, 1) if i != j else ca.fabs(rows[i][i])
             )
     return L
 

@@ -58,9 +58,7 @@ class Belief:
             )
 
     @classmethod
-    def of(
-        cls, x: Signals, mean: Mapping[str, float], sigma: Mapping[str, float]
-    ) -> Belief:
+    def of(cls, x: Signals, mean: Mapping[str, float], sigma: Mapping[str, float]) -> Belief:
         """Make an uncorrelated belief from means and standard deviations by name.
 
         Raises

@@ -20,7 +20,6 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.errors import ParameterError
-
 from estimators.algebra import backward, cholesky, forward, symmetric
 from estimators.belief import Belief
 from estimators.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
@@ -53,8 +52,11 @@ class Corrected(NamedTuple):
 @lru_cache(maxsize=64)
 def _kernel(n: int, ny: int, fixed: tuple[int, ...]) -> ca.Function:
     """The update as an SX Function (P, H, nu, R) -> Corrected; ``fixed`` rows have no gain."""
-    P, H, nu, R = ca.SX.sym("P", n, n), ca.SX.sym("H", ny, n), ca.SX.sym("nu", ny), ca.SX.sym(
-        "R", ny
+    P, H, nu, R = (
+        ca.SX.sym("P", n, n),
+        ca.SX.sym("H", ny, n),
+        ca.SX.sym("nu", ny),
+        ca.SX.sym("R", ny),
     )
     return ca.Function("correct", [P, H, nu, R], list(_corrected(P, H, nu, R, fixed)))
 

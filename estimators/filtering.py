@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -19,7 +19,6 @@ from apu_casadi.backend import Caller, compiled
 from apu_casadi.errors import EstimationError, SignalError
 from apu_casadi.results import dataset
 from apu_casadi.signals import Signal, Signals
-
 from estimators.belief import Belief
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording

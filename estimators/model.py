@@ -1,7 +1,7 @@
 """What a filter needs to know of a model: f, g, names, and where noise enters.
 
-A :class:`FilterModel` is a discrete-time model with named vectors.  At a sample the output is taken,
-then the state goes on to the next sample:
+A :class:`FilterModel` is a discrete-time model with named vectors.  At a sample the output is
+taken, then the state goes on to the next sample:
 
     y(k)   = g(x(k), u(k), p, w(k)) + v(k)
     x(k+1) = f(x(k), u(k), p, w(k), dt(k)) + sqrt(dt(k)) * walk * xi(k)
@@ -262,9 +262,7 @@ def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
     s = model.symbols()
     y, check = model.output(*s[:4])
     output = ca.Function(f"{model.name}_g", [*s[:4]], [y[rows], check], *_OUTPUT)
-    return dataclasses.replace(
-        model, y=Signals([model.y[i] for i in rows]), output=output
-    )
+    return dataclasses.replace(model, y=Signals([model.y[i] for i in rows]), output=output)
 
 
 def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:

@@ -16,7 +16,6 @@ import numpy as np
 
 from apu_casadi.errors import DataError, nearest
 from apu_casadi.signals import Signals
-
 from estimators.model import FilterModel
 
 __all__ = ["Recording", "record"]
@@ -111,12 +110,14 @@ def _stamped(name: str, data: Any) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError):
         raise DataError(f"{name}: (times, values) expected, got {data!r:.80}") from None
     if t.ndim != 1 or t.shape != v.shape or t.size == 0:
-        raise DataError(f"{name}: times and values of one length expected, got {t.shape}, {v.shape}")
+        raise DataError(
+            f"{name}: times and values of one length expected, got {t.shape}, {v.shape}"
+        )
     if not np.isfinite(t).all() or (np.diff(t) <= SAME_TIME).any():
         k = int(np.argmax(np.diff(t) <= SAME_TIME)) if t.size > 1 else 0
         raise DataError(
-            f"{name}: times must be finite and increase; near t = {t[k]:.9g} s (sample {k}) they do "
-            "not: sort the stream, or drop one of two samples of the same stamp"
+            f"{name}: times must be finite and increase; near t = {t[k]:.9g} s (sample {k}) they "
+            "do not: sort the stream, or drop one of two samples of the same stamp"
         )
     return t, v
 

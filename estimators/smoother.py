@@ -13,7 +13,6 @@ import dataclasses
 import numpy as np
 
 from apu_casadi.errors import EstimationError
-
 from estimators.belief import Belief
 from estimators.filtering import FilterResult
 
