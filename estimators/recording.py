@@ -149,11 +149,11 @@ def record(
     DataError : unknown name, stamps that do not increase, missing sigma, an input that begins
         after the first measurement.
     """
-    for what, given, known in (
+    for what, names, known in (
         ("output", outputs, model.y), ("sigma of output", sigma, model.y),
         ("input", inputs or {}, model.u),
     ):  # fmt: skip
-        for name in given:
+        for name in names:
             if name not in known:
                 raise DataError(f"unknown {what} {name!r} {nearest(name, known.names)}")
     if not outputs:
@@ -162,7 +162,8 @@ def record(
     if missing:
         raise DataError(f"sigma missing for {', '.join(missing)}")
     streams = {n: _stamped(n, d) for n, d in outputs.items()}
-    held, constant = {}, {}
+    held: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    constant: dict[str, float] = {}
     for name, value in (inputs or {}).items():
         if np.ndim(value) == 0 and not isinstance(value, tuple):
             constant[name] = float(value)
@@ -181,7 +182,7 @@ def record(
     stamps += [t[(t > first) & (t < last)] for t, _ in held.values()]
     grid = _merged(stamps, max_dt)
     u = np.empty((len(model.u), grid.size))
-    given = dict(constant)
+    given: dict[str, Any] = dict(constant)
     for name, (t, v) in held.items():
         k = np.searchsorted(t, grid + SAME_TIME, side="right") - 1
         given[name] = v[k]
