@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from apu_casadi.multirate import Noise, simulate_joint
     from apu_casadi.signals import Signal, Signals
     from apu_casadi.statespace import StateSpace
-    from apu_casadi.trimming import OperatingPoint, trim_batch
+    from apu_casadi.steadypoint import OperatingPoint
+    from apu_casadi.trimbatch import trim_batch
 
     __version__: str
 
@@ -61,7 +62,7 @@ _HOME = {
     "LoadChange": "apu_casadi.events",
     "Noise": "apu_casadi.multirate",
     "OpenLoad": "apu_casadi.machine.load",
-    "OperatingPoint": "apu_casadi.trimming",
+    "OperatingPoint": "apu_casadi.steadypoint",
     "SeriesLoad": "apu_casadi.machine.load",
     "Signal": "apu_casadi.signals",
     "Signals": "apu_casadi.signals",
@@ -69,7 +70,7 @@ _HOME = {
     "Ttsc": "apu_casadi.machine.ttsc",
     "simulate_joint": "apu_casadi.multirate",
     "trim": "apu_casadi.apu",
-    "trim_batch": "apu_casadi.trimming",
+    "trim_batch": "apu_casadi.trimbatch",
 }
 
 

@@ -14,7 +14,8 @@ from apu_casadi.events import Ambient
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
 from apu_casadi.parameters import Parameters, par
-from apu_casadi.trimming import Limits, OperatingPoint, trim_gas_generator
+from apu_casadi.steadypoint import Limits, OperatingPoint
+from apu_casadi.trimming import trim_gas_generator
 
 if TYPE_CHECKING:
     from apu_casadi.machine.load import Load

@@ -40,7 +40,8 @@ from apu_casadi.errors import (
 )
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.maps import MapCalibration
-from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+from apu_casadi.steadypoint import OperatingPoint
+from apu_casadi.trimming import trim_gas_generator
 
 SETS = ("compressor_map", "turbine_map")
 AMBIENT = ("altitude", "Mach", "dT_isa", "war")

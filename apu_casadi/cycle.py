@@ -1,16 +1,17 @@
 """The gas generator's cycle: signals, parameters, design point, residual equations, Jacobians.
 
-Thermodynamics is written once, as SX expressions of the components; maps are splines, which exist
-in MX graphs only.  :class:`Cycle` joins the two, and assembles exact Jacobians of the whole from
-those of the parts by the chain rule: differentiating through the joined graph gives the same
-numbers but code ten times as long (see ``tests/test_cycle.py``, which holds one against the
-other).
+Thermodynamics and maps are written once, as SX expressions.  Only finding the cell of a map that a
+point lies in needs an MX graph, so every function made here has the same two parts
+(:meth:`Cycle.function`): look up the cells, then evaluate one SX function, which holds all the rest
+down to the solution of linear systems, with common subexpressions computed once.  Jacobians of the
+whole are assembled from those of maps and stations by the chain rule, which gives shorter code than
+differentiating through.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -28,9 +29,9 @@ from apu_casadi.components.shaft import power_balance, rotor_acceleration
 from apu_casadi.components.turbine import mix_cooling, turbine
 from apu_casadi.errors import OperatingPointError
 from apu_casadi.gas import Gas
-from apu_casadi.maps import ScaledMap
+from apu_casadi.maps import N_CELL, N_SURGE_CELL, ScaledMap, surface_cell, surge_cell
 from apu_casadi.parameters import Parameters, par
-from apu_casadi.rootfinding import Newton
+from apu_casadi.rootfinding import Newton, solve_bordered
 from apu_casadi.signals import Signal, Signals
 
 RPM = math.pi / 30.0  # rad/s per r/min
@@ -411,9 +412,14 @@ EQUATIONS = (
     "static state 3",
     "turbine flow",
 )
-_A = ("T0", "P0", "T1", "P1")  # ambient quantities, computed once per set of inputs
-_NZ, _NX, _NU, _NA, _NT = len(Z_NAMES), len(X), len(U), len(_A), len(THETA)
-_BETA_C, _BETA_T = Z_NAMES.index("beta_c"), Z_NAMES.index("beta_t")
+AMBIENT_STATE = ("T0", "P0", "T1", "P1")  # ambient quantities, computed once per set of inputs
+_NZ, _NX, _NU, _NA, _NT = len(Z_NAMES), len(X), len(U), len(AMBIENT_STATE), len(THETA)
+# In this order, equation k determines temperature k of z from those before it and from the map
+# coordinates; the last two equations are left for the coordinates.
+_LAST = ("static state 3", "exit flow", "turbine flow")
+ORDER = (*range(_NZ - len(_LAST)), *(EQUATIONS.index(n) for n in _LAST))
+N_ORDERED = _NZ - 2
+STEP_TOL = 1e-7  # of Newton's last step, relative: it converges quadratically, some 1e-13 is left
 
 
 class Columns(NamedTuple):
@@ -435,10 +441,10 @@ COLUMNS = _columns()
 
 
 class Assembled(NamedTuple):
-    """The cycle at one point, as MX: residuals, power before the load, outputs, derivatives.
+    """The cycle at one point, as SX: residuals, power before the load, outputs, derivatives.
 
     ``dq`` are the derivatives of (residuals, power before the load) and ``dy`` those of y with
-    respect to v = (z, x, u, a, theta); None where they were not asked for.
+    respect to v = (z, x, u, a, theta); rows off_c, off_t and residual of ``dy`` are zero.
     """
 
     alg: Any
@@ -446,6 +452,16 @@ class Assembled(NamedTuple):
     y: Any
     dq: Any
     dy: Any
+
+
+class Point(NamedTuple):
+    """Where the cycle is evaluated: state, unknowns, inputs, ``ambient(u)``, health; all SX."""
+
+    x: Any
+    z: Any
+    u: Any
+    a: Any
+    theta: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -489,32 +505,41 @@ class Cycle:
         )
         return ca.Function("ambient", [us], [ca.vertcat(amb.T0, amb.P0, amb.T1, amb.P1)])
 
-    @cached_property
-    def _parts(self) -> dict[str, ca.Function]:
-        """SX functions: map arguments, thermodynamics, and their Jacobians."""
-        p, d, gas = self.p, self.design, self.gas
-        xs, zs, us, aa, ts = (
-            ca.SX.sym(n, m) for n, m in (("x", _NX), ("z", _NZ), ("u", _NU), ("a", _NA), ("t", _NT))
-        )
-        Xv, Z = X.unpack(xs), _Unknown(*ca.vertsplit(zs))
-        Uv, H = U.unpack(us), THETA.unpack(ts)
-        N, war = Xv["N"], Uv["war"]
-        T0, P0, T1, P1 = ca.vertsplit(aa)
+    # -- expressions --------------------------------------------------------------------------
+
+    def _map_arguments(self, at: Point, PR_c: Any) -> dict[str, Any]:
+        """Corrected speeds over design and Reynolds number indices of the two maps."""
+        p, d, Z, N = self.p, self.design.values, _Unknown(*ca.vertsplit(at.z)), at.x
+        _, _, T1, P1 = ca.vertsplit(at.a)
+        T2, P2 = inlet(T1=T1, P1=P1, dp_inlet=p.dp_inlet)
+        P4 = P2 * PR_c * (1 - p.dp_burner)
+        return {
+            "n_c": N / ca.sqrt(T2 / d["T2"]) / p.N,
+            "n_t": N / ca.sqrt(Z.T41 / d["T41"]) / p.N,
+            "RNI_c": reynolds_index(P=P2, T=T2, P_ref=d["P2"], T_ref=d["T2"]),
+            "RNI_t": reynolds_index(P=P4, T=Z.T41, P_ref=d["P4"], T_ref=d["T41"]),
+        }
+
+    def _pass(self, at: Point, mc: Any, mt: Any) -> tuple[Any, Any, dict[str, Any]]:
+        """One pass through the stations, given what the maps say.
+
+        Parameters
+        ----------
+        mc, mt : W, PR, eta, SM of the compressor; W, PR, eta of the turbine.
+
+        Returns
+        -------
+        Residuals in the order of ``EQUATIONS``, power before the load, outputs by name; without
+        those that only the maps know.
+        """
+        p, d = self.p, self.design
+        Z, Uv, H = _Unknown(*ca.vertsplit(at.z)), U.unpack(at.u), THETA.unpack(at.theta)
+        W_c, PR_c, eta_c, SM = ca.vertsplit(mc)
+        W_t, PR_t, eta_t = ca.vertsplit(mt)
+        T0, P0, T1, P1 = ca.vertsplit(at.a)
         amb = Ambient(T0=T0, P0=P0, V0=ca.SX(0), T1=T1, P1=P1)
         T2, P2 = inlet(T1=T1, P1=P1, dp_inlet=p.dp_inlet)
         T2d, P2d = d.values["T2"], d.values["P2"]
-        # map arguments: corrected speeds and Reynolds number indices
-        PR = ca.SX.sym("PR_c")
-        n_c = N / ca.sqrt(T2 / T2d) / p.N
-        n_t = N / ca.sqrt(Z.T41 / d.values["T41"]) / p.N
-        RNI_c = reynolds_index(P=P2, T=T2, P_ref=P2d, T_ref=T2d)
-        RNI_t = reynolds_index(
-            P=P2 * PR * (1 - p.dp_burner), T=Z.T41, P_ref=d.values["P4"], T_ref=d.values["T41"]
-        )
-        # one pass through the stations, given the map values
-        mc, mt = ca.SX.sym("mc", 4), ca.SX.sym("mt", 3)
-        W_c, PR_c, eta_c, SM = ca.vertsplit(mc)
-        W_t, PR_t, eta_t = ca.vertsplit(mt)
         W2 = W_c * H["f_W_c"] * (P2 / P2d) / ca.sqrt(T2 / T2d)
         # losses grow with the square of the corrected flow at the inlet of their duct (Table 5)
         corrected_31 = (W2 * ca.sqrt(Z.T3) / (P2 * PR_c)) / (
@@ -525,7 +550,7 @@ class Cycle:
         W5 = W2 * (1 - p.bleed_overboard) + Uv["Wf"]
         corrected_5 = (W5 * ca.sqrt(Z.T5) / (P4 / PR_t)) / (W5d * math.sqrt(T5d) / P5d)
         st = _stations(
-            p=p, gas=gas, amb=amb, war=war, Wf=Uv["Wf"], W2=W2, PR_c=PR_c,
+            p=p, gas=self.gas, amb=amb, war=Uv["war"], Wf=Uv["Wf"], W2=W2, PR_c=PR_c,
             eta_c=eta_c * H["f_eta_c"], dp_burner=p.dp_burner * corrected_31**2, PR_t=PR_t,
             eta_t=eta_t * H["f_eta_t"], dp_exhaust=p.dp_exhaust * corrected_5**2, A3=d.A3, A8=d.A8,
             z=Z._asdict(),
@@ -533,104 +558,112 @@ class Cycle:
         capacity = W_t * H["f_W_t"]
         res = dict(st.res)
         res["turbine flow"] = st.y["W41"] * ca.sqrt(Z.T41) / st.y["P4"] / capacity - 1
+        if tuple(res) != EQUATIONS:
+            raise AssertionError(f"equations out of order: {tuple(res)}")
         P_free = power_balance(
             P_turb=st.y["P_turb"], P_cpr=st.y["P_cpr"], eta_cpr=p.eta_cpr, P_acc=p.P_acc, PW=0.0
         )
-        y = dict(st.y)
-        y |= {"eta_c": eta_c * H["f_eta_c"], "eta_t": eta_t * H["f_eta_t"], "SM": SM}
+        y = st.y | {"N": at.x, "PW": Uv["PW"], "Wf": Uv["Wf"], "SM": SM}
+        y |= {"eta_c": eta_c * H["f_eta_c"], "eta_t": eta_t * H["f_eta_t"]}
         y |= {"SFC": Uv["Wf"] / (Uv["PW"] + p.P_acc), "P_acceleration": P_free - Uv["PW"]}
-        y |= {"n_c": n_c, "n_t": n_t, "N": N, "PW": Uv["PW"], "Wf": Uv["Wf"]}
-        # filled in where the spline is at hand
-        y |= {"off_c": ca.SX(0), "off_t": ca.SX(0), "residual": ca.SX(0)}
-        if tuple(res) != EQUATIONS:
-            raise AssertionError(f"equations out of order: {tuple(res)}")
-        inputs = [xs, zs, us, aa, ts, mc, mt]
-        v = ca.vertcat(zs, xs, us, aa, ts)
-        q = ca.vertcat(*res.values(), P_free)
-        yv = Y.stack({k: y[k] for k in Y.names})
-
-        def function(name: str, args: list[Any], out: list[Any]) -> ca.Function:
-            return ca.Function(name, args, ca.cse(out))
-
-        v_t = ca.vertcat(zs, xs, us, aa, ts)
-        k_t = ca.vertcat(n_t, RNI_t)
-        k_c = ca.vertcat(n_c, RNI_c)
-        return {
-            "k_c": function("k_c", [xs, aa], [k_c]),
-            "dk_c": function("dk_c", [xs, zs, us, aa, ts], [ca.jacobian(k_c, v)]),
-            "k_t": function("k_t", [xs, zs, aa, PR], [k_t]),
-            "dk_t": function(
-                "dk_t", [xs, zs, us, aa, ts, PR], [ca.jacobian(k_t, v_t), ca.jacobian(k_t, PR)]
-            ),
-            "q": function("q", inputs, [q]),
-            "y": function("y", inputs, [yv]),
-            "dq": function(
-                "dq", inputs, [q, ca.jacobian(q, v), ca.jacobian(q, mc), ca.jacobian(q, mt)]
-            ),
-            "dy": function(
-                "dy", inputs, [yv, ca.jacobian(yv, v), ca.jacobian(yv, mc), ca.jacobian(yv, mt)]
-            ),
-        }
+        return ca.vertcat(*res.values()), P_free, y
 
     @cached_property
-    def _map_functions(self) -> tuple[ca.Function, ca.Function]:
-        """(n, beta, RNI) -> values (W, PR, eta[, SM]), their Jacobian, distance off the map."""
-        out = []
-        for m, name in ((self.cmap, "map_c"), (self.tmap, "map_t")):
-            k = ca.MX.sym("k", 3)
-            pt = m.lookup(k[0], k[1], k[2])
-            values = [pt.W, pt.PR, pt.eta] + ([pt.SM] if pt.SM is not None else [])
-            val = ca.vertcat(*values)
-            out.append(ca.Function(name, [k], [val, ca.jacobian(val, k), pt.off]))
-        return out[0], out[1]
+    def _core(self) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """SX functions of a point and the map cells that it lies in.
 
-    def assemble(
+        where : (x, z, u, a, theta) -> N and beta on the compressor's and the turbine's table.
+        flow : (x, z, u, a, theta, cell_c) -> flow at which the surge line is read.
+        cycle : (x, z, u, a, theta, cell_c, cell_t, cell_s) -> as :class:`Assembled`.
+        """
+        sizes = {"x": _NX, "z": _NZ, "u": _NU, "a": _NA, "theta": _NT}
+        point = Point(**{k: ca.SX.sym(k, n) for k, n in sizes.items()})
+        cells = {"cell_c": N_CELL, "cell_t": N_CELL, "cell_s": N_SURGE_CELL}
+        cell_c, cell_t, cell_s = (ca.SX.sym(k, n) for k, n in cells.items())
+        mc, mt = ca.SX.sym("mc", 4), ca.SX.sym("mt", 3)
+        beta_c, beta_t = point.z[_NZ - 2], point.z[_NZ - 1]
+        k = self._map_arguments(point, mc[1])
+        at_c, flow = self.cmap.at(k["n_c"], beta_c, k["RNI_c"], cell_c, cell_s)
+        at_t, _ = self.tmap.at(k["n_t"], beta_t, k["RNI_t"], cell_t)
+        values_c = ca.vertcat(at_c.W, at_c.PR, at_c.eta, at_c.SM)
+        values_t = ca.vertcat(at_t.W, at_t.PR, at_t.eta)
+        alg, P_free, y = self._pass(point, mc, mt)
+        y |= {"n_c": k["n_c"], "n_t": k["n_t"]}
+        y |= {"off_c": ca.SX(0), "off_t": ca.SX(0), "residual": ca.SX(0)}  # no derivatives of these
+        q, yv = ca.vertcat(alg, P_free), Y.stack({n: y[n] for n in Y.names})
+        # derivatives of the whole by the chain rule
+        v = ca.vertcat(point.z, point.x, point.u, point.a, point.theta)
+        dmc = ca.jacobian(values_c, v)
+        dmt = ca.jacobian(values_t, v) + ca.mtimes(ca.jacobian(values_t, mc), dmc)
+        dq, dy = (
+            ca.jacobian(e, v)
+            + ca.mtimes(ca.jacobian(e, mc), dmc)
+            + ca.mtimes(ca.jacobian(e, mt), dmt)
+            for e in (q, yv)
+        )
+        yv[Y.index("off_c")], yv[Y.index("off_t")] = at_c.off, at_t.off
+        # 1-norm: fmax inside the max-norm would swallow NaN
+        yv[Y.index("residual")] = ca.norm_1(alg)
+        # what the maps say takes the place of its symbols, the turbine's first: it needs PR_c
+        out = [alg, P_free, yv, dq, dy]
+        for symbol, value in ((mt, values_t), (mc, values_c)):
+            out = ca.substitute(out, [symbol], [value])
+        table = [self.cmap.N_map_des * k["n_c"], beta_c, self.tmap.N_map_des * k["n_t"], beta_t]
+        return (
+            ca.Function("where", [*point], [ca.vertcat(*table)]),
+            ca.Function("flow", [*point, cell_c], [flow]),
+            ca.Function("cycle", [*point, cell_c, cell_t, cell_s], out),
+        )
+
+    def function(
         self,
-        x: Any,
-        z: Any,
-        u: Any,
-        a: Any,
-        theta: Any,
-        *,
-        outputs: bool = False,
-        derivatives: bool = False,
-    ) -> Assembled:
-        """Write the cycle at a point in MX; ``a`` is ``ambient(u)``, held as separate input."""
-        f = self._parts
-        map_c, map_t = self._map_functions
-        k_c = f["k_c"](x, a)
-        mc, Jc, off_c = map_c(ca.vertcat(k_c[0], z[_BETA_C], k_c[1]))
-        k_t = f["k_t"](x, z, a, mc[1])
-        mt, Jt, off_t = map_t(ca.vertcat(k_t[0], z[_BETA_T], k_t[1]))
-        point = (x, z, u, a, theta, mc, mt)
-        dq = dy = None
-        if derivatives:
-            n_v = _NZ + _NX + _NU + _NA + _NT
-            e_c, e_t = ca.DM(1, n_v), ca.DM(1, n_v)
-            e_c[0, _BETA_C], e_t[0, _BETA_T] = 1, 1
-            dk_c = f["dk_c"](x, z, u, a, theta)
-            dmc = ca.mtimes(Jc, ca.vertcat(dk_c[0, :], ca.MX(e_c), dk_c[1, :]))
-            dk_t, dk_t_PR = f["dk_t"](x, z, u, a, theta, mc[1])
-            dk_t = dk_t + ca.mtimes(dk_t_PR, dmc[1, :])
-            dmt = ca.mtimes(Jt, ca.vertcat(dk_t[0, :], ca.MX(e_t), dk_t[1, :]))
-            q, q_v, q_mc, q_mt = f["dq"](*point)
-            dq = q_v + ca.mtimes(q_mc, dmc) + ca.mtimes(q_mt, dmt)
-        else:
-            q = f["q"](*point)
-        alg = q[:_NZ]
-        y = None
-        if outputs:
-            if derivatives:
-                y, y_v, y_mc, y_mt = f["dy"](*point)
-                dy = y_v + ca.mtimes(y_mc, dmc) + ca.mtimes(y_mt, dmt)
-            else:
-                y = f["y"](*point)
-            rows = ca.vertsplit(y)
-            rows[Y.index("off_c")], rows[Y.index("off_t")] = off_c, off_t
-            # 1-norm: fmax inside the max-norm would swallow NaN
-            rows[Y.index("residual")] = ca.norm_1(alg)
-            y = ca.vertcat(*rows)
-        return Assembled(alg, q[_NZ], y, dq, dy)
+        name: str,
+        args: Mapping[str, ca.SX],
+        point: Point,
+        outputs: Callable[[Assembled], Mapping[str, Any]],
+    ) -> ca.Function:
+        """Make a function that evaluates the cycle at a point given by its arguments.
+
+        Parameters
+        ----------
+        name : of the function.
+        args : its arguments by name, symbols.
+        point : where to evaluate the cycle, SX expressions of the arguments.
+        outputs : what to return, by name, made from the cycle at the point; what of it is not used
+            costs nothing.
+
+        Returns
+        -------
+        MX function args -> outputs, dense.  It finds the map cells and calls one SX function.
+        """
+        where, flow, cycle = self._core
+        given = list(args.values())
+        cells = [ca.SX.sym("c", N_CELL), ca.SX.sym("t", N_CELL), ca.SX.sym("s", N_SURGE_CELL)]
+        made = outputs(Assembled(*cycle.call([*point, *cells])))
+        values = ca.cse([ca.densify(ca.SX(e)) for e in made.values()])
+        # nothing is differentiated by the cells: they change by jumps only, between which the
+        # coefficients are those of the same smooth surface
+        smooth = {"is_diff_in": [True] * len(given) + [False] * len(cells)}
+        inner = ca.Function(f"{name}_sx", [*given, *cells], values, smooth)
+        find = ca.Function("find", given, ca.cse(where.call([*point])))
+        read = ca.Function("read", [*given, cells[0]], ca.cse(flow.call([*point, cells[0]])))
+        q = [ca.MX.sym(k, *s.shape) for k, s in args.items()]
+        at = find(*q)
+        cell_c = surface_cell(self.cmap.table)(at[0], at[1])
+        cell_t = surface_cell(self.tmap.table)(at[2], at[3])
+        cell_s = ca.MX(N_SURGE_CELL, 1)
+        if any(ca.depends_on(e, cells[2]) for e in values):
+            cell_s = surge_cell(self.cmap.table)(read(*q, cell_c))
+        out = inner.call([*q, cell_c, cell_t, cell_s])
+        return ca.Function(name, q, out, list(args), list(made))
+
+    def _point(self) -> tuple[dict[str, ca.SX], Point]:
+        """Arguments x, z, u, theta, and the point that they give."""
+        n = {"x": _NX, "z": _NZ, "u": _NU, "theta": _NT}
+        args = {k: ca.SX.sym(k, m) for k, m in n.items()}
+        return args, Point(a=self.ambient(args["u"]), **args)
+
+    # -- functions ----------------------------------------------------------------------------
 
     def symbols(self) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
         """Fresh MX symbols (x, z, u, theta)."""
@@ -644,38 +677,86 @@ class Cycle:
     @cached_property
     def equations(self) -> ca.Function:
         """The model: Function (x, z, u, theta) -> (ode, alg, y), from which all else is made."""
-        x, z, u, theta = self.symbols()
-        c = self.assemble(x, z, u, self.ambient(u), theta, outputs=True)
-        ode = rotor_acceleration(P_acceleration=c.P_free - u[1], N=x, J=self.p.J)
-        names = ["x", "z", "u", "theta"], ["ode", "alg", "y"]
-        return ca.Function("gas_generator", [x, z, u, theta], [ode, c.alg, c.y], *names)
+        args, point = self._point()
+        return self.function(
+            "gas_generator",
+            args,
+            point,
+            lambda c: {"ode": self._ode(c, point), "alg": c.alg, "y": c.y},
+        )
+
+    def _ode(self, c: Assembled, point: Point) -> Any:
+        """dN/dt, rad/s2."""
+        return rotor_acceleration(P_acceleration=c.P_free - point.u[1], N=point.x, J=self.p.J)
 
     @cached_property
     def solve(self) -> ca.Function:
         """Solve 0 = alg for z by Newton's method, as a differentiable CasADi function.
 
-        Function (z0, x, u, theta) -> z.  Success is *not* reported inside larger expressions:
-        every user re-evaluates the residual, which is why it is an output of the model.
+        Function (z0, x, u, theta) -> z.  Derivatives of any order are those of the root, by the
+        implicit function theorem; there are none by z0.  Success is *not* reported inside larger
+        expressions: every user re-evaluates the residual, which is why it is an output of the
+        model.
         """
-        x, z, u, theta = self.symbols()
-        a = ca.MX.sym("a", _NA)
-        plain = self.assemble(x, z, u, a, theta)
-        exact = self.assemble(x, z, u, a, theta, derivatives=True)
-        args = [z, x, u, a, theta]
-        alg = ca.Function("alg", args, [plain.alg])
-        J = ca.Function("alg_z", args, [exact.dq[:_NZ, COLUMNS.z], exact.alg])
+        scale = ca.DM(self.z.nominals)
+        args, point = self._point()
+        # the unknown first, as the root finder wants it; a once, not in every iteration
+        args = {"z": args["z"]} | args | {"a": ca.SX.sym("a", _NA)}
+        point = point._replace(z=scale * args["z"], a=args["a"])
+        step = self.function(
+            "newton", args, point, lambda c: {"step": -self._along(c, c.alg) / scale}
+        )
+        q = step.mx_in()
+        # fast_newton serves as the loop alone: it is given the identity for a Jacobian and Newton's
+        # step, over the magnitudes of z, for a residual
         options = {
-            # a hundredth of what is checked: Newton converges quadratically, so it ends far below
-            "abstol": 1e-11,
-            "abstolStep": 0.0,
+            "abstol": 0.0,
+            "abstolStep": STEP_TOL,
             "max_iter": 20,
             "error_on_fail": False,
-            "jacobian_function": J,
+            "jacobian_function": ca.Function("loop", q, [ca.DM.eye(_NZ), step(*q)]),
         }
-        root = ca.rootfinder("gas_generator_z", "fast_newton", alg, options)
+        root = ca.rootfinder("gas_generator_z", "fast_newton", step, options)
+        x, _, u, theta = self.symbols()
         z0 = ca.MX.sym("z0", _NZ)
-        z1 = root(z0, x, u, self.ambient(u), theta)
-        return ca.Function("solve_z", [z0, x, u, theta], [z1], ["z0", "x", "u", "theta"], ["z"])
+        z1 = scale * root(z0 / scale, x, u, theta, self.ambient(u))
+        names = ["z0", "x", "u", "theta"], ["z"]
+        options = {"custom_jacobian": self._solve_jacobian, "jac_penalty": 0}
+        return ca.Function("solve_z", [z0, x, u, theta], [z1], *names, options)
+
+    @cached_property
+    def _solve_jacobian(self) -> ca.Function:
+        """Function (z0, x, u, theta, z) -> derivatives of z by z0, which are none, x, u, theta."""
+        args, point = self._point()
+        own = {"x": slice(0, _NX), "u": slice(_NX, _NX + _NU), "theta": slice(_NX + _NU, None)}
+
+        def outputs(c: Assembled) -> dict[str, Any]:
+            z_w = self._along(c, self._by_inputs(c.dq[:_NZ, :], point))
+            return {f"z_{k}": z_w[:, at] for k, at in own.items()}
+
+        x, z, u, theta = self.symbols()
+        by = self.function("z_w", args, point, outputs)(x, z, u, theta)
+        z0 = ca.MX.sym("z0", _NZ)
+        names = ["z0", *own]
+        return ca.Function(
+            "jac_solve_z",
+            [z0, x, u, theta, z],
+            [ca.MX(_NZ, _NZ), *by],
+            [*names, "out_z"],
+            [f"jac_z_{k}" for k in names],
+        )
+
+    @staticmethod
+    def _by_inputs(d: Any, point: Point) -> Any:
+        """Derivatives by w = (x, u, theta) at fixed z from those by v; ``a`` follows from u."""
+        k, a_u = COLUMNS, ca.jacobian(point.a, point.u)
+        return ca.horzcat(d[:, k.x], d[:, k.u] + ca.mtimes(d[:, k.a], a_u), d[:, k.theta])
+
+    @staticmethod
+    def _along(c: Assembled, by: Any) -> Any:
+        """Derivatives of z along 0 = alg, given those of alg at fixed z, by columns."""
+        rows = list(ORDER)
+        return -solve_bordered(c.dq[rows, COLUMNS.z], by[rows, :], N_ORDERED)
 
     @cached_property
     def sensitivities(self) -> ca.Function:
@@ -684,49 +765,36 @@ class Cycle:
         Function (x, z, u, theta) -> (xdot, y, xdot_w, y_w, z_w) with w = (x, u, theta), by the
         implicit function theorem.  Rows off_c, off_t and residual of y_w are zero.
         """
-        x, z, u, theta = self.symbols()
-        us = ca.MX.sym("u", _NU)
-        a_u = ca.Function("a_u", [us], [ca.jacobian(self.ambient(us), us)])(u)
-        c = self.assemble(x, z, u, self.ambient(u), theta, outputs=True, derivatives=True)
+        args, point = self._point()
         k = COLUMNS
 
-        def columns(d: Any) -> Any:
-            d_u = d[:, k.u] + ca.mtimes(d[:, k.a], a_u)
-            return ca.horzcat(d[:, k.x], d_u, d[:, k.theta])
+        def outputs(c: Assembled) -> dict[str, Any]:
+            q_w, y_w = (self._by_inputs(d, point) for d in (c.dq, c.dy))
+            z_w = self._along(c, q_w[:_NZ, :])
+            P_w = q_w[_NZ, :] + ca.mtimes(c.dq[_NZ, k.z], z_w)
+            P_w[_NX + 1] -= 1  # the load
+            N, J, xdot = point.x, self.p.J, self._ode(c, point)
+            xdot_w = P_w / (J * N)
+            xdot_w[0] -= xdot / N
+            y_w = y_w + ca.mtimes(c.dy[:, k.z], z_w)
+            return {"xdot": xdot, "y": c.y, "xdot_w": xdot_w, "y_w": y_w, "z_w": z_w}
 
-        alg_z = c.dq[:_NZ, k.z]
-        z_w = -ca.solve(alg_z, columns(c.dq[:_NZ, :]))
-        P_w = columns(c.dq[_NZ, :]) + ca.mtimes(c.dq[_NZ, k.z], z_w)
-        load = ca.DM(1, _NX + _NU + _NT)
-        load[0, _NX + 1] = 1
-        P = c.P_free - u[1]
-        N, J = x, self.p.J
-        xdot = rotor_acceleration(P_acceleration=P, N=N, J=J)
-        own = ca.DM(1, _NX + _NU + _NT)
-        own[0, 0] = 1
-        xdot_w = (P_w - load) / (J * N) - (xdot / N) * own
-        y_w = columns(c.dy) + ca.mtimes(c.dy[:, k.z], z_w)
-        return ca.Function(
-            "sensitivities",
-            [x, z, u, theta],
-            [xdot, c.y, xdot_w, y_w, z_w],
-            ["x", "z", "u", "theta"],
-            ["xdot", "y", "xdot_w", "y_w", "z_w"],
-        )
+        return self.function("sensitivities", args, point, outputs)
 
     @cached_property
     def dfdx(self) -> ca.Function:
         """Function (x, z, u, theta) -> (ode, d ode/dx along 0 = alg, 1-norm of alg, dz/dx)."""
-        x, z, u, theta = self.symbols()
-        c = self.assemble(x, z, u, self.ambient(u), theta, derivatives=True)
-        alg, k = c.dq[:_NZ, :], COLUMNS
-        z_x = -ca.solve(alg[:, k.z], alg[:, k.x])
-        P_x = c.dq[_NZ, k.x] + ca.mtimes(c.dq[_NZ, k.z], z_x)
-        J = self.p.J
-        ode = rotor_acceleration(P_acceleration=c.P_free - u[1], N=x, J=J)
-        return ca.Function(
-            "dfdx", [x, z, u, theta], [ode, P_x / (J * x) - ode / x, ca.norm_1(c.alg), z_x]
-        )
+        args, point = self._point()
+        k = COLUMNS
+
+        def outputs(c: Assembled) -> dict[str, Any]:
+            z_x = self._along(c, c.dq[:_NZ, k.x])
+            P_x = c.dq[_NZ, k.x] + ca.mtimes(c.dq[_NZ, k.z], z_x)
+            ode = self._ode(c, point)
+            ode_x = P_x / (self.p.J * point.x) - ode / point.x
+            return {"ode": ode, "ode_x": ode_x, "residual": ca.norm_1(c.alg), "z_x": z_x}
+
+        return self.function("dfdx", args, point, outputs)
 
     @cached_property
     def similar(self) -> ca.Function:

@@ -37,7 +37,7 @@ from apu_casadi.jointmodel import (
 )
 from apu_casadi.signals import Signals
 from apu_casadi.statespace import StateSpace
-from apu_casadi.trimming import OperatingPoint
+from apu_casadi.steadypoint import OperatingPoint
 
 if TYPE_CHECKING:
     import xarray as xr

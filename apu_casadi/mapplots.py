@@ -21,7 +21,8 @@ from apu_casadi.errors import DataError, MapError, OperatingPointError, SignalEr
 from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
 from apu_casadi.maps import map_function
 from apu_casadi.results import phases
-from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+from apu_casadi.steadypoint import OperatingPoint
+from apu_casadi.trimming import trim_gas_generator
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -13,6 +13,12 @@ one far knot on each side, so one B-spline holds table and continuation, without
 knots lie ``REACH`` table spans away (at 5 % of the lowest speed below the table's speeds, since
 speeds are positive); beyond them everything is held at its value there.
 
+**Evaluation.**  The B-splines are rewritten as one bicubic polynomial per knot cell.  A lookup is
+then two steps: find the cell and take its coefficients (``*_cell``, an MX function), and sum the
+polynomial (``*_logs``, a plain expression that may be SX).  Models fetch the cells first and then
+compute maps, thermodynamics and all derivatives in one SX function, several times faster than
+B-splines within an MX graph.
+
 **Stability margin.**  At constant corrected flow, as in GasTurb: SM = PR_surge(W)/PR - 1.  The
 surge line is a natural cubic spline of ln(PR - 1) over ln W with the same continuation: a power
 law.
@@ -21,6 +27,8 @@ law.
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from types import SimpleNamespace
@@ -37,7 +45,8 @@ from apu_casadi.parameters import Parameters, par
 REACH = 2.0  # table spans from the table's edge to where everything is held
 LOWEST = 0.05  # held below this fraction of the table's lowest speed
 TILT_WIDTH = 0.1  # of relative speed, over which the tilt of the surge line saturates
-_MARGIN = 1e-9  # of the whole range: bspline is 0 at and beyond its last knot, stay inside
+_FIXED_CELL = {"is_diff_in": [True, True, False]}  # a cell's numbers change by jumps only
+N_CELL, N_SURGE_CELL = 4 + 3 * 16, 2 + 4  # numbers that describe a cell: its place, coefficients
 
 
 class MapPoint(NamedTuple):
@@ -96,32 +105,95 @@ def _ends(x: np.ndarray) -> tuple[float, float]:
     return float(x[0]) - reach, float(x[-1]) + reach
 
 
-def _clamp(x: Any, knots: np.ndarray) -> Any:
-    """Hold a query just inside the knots, where ``bspline`` is not yet zero."""
-    margin = _MARGIN * float(knots[-1] - knots[0])
-    return ca.fmin(ca.fmax(x, knots[0] + margin), knots[-1] - margin)
+def local_cubics(knots: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rewrite cubic B-splines as one cubic per knot interval.
+
+    Parameters
+    ----------
+    knots, C : knots with fourfold ends, shape (n + 4,); coefficients, shape (n, ...).
+
+    Returns
+    -------
+    breaks, shape (m + 1,), and pieces, shape (4, m, ...): in interval i the spline is the sum of
+    pieces[k, i] t^k with t = (x - breaks[i])/(breaks[i + 1] - breaks[i]).
+    """
+    breaks = knots[3:-3]
+    width = np.diff(breaks).reshape(-1, *[1] * (C.ndim - 1))
+    spline = BSpline(knots, C, 3)
+    return breaks, np.stack(
+        [spline(breaks[:-1], nu=k) * width**k / math.factorial(k) for k in range(4)]
+    )
+
+
+def _held(x: Any, breaks: np.ndarray) -> Any:
+    """Hold a query within the ends."""
+    return ca.fmin(ca.fmax(x, float(breaks[0])), float(breaks[-1]))
+
+
+def _interval(x: ca.MX, breaks: np.ndarray) -> tuple[ca.MX, ca.MX]:
+    """Return the interval that x lies in, the first or last for an x outside, and its place.
+
+    The place is the interval's start and one over its width, shape (2,).
+    """
+    i = ca.low(ca.DM(breaks), x)
+    places = ca.DM(np.stack([breaks[:-1], 1 / np.diff(breaks)]))
+    return i, ca.MX(places)[:, i]
+
+
+def _cubic(c: list[Any], t: Any) -> Any:
+    return c[0] + t * (c[1] + t * (c[2] + t * c[3]))
+
+
+@lru_cache(maxsize=64)
+def _surface(table: MapTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Breaks in N and beta, and coefficients of every cell, shape (48, cells).
+
+    Rows: quantity, power in N, power in beta, the last running fastest; columns likewise by
+    interval in N, interval in beta.
+    """
+    lo, hi = _ends(table.N)
+    knots_N, P_N = spline_operator(table.N, max(lo, LOWEST * float(table.N[0])), hi)
+    knots_b, P_b = spline_operator(table.beta, *_ends(table.beta))
+    logs = np.log(np.stack([table.W, table.PR - 1, table.eta]))
+    C = np.einsum("ai,kij,bj->abk", P_N, logs, P_b)
+    breaks_N, along_N = local_cubics(knots_N, C)  # (power, i, b, k)
+    breaks_b, both = local_cubics(knots_b, np.moveaxis(along_N, 2, 0))  # (power, j, power, i, k)
+    cells = np.einsum("ljpik->kplij", both)
+    return breaks_N, breaks_b, cells.reshape(48, -1)
+
+
+@lru_cache(maxsize=64)
+def surface_cell(table: MapTable) -> ca.Function:
+    """Return the CasADi function (N, beta) -> cell, shape (52,): where it lies, coefficients.
+
+    Piecewise constant: its derivative is zero, and that of :func:`surface_logs` is complete.
+    """
+    breaks_N, breaks_b, cells = _surface(table)
+    N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
+    (i, at_N), (j, at_b) = _interval(N, breaks_N), _interval(beta, breaks_b)
+    c = ca.MX(ca.DM(cells))[:, i * (breaks_b.size - 1) + j]
+    return ca.Function("cell", [N, beta], [ca.vertcat(at_N, at_b, c)], ["N", "beta"], ["cell"])
+
+
+def surface_logs(table: MapTable, N: Any, beta: Any, cell: Any) -> tuple[Any, list[Any]]:
+    """Return N as held, and (ln W, ln(PR - 1), ln eta), at a point of a cell."""
+    breaks_N, breaks_b, _ = _surface(table)
+    held = _held(N, breaks_N)
+    start_N, per_N, start_b, per_b, *c = ca.vertsplit(cell)
+    t, s = (held - start_N) * per_N, (_held(beta, breaks_b) - start_b) * per_b
+    rows = [_cubic(c[k : k + 4], s) for k in range(0, 48, 4)]
+    return held, [_cubic(rows[k : k + 4], t) for k in range(0, 12, 4)]
 
 
 @lru_cache(maxsize=64)
 def _log_map(table: MapTable) -> ca.Function:
     """(N, beta) -> N as held, and (ln W, ln(PR - 1), ln eta) stacked."""
-    lo, hi = _ends(table.N)
-    knots_N, P_N = spline_operator(table.N, max(lo, LOWEST * float(table.N[0])), hi)
-    knots_b, P_b = spline_operator(table.beta, *_ends(table.beta))
-    logs = np.log(np.stack([table.W, table.PR - 1, table.eta]))
-    C = np.einsum("ai,kij,bj->kab", P_N, logs, P_b)
-    N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
-    held = _clamp(N, knots_N)
-    # CasADi wants the output index fastest, then the first axis
-    y = ca.bspline(
-        ca.vertcat(held, _clamp(beta, knots_b)),
-        ca.DM(C.ravel(order="F")),
-        [knots_N.tolist(), knots_b.tolist()],
-        [3, 3],
-        3,
-        {},
-    )
-    return ca.Function("log_map", [N, beta], [held, y], ["N", "beta"], ["N_held", "logs"])
+    N, beta, cell = ca.SX.sym("N"), ca.SX.sym("beta"), ca.SX.sym("cell", N_CELL)
+    held, logs = surface_logs(table, N, beta, cell)
+    inner = ca.Function("logs", [N, beta, cell], [held, ca.vertcat(*logs)], _FIXED_CELL)
+    q = ca.MX.sym("N"), ca.MX.sym("beta")
+    out = inner(*q, surface_cell(table)(*q))
+    return ca.Function("log_map", [*q], [*out], ["N", "beta"], ["N_held", "logs"])
 
 
 @lru_cache(maxsize=64)
@@ -137,8 +209,8 @@ def map_function(table: MapTable) -> ca.Function:
 
 
 @lru_cache(maxsize=64)
-def surge_function(table: MapTable) -> ca.Function:
-    """Return the unscaled surge line as a CasADi function W -> PR_surge, in the table's units.
+def _surge_line(table: MapTable) -> tuple[np.ndarray, np.ndarray]:
+    """Breaks in ln W and coefficients of ln(PR_surge - 1), shape (4, intervals).
 
     Raises
     ------
@@ -148,10 +220,45 @@ def surge_function(table: MapTable) -> ca.Function:
         raise MapError(f"map {table.name!r} is of a {table.kind}: it has no surge line")
     x = np.log(table.surge_W)
     knots, P = spline_operator(x, *_ends(x))
+    return local_cubics(knots, P @ np.log(table.surge_PR - 1))
+
+
+@lru_cache(maxsize=64)
+def surge_cell(table: MapTable) -> ca.Function:
+    """Return the CasADi function W -> cell of the surge line, shape (6,); piecewise constant.
+
+    Raises
+    ------
+    MapError : the table is of a turbine.
+    """
+    breaks, pieces = _surge_line(table)
     W = ca.MX.sym("W")
-    coefficients = ca.DM(P @ np.log(table.surge_PR - 1))
-    y = ca.bspline(_clamp(ca.log(W), knots), coefficients, [knots.tolist()], [3], 1, {})
-    return ca.Function("surge", [W], [1 + ca.exp(y)], ["W"], ["PR_surge"])
+    i, place = _interval(ca.log(W), breaks)
+    return ca.Function("surge_cell", [W], [ca.vertcat(place, ca.MX(ca.DM(pieces))[:, i])])
+
+
+def surge_PR(table: MapTable, W: Any, cell: Any) -> Any:
+    """Return the pressure ratio of the unscaled surge line at W, which lies in this cell."""
+    breaks, _ = _surge_line(table)
+    start, per, *c = ca.vertsplit(cell)
+    return 1 + ca.exp(_cubic(c, (_held(ca.log(W), breaks) - start) * per))
+
+
+@lru_cache(maxsize=64)
+def surge_function(table: MapTable) -> ca.Function:
+    """Return the unscaled surge line as a CasADi function W -> PR_surge, in the table's units.
+
+    Raises
+    ------
+    MapError : the table is of a turbine.
+    """
+    find = surge_cell(table)
+    W, cell = ca.SX.sym("W"), ca.SX.sym("cell", N_SURGE_CELL)
+    inner = ca.Function(
+        "surge_PR", [W, cell], [surge_PR(table, W, cell)], {"is_diff_in": [True, False]}
+    )
+    q = ca.MX.sym("W")
+    return ca.Function("surge", [q], [inner(q, find(q))], ["W"], ["PR_surge"])
 
 
 @lru_cache(maxsize=64)
@@ -160,7 +267,7 @@ def off_function(table: MapTable) -> ca.Function:
 
     off is 0 inside the table, else the larger distance outside; the other two are signed.
     """
-    N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
+    N, beta = ca.SX.sym("N"), ca.SX.sym("beta")
     signed = []
     for x, axis in ((N, table.N), (beta, table.beta)):
         lo, hi = float(axis[0]), float(axis[-1])
@@ -289,7 +396,7 @@ class ScaledMap:
 
     @cached_property
     def function(self) -> ca.Function:
-        """(n, beta, RNI) -> W, PR, eta, off, and for a compressor SM."""
+        """(n, beta, RNI) -> W, PR, eta, for a compressor SM, and off."""
         n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
         out = self._bent(n, beta, RNI, self.cal)
         names = ["n", "beta", "RNI"]
@@ -313,26 +420,67 @@ class ScaledMap:
     def _bent(self, n: ca.MX, beta: ca.MX, RNI: ca.MX, cal: Any) -> dict[str, ca.MX]:
         """Return the outputs by name, with the numbers of ``cal`` floats or symbols."""
         t = self.table
-        _, des = _log_map(t)(self.N_map_des, self.beta_des)
         N_held, y = _log_map(t)(self.N_map_des * n, beta)
+        surge = surge_function(t) if t.kind == "compressor" else None
+        out = self._scaled(N_held, ca.vertsplit(y), RNI, cal, surge)
+        out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
+        return {k: out[k] for k in MapPoint._fields if k in out}
+
+    @cached_property
+    def _design_logs(self) -> tuple[float, float, float]:
+        """ln W, ln(PR - 1), ln eta of the table where the design point lies."""
+        _, y = _log_map(self.table)(self.N_map_des, self.beta_des)
+        W, PR, eta = np.asarray(y).ravel().tolist()
+        return W, PR, eta
+
+    def _scaled(
+        self, N_held: Any, y: list[Any], RNI: Any, cal: Any, surge: Callable[[Any], Any] | None
+    ) -> dict[str, Any]:
+        """Scale and bend what the table says: W, PR, eta, and SM if there is a surge line.
+
+        ``surge`` gives the unscaled line's pressure ratio by the unscaled flow.
+        """
+        des = self._design_logs
         held = N_held / self.N_map_des  # > 0, so that powers of it exist
-        rel = ca.exp(y - des)
-        W = self.W_des * rel[0] * held**cal.a_W
-        PR = 1 + (self.PR_des - 1) * rel[1]
+        W = self.W_des * ca.exp(y[0] - des[0]) * held**cal.a_W
+        PR = 1 + (self.PR_des - 1) * ca.exp(y[1] - des[1])
         # ln((PR - 1)/(PR_des - 1)) is y - des itself
         droop = cal.c_PR * (y[1] - des[1]) ** 2 + cal.c_N * (held - 1) ** 2
-        eta = 1 - (1 - self.eta_des * rel[2] * ca.exp(-droop)) * RNI ** (-cal.n_Re)
-        off = off_function(t)(self.N_map_des * n, beta)[0]
-        out = {"W": W, "PR": PR, "eta": eta, "off": off}
-        if t.kind == "compressor":
-            W_map = W / self.W_des * ca.exp(des[0])
-            surge = (surge_function(t)(W_map) - 1) * (self.PR_des - 1) / ca.exp(des[1])
+        eta = 1 - (1 - self.eta_des * ca.exp(y[2] - des[2] - droop)) * RNI ** (-cal.n_Re)
+        out = {"W": W, "PR": PR, "eta": eta}
+        if surge is not None:
+            line = (surge(self._table_flow(W)) - 1) * (self.PR_des - 1) / math.exp(des[1])
             # a tilt about n = 1 that saturates: a power law fitted above the design speed would
             # move the whole surge line at part speed, about which it knows nothing
             tilt = 1 + cal.a_SM * ca.tanh((held - 1) / TILT_WIDTH)
-            PR_surge = 1 + surge * cal.k_SM * tilt
-            out["SM"] = PR_surge / PR - 1
+            out["SM"] = (1 + line * cal.k_SM * tilt) / PR - 1
         return out
+
+    def _table_flow(self, W: Any) -> Any:
+        """Flow of the table that stands for a scaled flow."""
+        return W / self.W_des * math.exp(self._design_logs[0])
+
+    def at(self, n: Any, beta: Any, RNI: Any, cell: Any, surge: Any = None) -> tuple[MapPoint, Any]:
+        """Read the map at a point of a known cell; plain expressions, also of SX.
+
+        Parameters
+        ----------
+        n, beta, RNI : as in :meth:`lookup`.
+        cell : what :func:`surface_cell` of the table says at (N_map_des n, beta), shape (52,).
+        surge : what :func:`surge_cell` says at the flow returned, shape (6,); None leaves out SM.
+
+        Returns
+        -------
+        The point, and the flow at which the surge line is read.
+        """
+        t = self.table
+        N_held, y = surface_logs(t, self.N_map_des * n, beta, cell)
+        line = None if surge is None else lambda W: surge_PR(t, W, surge)
+        out = self._scaled(N_held, y, RNI, self.cal, line)
+        off = off_function(t)(self.N_map_des * n, beta)[0]
+        return MapPoint(out["W"], out["PR"], out["eta"], out.get("SM"), off), self._table_flow(
+            out["W"]
+        )
 
     def lookup(self, n: Any, beta: Any, RNI: Any = 1.0) -> MapPoint:
         """Read the map.
@@ -349,9 +497,9 @@ class ScaledMap:
 
         Raises
         ------
-        MapError : an argument is a ``casadi.SX``; B-splines exist in MX graphs only.
+        MapError : an argument is a ``casadi.SX``; cells are found in MX graphs only.
         """
-        W, PR, eta, off, *SM = _call(self.function, n, beta, RNI)
+        W, PR, eta, *SM, off = _call(self.function, n, beta, RNI)
         return MapPoint(W=W, PR=PR, eta=eta, SM=SM[0] if SM else None, off=off)
 
     def off_axes(self, n: Any, beta: Any) -> OffMap:
@@ -400,7 +548,7 @@ def scale_map(
 def _call(f: ca.Function, *args: Any) -> tuple[Any, ...]:
     """Call with symbols, floats or arrays; return expressions, floats or arrays."""
     if any(isinstance(a, ca.SX) for a in args):
-        raise MapError("maps are B-splines, which exist in MX graphs only: use MX, not SX, symbols")
+        raise MapError("a map's cell is found in MX graphs only: use MX, not SX, symbols")
     if any(isinstance(a, ca.MX) for a in args):
         return tuple(f.call([ca.MX(a) for a in args]))
     arrays = np.broadcast_arrays(*(np.asarray(a, dtype=float) for a in args))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -116,3 +117,25 @@ class Newton:
 def _norm(r: np.ndarray) -> float:
     """Max-norm; infinite when anything is not a number."""
     return float(np.abs(r).max()) if np.all(np.isfinite(r)) else float("inf")
+
+
+def solve_bordered(A: Any, B: Any, k: int) -> Any:
+    """Solve A X = B for an A whose leading k by k block is lower triangular, as an expression.
+
+    Parameters
+    ----------
+    A : sparse SX, shape (n, n); the diagonal of the leading block must not vanish.
+    B : SX, shape (n, m).
+    k : size of that block.
+
+    Returns
+    -------
+    X, shape (n, m).  Forward substitution leaves a system of the n - k others, solved by
+    orthogonalisation, which needs no pivots: the code has no branches.
+    """
+    n = A.shape[0]
+    lower, border, C, D = A[:k, :k], A[:k, k:], A[k:, :k], A[k:, k:]
+    W = ca.solve(lower, ca.horzcat(border, B[:k, :]))
+    W_border, W_B = W[:, : n - k], W[:, n - k :]
+    last = ca.solve(D - ca.mtimes(C, W_border), B[k:, :] - ca.mtimes(C, W_B))
+    return ca.vertcat(W_B - ca.mtimes(W_border, last), last)

@@ -8,6 +8,7 @@ when to stop, and the residual is evaluated again at the end, whatever the itera
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,7 +16,21 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.components.inlet import inlet
-from apu_casadi.cycle import COLUMNS, EQUATIONS, THETA, Z_NAMES, Cycle, U, Y
+from apu_casadi.cycle import (
+    AMBIENT_STATE,
+    COLUMNS,
+    EQUATIONS,
+    N_ORDERED,
+    ORDER,
+    THETA,
+    Z_NAMES,
+    Assembled,
+    Cycle,
+    Point,
+    U,
+    Y,
+)
+from apu_casadi.rootfinding import solve_bordered
 
 NZ = len(Z_NAMES)
 N_W = NZ + 3  # w = (z, N, Wf, PW)
@@ -43,6 +58,19 @@ class Output(NamedTuple):
     r: Any
     s: Any
     iterations: Any
+
+
+class System(NamedTuple):
+    """The equations at one point, as SX.
+
+    r : residuals, in the order of ``TrimKernel.rows``.  J : their derivatives by the unknowns as
+    sought.  w : (z, N, Wf, PW), a list.  y : outputs.
+    """
+
+    r: Any
+    J: Any
+    w: list[Any]
+    y: Any
 
 
 class TrimKernel:
@@ -95,11 +123,11 @@ class TrimKernel:
                 slope[i] = w[i]
             else:
                 w[i] = self.nominal[i] * s[k]
-                slope[i] = ca.MX(self.nominal[i])
+                slope[i] = self.nominal[i]
         for n, i in DIRECT.items():
             if n in values:
                 w[i] = values[n]
-        dPW_dN = ca.MX(0)
+        dPW_dN = 0.0
         if LAW in values:
             PW_ref, N_ref, k = ca.vertsplit(values[LAW])
             N = w[DIRECT["N"]]
@@ -109,55 +137,58 @@ class TrimKernel:
 
     def _ambient(self, p: Any) -> Any:
         n = len(AMBIENT)
-        return self.cycle.ambient(ca.vertcat(ca.MX(2, 1), p[:n]))
+        return self.cycle.ambient(ca.vertcat(0.0, 0.0, p[:n]))
+
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Unknowns s, parameters p, ambient state a."""
+        sizes = {"s": len(self.free), "p": self.n_p, "a": len(AMBIENT_STATE)}
+        s, p, a = (ca.SX.sym(k, n) for k, n in sizes.items())
+        return s, p, a
+
+    def _function(
+        self,
+        name: str,
+        args: Mapping[str, ca.SX],
+        s: Any,
+        p: Any,
+        a: Any,
+        outputs: Callable[[System], Mapping[str, Any]],
+    ) -> ca.Function:
+        """Make a function of ``args``, which give s, p and a, that evaluates the equations."""
+        w, slope, dPW_dN = self._decode(s, p)
+        n = len(AMBIENT)
+        N, Wf, PW = w[NZ:]
+        point = Point(
+            x=N, z=ca.vertcat(*w[:NZ]), u=ca.vertcat(Wf, PW, p[:n]), a=a, theta=p[n:N_FIRST]
+        )
+
+        def made(c: Assembled) -> Mapping[str, Any]:
+            return outputs(self._system(c, p, w, slope, dPW_dN))
+
+        return self.cycle.function(name, args, point, made)
 
     def _system(
-        self, s: Any, p: Any, a: Any, *, derivatives: bool
-    ) -> tuple[Any, Any, list[Any], Any]:
-        """Residuals, their Jacobian by s (or None), w and y (or None)."""
-        w, slope, dPW_dN = self._decode(s, p)
-        z, N, Wf, PW = ca.vertcat(*w[:NZ]), *w[NZ:]
-        n = len(AMBIENT)
-        u, theta = ca.vertcat(Wf, PW, p[:n]), p[n:N_FIRST]
-        implicit = [name for name in self.spec if name not in (*DIRECT, LAW)]
-        direct_z = {name: "T5" if name == "T8" else name for name in implicit}
-        direct_z = {k: v for k, v in direct_z.items() if v in Z_NAMES}
-        need_y = not derivatives or len(direct_z) < len(implicit)
-        c = self.cycle.assemble(N, z, u, a, theta, outputs=need_y, derivatives=derivatives)
+        self, c: Assembled, p: Any, w: list[Any], slope: dict[int, Any], dPW_dN: Any
+    ) -> System:
+        """Residuals and their Jacobian by s, from the cycle at w."""
         values = self._values(p)
-        PW_ref = self.PW_design
-        rows = [c.alg, (c.P_free - PW) / PW_ref]
-        for name in implicit:
-            value = w[Z_NAMES.index(direct_z[name])] if name in direct_z else c.y[Y.index(name)]
-            rows.append((value - values[name]) / Y[name].nominal)
-        r = ca.vertcat(*rows)
-        if not derivatives:
-            return r, None, w, c.y
         k = COLUMNS
         # columns of (z, N, Wf, PW) among v = (z, x, u, a, theta)
         columns = [*range(NZ), k.x.start, k.u.start, k.u.start + 1]
-        own = ca.DM(1, N_W)
-        own[0, DIRECT["PW"]] = 1
-        parts = [
-            c.dq[:NZ, :][:, columns],
-            (c.dq[NZ, :][:, columns] - ca.sparsify(own)) / PW_ref,
-        ]
-        for name in implicit:
-            if name in direct_z:
-                e = ca.DM(1, N_W)
-                e[0, Z_NAMES.index(direct_z[name])] = 1
-                parts.append(ca.MX(ca.sparsify(e)) / Y[name].nominal)
-            else:
-                parts.append(c.dy[Y.index(name), :][:, columns] / Y[name].nominal)
-        J = ca.vertcat(*parts)
-        J_free = ca.horzcat(*(J[:, i] * slope[i] for i in self.free))
+        load = ca.SX(1, N_W)
+        load[0, DIRECT["PW"]] = 1
+        r = [c.alg, (c.P_free - w[DIRECT["PW"]]) / self.PW_design]
+        J = [c.dq[:NZ, columns], (c.dq[NZ, columns] - load) / self.PW_design]
+        for name in (n for n in self.spec if n not in (*DIRECT, LAW)):
+            scale = Y[name].nominal
+            r.append((c.y[Y.index(name)] - values[name]) / scale)
+            J.append(c.dy[Y.index(name), columns] / scale)
+        J_w = ca.vertcat(*J)
+        J_s = ca.horzcat(*(J_w[:, i] * slope[i] for i in self.free))
         if LAW in self.spec and DIRECT["N"] in self.free:
             at = self.free.index(DIRECT["N"])
-            extra = J[:, DIRECT["PW"]] * dPW_dN * slope[DIRECT["N"]]
-            J_free = J_free + ca.horzcat(
-                *(extra if i == at else ca.MX(J.shape[0], 1) for i in range(len(self.free)))
-            )
-        return r, J_free, w, c.y
+            J_s[:, at] += J_w[:, DIRECT["PW"]] * dPW_dN * slope[DIRECT["N"]]
+        return System(ca.vertcat(*r), J_s, w, c.y)
 
     def _start(self, p: Any, a: Any) -> Any:
         """First guess by similarity with the design point, from whatever is fixed."""
@@ -176,7 +207,7 @@ class TrimKernel:
         def power_of(Wf: Any) -> Any:
             return full * (Wf / (d["Wf"] * delta) - idle) / (1 - idle) - par.P_acc
 
-        N = values.get("N", ca.MX(par.N))
+        N = values.get("N", par.N)
         if LAW in values:
             PW_ref, N_ref, k = ca.vertsplit(values[LAW])
             if "Wf" in values:
@@ -206,8 +237,8 @@ class TrimKernel:
                 zd[m] * (ratio[m] / zd["T3"] if m in ratio else T4 / par.T4)
                 for m in Z_NAMES[: NZ - 2]
             ),
-            ca.MX(cy.cmap.beta_des),
-            ca.MX(cy.tmap.beta_des),
+            cy.cmap.beta_des,
+            cy.tmap.beta_des,
         ]
         w = [*z, N, Wf, PW]
         return ca.vertcat(
@@ -226,26 +257,34 @@ class TrimKernel:
         limited step for a residual, so that what it subtracts is the step made here.
         """
         n, m = len(self.free), self.n_p
-        v, q = ca.MX.sym("v", n + 1), ca.MX.sym("q", m + 4)
-        r, J, _, _ = self._system(v[:n], q[:m], q[m:], derivatives=True)
-        step = -ca.solve(J, r, "qr")
-        step = step * ca.fmin(1.0, MAX_STEP / ca.norm_inf(step))
-        F = ca.Function("trim_step", [v, q], [ca.vertcat(-step, -_COUNT)])
-        back = F(v, q)
+        v, q = ca.SX.sym("v", n + 1), ca.SX.sym("q", m + len(AMBIENT_STATE))
+        rows = [*ORDER, *range(NZ, n)]
+
+        def step(e: System) -> dict[str, Any]:
+            d = -solve_bordered(e.J[rows, :], e.r[rows], N_ORDERED)
+            d = d * ca.fmin(1.0, MAX_STEP / ca.norm_inf(d))
+            return {"F": ca.vertcat(-d, -_COUNT)}
+
+        F = self._function("trim_step", {"v": v, "q": q}, v[:n], q[:m], q[m:], step)
+        x, c = F.mx_in()
         options = {
             "abstol": 0.0,
             "abstolStep": STEP_TOL,
             "max_iter": iterations,
             "error_on_fail": False,
-            "jacobian_function": ca.Function("trim_loop", [v, q], [ca.DM.eye(n + 1), back]),
+            "jacobian_function": ca.Function("trim_loop", [x, c], [ca.DM.eye(n + 1), F(x, c)]),
         }
         return ca.rootfinder("trim_root", "fast_newton", F, options)
 
     def _outputs(self, s0: Any, p: Any, a: Any, iterations: int) -> list[Any]:
         n = len(self.free)
         v = self._root(iterations)(ca.vertcat(s0, 0.0), ca.vertcat(p, a))
-        r, _, w, y = self._system(v[:n], p, a, derivatives=False)
-        return [ca.vertcat(*w), ca.densify(y), ca.densify(r), v[:n], v[n] / _COUNT]
+        s_end, p_end, a_end = self._symbols()
+        end = self._function(
+            "trim_end", {"s": s_end, "p": p_end, "a": a_end}, s_end, p_end, a_end,
+            lambda e: {"w": ca.vertcat(*e.w), "y": e.y, "r": e.r},
+        )  # fmt: skip
+        return [*end(v[:n], p, a), v[:n], v[n] / _COUNT]
 
     @cached_property
     def cold(self) -> ca.Function:
@@ -255,7 +294,9 @@ class TrimKernel:
         """
         p = ca.MX.sym("p", self.n_p)
         a = self._ambient(p)
-        out = self._outputs(self._start(p, a), p, a, MAX_ITERATIONS)
+        _, ps, as_ = self._symbols()
+        start = ca.Function("trim_start", [ps, as_], [self._start(ps, as_)])
+        out = self._outputs(start(p, a), p, a, MAX_ITERATIONS)
         return ca.Function(f"trim_{self.label}", [p], out, ["p"], list(Output._fields))
 
     @cached_property
@@ -268,11 +309,12 @@ class TrimKernel:
         return ca.Function(f"trim_warm_{self.label}", [s, p], out, ["s", "p"], names)
 
     @cached_property
-    def jacobian(self) -> ca.Function:
-        """(s, p) -> Jacobian of the scaled equations by the scaled unknowns; to tell a fold."""
-        s, p = ca.MX.sym("s", len(self.free)), ca.MX.sym("p", self.n_p)
-        _, J, _, _ = self._system(s, p, self._ambient(p), derivatives=True)
-        return ca.Function("trim_jacobian", [s, p], [ca.densify(J)])
+    def equations(self) -> ca.Function:
+        """(s, p) -> residuals, and their Jacobian by the scaled unknowns, which tells a fold."""
+        s, p, _ = self._symbols()
+        args = {"s": s, "p": p}
+        a = self._ambient(p)
+        return self._function("trim_equations", args, s, p, a, lambda e: {"r": e.r, "J": e.J})
 
     @property
     def label(self) -> str:

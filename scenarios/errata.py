@@ -23,7 +23,8 @@ from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.multirate import simulate_joint
 from apu_casadi.results import RPM
-from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+from apu_casadi.steadypoint import OperatingPoint
+from apu_casadi.trimming import trim_gas_generator
 from scenarios.pages import markdown_table
 from scenarios.paper_figures import HEALTH
 from scenarios.paper_tables import design_point, high_altitude_point, table4, table5

@@ -13,7 +13,8 @@ from apu_casadi.apu import Apu
 from apu_casadi.gasgenerator import RPM, GasGenerator
 from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+from apu_casadi.steadypoint import OperatingPoint
+from apu_casadi.trimming import trim_gas_generator
 from scenarios.validation import Row, mean_row, reference, relative, section
 
 #: paper's row name: (output of the model, factor from SI to the table's unit)

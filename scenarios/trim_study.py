@@ -17,7 +17,8 @@ import numpy as np
 
 from apu_casadi import backend
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
-from apu_casadi.trimming import MEANING, Limits, Status, TrimBatch, trim_batch
+from apu_casadi.steadypoint import MEANING, Limits, Status
+from apu_casadi.trimbatch import TrimBatch, trim_batch
 
 ENVELOPE: dict[str, tuple[float, float]] = {
     "altitude": (0.0, 12e3),

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi.rootfinding import Newton
+from apu_casadi.rootfinding import Newton, solve_bordered
 
 
 def newton(residual, n=1, n_p=0, **options):
@@ -115,3 +115,17 @@ def test_equations_and_unknowns_must_match_in_number():
     """A square system is the contract."""
     with pytest.raises(ValueError, match="2 equations for 1 unknowns"):
         newton(lambda x, p: ca.vertcat(x, x))
+
+
+@pytest.mark.parametrize(("n", "k"), [(5, 3), (6, 0), (11, 9), (13, 9), (4, 4)])
+def test_bordered_systems_are_solved_as_by_elimination(n, k):
+    """NumPy's solution of random systems, the leading block lower triangular (rounding)."""
+    rng = np.random.default_rng(n)
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, 3))
+    A[:k, :k] = np.tril(A[:k, :k]) + 3 * np.eye(k)
+    pattern = ca.DM(A)
+    pattern[:k, :k] = ca.tril(pattern[:k, :k])
+    a = ca.SX.sym("a", ca.sparsify(pattern).sparsity())
+    b = ca.SX.sym("b", n, 3)
+    X = ca.Function("X", [a, b], [solve_bordered(a, b, k)])(ca.sparsify(pattern), B)
+    np.testing.assert_allclose(X.full(), np.linalg.solve(A, B), rtol=1e-10, atol=1e-12)

@@ -15,7 +15,7 @@ HELP = "compile the hot functions to C libraries ahead of time"
 
 HOT: tuple[tuple[str, str], ...] = (
     ("gas_generator", "scenarios.commands.compile:gas_generator_functions"),
-    ("trim", "apu_casadi.trimming:hot_functions"),
+    ("trim", "apu_casadi.trimsolver:hot_functions"),
     ("joint", "scenarios.commands.compile:joint_functions"),
 )
 """(name, "module:callable"); the callable compiles its functions and returns their names."""

@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
 
     from apu_casadi.errors import DataError, ScenarioError
     from apu_casadi.gasgenerator import GasGenerator
-    from apu_casadi.trimming import MEANING, Status, performance_deck
+    from apu_casadi.steadypoint import MEANING, Status
+    from apu_casadi.trimbatch import performance_deck
 
     axes: dict[str, Any] = {
         "altitude": _axis("--altitude", args.altitude), "Mach": _axis("--mach", args.mach),

@@ -115,7 +115,7 @@ def _numbers(option: str, texts: list[str]) -> dict[str, float]:
 def _limits(texts: list[str]) -> Any:
     import dataclasses
 
-    from apu_casadi.trimming import Limits
+    from apu_casadi.steadypoint import Limits
 
     known = [f.name for f in dataclasses.fields(Limits)]
     given = _numbers("--limit", texts)
@@ -126,7 +126,7 @@ def _limits(texts: list[str]) -> Any:
 
 
 def _fixed(texts: list[str], PW_design: float, N_design: float) -> dict[str, Any]:
-    from apu_casadi.trimming import LoadLaw
+    from apu_casadi.steadypoint import LoadLaw
 
     out: dict[str, Any] = {}
     for name, value in _pairs("--fix", texts).items():

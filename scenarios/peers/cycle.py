@@ -31,7 +31,8 @@ from typing import Any
 from apu_casadi.gas import T_REF
 from apu_casadi.gasgenerator import RPM, GasGenerator
 from apu_casadi.maps import MapCalibration
-from apu_casadi.trimming import OperatingPoint, trim_gas_generator
+from apu_casadi.steadypoint import OperatingPoint
+from apu_casadi.trimming import trim_gas_generator
 from scenarios.peers.process import run_script
 from scenarios.validation import Row, SkippedError, relative, section
 
