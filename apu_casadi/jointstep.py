@@ -1,10 +1,11 @@
 """Many exchange steps of the whole unit as one compiled function.
 
 The loop of :mod:`apu_casadi.multirate` written as an expression: exact propagation of the
-generators (:mod:`apu_casadi.propagation`), governor, and the gas generator's discrete step, folded
-over a block of exchange steps.  For phases in which nothing is switched and the machine's
-coefficients do not depend on the rotor angle (healthy, balanced load); what Python does between
-the steps of the ordinary loop costs as much there as the models themselves.
+generators, governor, and the gas generator's discrete step, over a block of exchange steps.  For
+phases in which nothing is switched: with waveforms (:mod:`apu_casadi.propagation`) where the
+machine's coefficients do not depend on the rotor angle, without them
+(:mod:`apu_casadi.meanstep`) always.  What Python does between the steps of the ordinary loop costs
+as much as the models themselves.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from apu_casadi.apu import Apu
 from apu_casadi.backend import Caller, compiled
 from apu_casadi.control import governor
 from apu_casadi.gasgenerator import RESIDUAL_TOL
+from apu_casadi.meanstep import MeanStep
 from apu_casadi.propagation import Propagator
 
 BLOCK = 10  # exchange steps in one call
@@ -45,51 +47,56 @@ class BlockResult(NamedTuple):
     waves: np.ndarray
 
 
-def _function(apu: Apu, propagator: Propagator) -> ca.Function:
-    """Build the block for one propagator layout: carry -> (last, y, means, waves, checks)."""
-    advance, table = propagator.function, propagator.table
-    gg, ss, gov = apu.gas_generator, propagator.ss, apu.governor
-    n_x, n_z, n_u, n_sg = len(gg.X), len(gg.z), len(gg.U), len(ss.x)
-    n_series = int(table.series.size)
-    sizes = [n_x, n_z, 1, n_sg, n_u, len(gg.THETA), len(ss.u), n_series, 4]
-    carry = ca.MX.sym("carry", sum(sizes))
+def _function(apu: Apu, machine: Propagator | MeanStep) -> ca.Function:
+    """Build the block: (carry, u, theta, u_sg, theta_sg, series, dt) -> (last, y, means, ...).
+
+    ``carry`` holds N, z, Wf_I and the generator's state; the waveforms and, for each step, what is
+    to be checked come last: errors of the machine's step, residual of the cycle, speed.
+    """
+    gg, ss, gov = apu.gas_generator, machine.ss, apu.governor
+    n_out = machine.n_out
+    sizes = [len(gg.X), len(gg.z), 1, len(ss.x)]
     ends = np.cumsum([0, *sizes]).tolist()
-    N, z, Wf_I, x_sg, u, theta, u_sg, series, c = (carry[i:j] for i, j in pairwise(ends))
-    dt, centre, half = c[0], c[1], c[2]
-    w_r = apu.w_r(N)
-    s = (w_r - centre) / half
-    at_w = ca.DM(len(ss.u), 1)
-    at_w[ss.u.index("w_r")] = 1
-    u_now = u_sg * (1 - at_w) + at_w * w_r
-    P = ca.mtimes(ca.reshape(series, n_series // 4, 4), ca.vertcat(1, s, s**2, s**3))
-    x1, Y, means, miss = advance(x_sg, P, u_now, ca.DM(0, 1), dt / propagator.n_out)
-    angle = np.zeros((n_sg, 1))
-    angle[ss.x.index("theta_e")] = 2 * math.pi
-    x1 = x1 - angle * ca.floor(x1[ss.x.index("theta_e")] / (2 * math.pi) + 0.5)
+    carry, u = ca.MX.sym("carry", ends[-1]), ca.MX.sym("u", len(gg.U))
+    theta, u_sg = ca.MX.sym("theta", len(gg.THETA)), ca.MX.sym("u_sg", len(ss.u))
+    series, dt = ca.MX.sym("series", machine.parameters.size), ca.MX.sym("dt")
+    fault = [ca.MX.sym("fault", len(ss.theta))] if len(ss.theta) else []
+    held = [u, theta, u_sg, *fault, series, dt]
+
+    N, z, Wf_I, x_sg = (carry[i:j] for i, j in pairwise(ends))
+    u_now = ca.MX(u_sg)
+    u_now[ss.u.index("w_r")] = w_r = apu.w_r(N)
+    x1, *Y, means, miss = machine.advance(x_sg, series, u_now, *fault, dt)
+    at = ss.x.index("theta_e")
+    x1[at] -= 2 * math.pi * ca.floor(x1[at] / (2 * math.pi) + 0.5)
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=gov)
     u1 = ca.vertcat(fuel.Wf, apu.PW(means[0]), u[2:])
     N1, y, z1, r = gg.step(N, u1, theta, dt, z)
-    out = ca.vertcat(N1, z1, Wf_I + dt * fuel.Wf_I_dot, x1, u1, theta, u_sg, series, c)
+    after = ca.vertcat(N1, z1, Wf_I + dt * fuel.Wf_I_dot, x1)
     # w_r goes with the checks: the series holds in a range of speeds
-    step = ca.Function("joint_step", [carry], [out, y, means, ca.vec(Y), ca.vertcat(miss, r, w_r)])
-    run = step.mapaccum("joint_block", BLOCK, 1)
-    last, ys, ms, Ys, checks = run(carry)
+    outs = [after, y, means, ca.vertcat(miss, r, w_r), *Y]
+    step = ca.Function("joint_step", [carry, *held], outs)
+
+    now, rows = carry, []
+    for _ in range(BLOCK):
+        now, *row = step(now, *held)
+        rows.append(row)
     return ca.Function(
-        f"joint_block_{ss.name}_{propagator.n_out}",
-        [carry],
-        [last[: ends[4], BLOCK - 1], ys, ms, Ys, checks],
-        ["carry"],
-        ["last", "y", "means", "waves", "checks"],
+        f"joint_block_{ss.name}_{n_out}",
+        [carry, *held],
+        [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))],
+        ["carry", "u", "theta", "u_sg", *(["fault"] if fault else []), "series", "dt"],
+        ["last", "y", "means", "checks", *(["waves"] if Y else [])],
     )
 
 
 class JointBlock:
-    """Blocks of exchange steps with one healthy, balanced load."""
+    """Blocks of exchange steps with one load and fault."""
 
-    def __init__(self, apu: Apu, propagator: Propagator) -> None:
-        """Build or fetch the compiled block; ``propagator.constant`` must hold."""
-        self.apu, self.propagator = apu, propagator
-        self._call = _caller(apu, propagator)
+    def __init__(self, apu: Apu, machine: Propagator | MeanStep) -> None:
+        """Build or fetch the compiled block; a ``Propagator`` must have constant coefficients."""
+        self.apu, self.machine = apu, machine
+        self._call = _caller(apu, machine)
 
     def __call__(
         self,
@@ -102,43 +109,41 @@ class JointBlock:
         u_sg: np.ndarray,
     ) -> BlockResult | None:
         """Advance ``BLOCK`` steps; None where a check fails and the ordinary loop must decide."""
-        p, table = self.propagator, self.propagator.table
-        carry = np.concatenate(
-            [N, z, [Wf_I], x_sg, u, theta, u_sg, table.series.ravel(),
-             [p.dt, table.centre, table.half, 0.0]]
-        )  # fmt: skip
-        last, y, means, waves, checks = self._call(carry)
-        miss, residual, w_r = checks
+        m = self.machine
+        carry = np.concatenate([N, z, [Wf_I], x_sg])
+        fault = [m.theta] if m.theta.size else []
+        last, y, means, checks, *waves = self._call(
+            carry, u, theta, u_sg, *fault, m.parameters, m.dt
+        )
+        *miss, residual, w_r = checks
         good = (
-            np.all(miss <= p.tol)
+            np.all(m.limits >= np.array(miss).T)
             and np.all(residual <= RESIDUAL_TOL)
             and np.isfinite(last).all()
-            and p.valid(float(w_r.min()))
-            and p.valid(float(w_r.max()))
+            and np.isfinite(means).all()
+            and m.valid(float(w_r.min()))
+            and m.valid(float(w_r.max()))
         )
         if not good:
             return None
         n_x, n_z = N.size, z.size
-        # column-major samples of each step, one step after the other
-        k = len(p.outputs)
-        w = waves.T.reshape(BLOCK * p.n_out, k).T if k else np.empty((0, BLOCK * p.n_out))
         return BlockResult(
-            last[:n_x].copy(),
-            last[n_x : n_x + n_z].copy(),
+            last[:n_x],
+            last[n_x : n_x + n_z],
             float(last[n_x + n_z]),
-            last[n_x + n_z + 1 :].copy(),
+            last[n_x + n_z + 1 :],
             y,
             means,
-            w,
+            waves[0] if waves else np.empty((0, 0)),
         )
 
 
 _CALLERS: dict[tuple[object, ...], Caller] = {}
 
 
-def _caller(apu: Apu, propagator: Propagator) -> Caller:
+def _caller(apu: Apu, machine: Propagator | MeanStep) -> Caller:
     """One compiled block for each unit and layout."""
-    key = (apu, *propagator.layout)
+    key = (apu, *machine.layout)
     if key not in _CALLERS:
-        _CALLERS[key] = Caller(compiled(_function(apu, propagator)))
+        _CALLERS[key] = Caller(compiled(_function(apu, machine)))
     return _CALLERS[key]

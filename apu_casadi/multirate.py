@@ -20,15 +20,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu
@@ -44,14 +41,22 @@ from apu_casadi.events import (
     in_order,
 )
 from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.generator import GeneratorPoint, MeasurementNoise
-from apu_casadi.jointstep import BLOCK, BlockResult, JointBlock
+from apu_casadi.generator import MeasurementNoise
+from apu_casadi.jointstep import BLOCK, BlockResult
 from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.propagation import Propagator
+from apu_casadi.machinestep import (
+    EXCHANGES,
+    GRID_TOL,
+    MEANS,
+    PHASORS,
+    RMS,
+    WAVEFORMS,
+    MachineStep,
+    phasors_of,
+    ramped,
+)
 from apu_casadi.results import dataset
-from apu_casadi.signals import Signal, Signals
-from apu_casadi.simulation import stepper
-from apu_casadi.statespace import StateSpace
+from apu_casadi.signals import Signal
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -59,44 +64,20 @@ if TYPE_CHECKING:
     from apu_casadi.machine.load import Load
     from apu_casadi.machine.ttsc import Ttsc
 
-WAVEFORMS = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_total")
-RMS = {"V_a_rms": "v_a^2", "V_b_rms": "v_b^2", "V_c_rms": "v_c^2",
-        "I_a_rms": "i_a^2", "I_b_rms": "i_b^2", "I_c_rms": "i_c^2"}  # fmt: skip
-MEANS = ("P_total", "P_e", "P_loss_fault")
-
-
-class Exchange(NamedTuple):
-    """How speed and fuel pass between the models over a step.
-
-    Parameters
-    ----------
-    ramp : the machine's speed goes on with the step's predicted slope, instead of being held.
-    mid_fuel : the fuel is that of the predicted mid-step, instead of that of the beginning.
-    passes : times that each step is computed, the slope of the one before serving the next.
-    """
-
-    ramp: bool
-    mid_fuel: bool
-    passes: int = 1
-
-
-EXCHANGES = {
-    "paper": Exchange(False, False),
-    "predicted": Exchange(True, True),
-    "corrected": Exchange(True, True, passes=2),
-    "predicted speed": Exchange(True, False),
-    "predicted fuel": Exchange(False, True),
-}
-"""What ``simulate_joint(exchange=...)`` takes; the last two tell two parts of the error apart."""
+__all__ = [
+    "EXCHANGES",
+    "MEANS",
+    "RMS",
+    "SOLVERS",
+    "WAVEFORMS",
+    "Noise",
+    "exchange_grid",
+    "ramped",
+    "simulate_joint",
+]
 
 SOLVERS = ("cvodes", "idas", "propagator")
-#: Samples in an exchange step of exact propagation when no waveforms are kept, by "is healthy".
-#: Enough for means and rms values to 1e-5 at 20 ms; the samples themselves are exact anyway.
-SUMMARY_SAMPLES = {True: 160, False: 200}
-FINE_SAMPLE = 50e-6  # s; what stored waveforms are computed with, at most
 _HEALTHY = (0.0, math.nan, math.nan)
-_LOG = logging.getLogger("apu_casadi")
-_GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
 @dataclass(frozen=True)
@@ -140,34 +121,10 @@ def exchange_grid(duration: float, dt: float, events: Sequence[Event]) -> np.nda
         raise ScenarioError(f"exchange step dt must lie in (0, 1] s, got {dt!r}")
     regular = np.arange(0, math.floor(duration / dt + 1e-9) + 1) * dt
     t = np.unique(np.concatenate([regular, [e.t for e in events], [duration]]))
-    keep = np.concatenate([[True], np.diff(t) > _GRID_TOL])
+    keep = np.concatenate([[True], np.diff(t) > GRID_TOL])
     grid = t[keep]
     grid[-1] = duration
     return np.asarray(grid)
-
-
-@lru_cache(maxsize=64)
-def ramped(ss: StateSpace) -> StateSpace:
-    """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input."""
-    X = Signals([*ss.x, dataclasses.replace(ss.u["w_r"], name="w_r", default=None)])
-    slope = Signal("w_r_dot", "rad/s^2", "slope of the electrical speed", nominal=1e3)
-    U = Signals([slope if s.name == "w_r" else s for s in ss.u])
-    at = ss.u.index("w_r")
-    x, z, u, theta = (
-        ca.SX.sym(label, len(s))
-        for label, s in (("x", X), ("z", ss.z), ("u", U), ("theta", ss.theta))
-    )
-    x_sg, rate = x[: len(ss.x)], u[at]
-    u_sg = ca.vertcat(u[:at], x[len(ss.x)], u[at + 1 :])
-    ode, alg = ss.residual(x_sg, z, u_sg, theta)
-    name, args = f"{ss.name}_ramped", [x, u, theta]
-    return StateSpace(
-        name=name, x=X, z=ss.z, u=U, theta=ss.theta, y=ss.y,
-        residual=ca.Function(f"{name}_residual", [x, z, u, theta], [ca.vertcat(ode, rate), alg]),
-        f=ca.Function(f"{name}_f", args, [ca.vertcat(ss.f(x_sg, u_sg, theta), rate)]),
-        g=ca.Function(f"{name}_g", args, [ss.g(x_sg, u_sg, theta)]),
-        z_of=ca.Function(f"{name}_z", args, [ss.z_of(x_sg, u_sg, theta)]),
-    )  # fmt: skip
 
 
 def simulate_joint(
@@ -182,6 +139,7 @@ def simulate_joint(
     dt: float = 0.02,
     exchange: str = "paper",
     waveform_dt: float | None = 50e-6,
+    phasors: bool = False,
     noise: Noise | None = None,
     seed: int | None = None,
     hook: Callable[[int, np.ndarray], np.ndarray] | None = None,
@@ -212,6 +170,9 @@ def simulate_joint(
         there.  ``"corrected"``: every step twice.  (``"predicted speed"`` and ``"predicted fuel"``
         do half of it, to tell the two errors apart.)  Energy is handed over exactly in each.
     waveform_dt : sampling of the stored waveforms, s; None stores none.
+    phasors : whether to store, for each exchange step, the fundamental phasors of the phase
+        voltages and currents: ``V_a_re``, ``V_a_im``, ..., rms values with the rotor angle as
+        reference, v_a = sqrt(2) Re(V_a exp(j theta_e)); least squares over the step.
     noise, seed : uncertainty and the seed of its random numbers.
     hook : processes the rotor speed between state update and output (Algorithm 2).
     solver, rtol, atol : integrator of the generators and its tolerances: ``"cvodes"``, ``"idas"``,
@@ -249,13 +210,15 @@ def simulate_joint(
 
     start_load = _balanced_part(load)
     point = apu.steady_state(start_load, ambient=ambient, health=factors)
-    machine = _Machine(apu, point.generator, start_load, way, dt, waveform_dt, solver, rtol, atol)
+    machine = MachineStep(
+        apu, point.generator, start_load, way, dt, waveform_dt, solver, rtol, atol, phasors
+    )  # fmt: skip
     gg, theta = apu.gas_generator, point.gas.theta
     x, u = point.gas.x, point.gas.u.copy()
     y, z = gg.output(x, u, theta, z0=point.gas.z)
     Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
     hot = gg.stepper if solver == "propagator" else None
-    book = _Book(gg, grid, machine.samples(grid))
+    book = _Book(gg, grid, machine.samples(grid), len(machine.quad))
     book.put(0, y, machine.means_at_rest(point.generator), factors, None)
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
@@ -269,7 +232,7 @@ def simulate_joint(
     while k < grid.size - 1:
         k += 1
         t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
-        while pending and pending[0].t <= t0 + _GRID_TOL:
+        while pending and pending[0].t <= t0 + GRID_TOL:
             event, slope = pending.pop(0), None
             if isinstance(event, HealthChange):
                 factors.update(event.factors)
@@ -279,11 +242,11 @@ def simulate_joint(
             elif isinstance(event, FaultChange):
                 machine.switch(machine.load, event.fault)
         until = pending[0].t if pending else duration
-        if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + _GRID_TOL:
+        if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + GRID_TOL:
             done = machine.block(x, z, Wf_I, u, theta, grid[k - 1 : k + BLOCK])
             if done is not None:
                 x, z, Wf_I = done.N, done.z, done.Wf_I
-                book.put_block(k, done, factors)
+                book.put_block(k, done, factors, machine.fault)
                 book.wave(machine.block_times(grid[k - 1 : k + BLOCK]), done.waves)
                 k += BLOCK - 1
                 slope = None if way != EXCHANGES["paper"] else 0.0
@@ -330,204 +293,14 @@ def simulate_joint(
     return _collect(apu, book, noise, rng, attrs, status)
 
 
-class _Machine:
-    """The generators between two exchange instants: state, load, fault and integrator.
-
-    ``solver="propagator"`` uses the exact propagation of :mod:`apu_casadi.propagation` where it
-    holds: linear load, speed held, no step shortened by an event, and not in the step after a
-    switch, in which the windings settle within microseconds.  CVODES does the others.
-    """
-
-    def __init__(
-        self,
-        apu: Apu,
-        point: GeneratorPoint,
-        load: Load,
-        way: Exchange,
-        dt: float,
-        waveform_dt: float | None,
-        solver: str,
-        rtol: float,
-        atol: float,
-    ) -> None:
-        self.apu, self.gen, self.way = apu, apu.generator, way
-        self.V_ref, self.w_r = point.V_ref, apu.w_r(apu.N_ref)
-        self.ss, self.x = point.ss, np.asarray(point.x, float)
-        self.u, self.theta = np.array(point.u, float), np.zeros(0)
-        self.load: Load = load
-        self.fault: Ttsc | None = None
-        self.dt, self.waveform_dt = dt, waveform_dt
-        self.solver, self.rtol, self.atol = solver, rtol, atol
-        self.nsteps = self.propagated = 0
-        self._fast: dict[bool, Propagator | None] = {}
-        self._kept = slice(None)
-        self._block: JointBlock | None = None
-        self._settled = self.may_propagate
-        self._noisy = False
-        self._index()
-
-    @property
-    def may_propagate(self) -> bool:
-        return self.solver == "propagator" and self.way == EXCHANGES["paper"]
-
-    def _index(self) -> None:
-        self._angle = self.ss.x.index("theta_e")
-        self._w = self.ss.u.index("w_r")
-        self._rows = self.ss.y.indices(WAVEFORMS)
-
-    def n_out(self, h: float) -> int:
-        """Samples stored in a step of length h."""
-        return 1 if self.waveform_dt is None else max(1, round(h / self.waveform_dt))
-
-    def samples(self, grid: np.ndarray) -> int:
-        """Waveform samples of a whole run, the start included; 0 where none are stored."""
-        if self.waveform_dt is None:
-            return 0
-        return 1 + sum(self.n_out(float(h)) for h in np.diff(grid))
-
-    @staticmethod
-    def means_at_rest(point: GeneratorPoint) -> np.ndarray:
-        """What a step's means would be in the steady state of a balanced load."""
-        y = point.y
-        I2 = sum(y[f"i_{p}"] ** 2 for p in "abc") / 3
-        return np.array([*(y[n] for n in MEANS), *[y["V_t"] ** 2] * 3, *[I2] * 3])
-
-    def switch(self, load: Load, fault: Ttsc | None) -> None:
-        """Change load or fault at this instant; the flux linkages stay."""
-        target = self.gen.variant(load, fault)
-        u_new = self.gen.inputs(load, w_r=self.w_r, V_ref=self.V_ref)
-        self.x = self.gen.transfer(
-            self.x, self.ss, target, u=self.u, theta=self.theta, u_target=u_new
-        )
-        self.ss, self.u, self.theta = target, u_new, self.gen.fault_vector(load, fault)
-        self.load, self.fault = load, fault
-        self._fast, self._block = {}, None
-        self._settled = False
-        self._index()
-
-    def disturb(self, w1: np.ndarray, w2: np.ndarray) -> None:
-        """Set the process noise of (5) and (6), V, for the next step."""
-        names = ("w1_q", "w1_d", "w1_0", "w2_fd", "w2_kd", "w2_kq")
-        self.u[self.ss.u.indices(names)] = np.concatenate([w1, w2])
-        self._noisy = True
-
-    def step(
-        self, N: float, slope: float, h: float, t0: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Advance over [t0, t0 + h]: end state, means, sample times and waveforms.
-
-        The own state is left as it was: the caller may repeat the step.
-        """
-        self.w_r = self.apu.w_r(N)
-        self.u[self._w] = self.w_r
-        full = abs(h - self.dt) < _GRID_TOL
-        if self.may_propagate and full and self._settled and not self._noisy:
-            done = self._propagate(t0)
-            if done is not None:
-                return done
-        self._settled = full
-        model = ramped(self.ss) if self.way.ramp else self.ss
-        run = stepper(
-            model,
-            self.n_out(h),
-            quad=(*MEANS, *RMS.values()),
-            solver="cvodes" if self.solver == "propagator" else self.solver,
-            rtol=self.rtol,
-            atol=self.atol,
-        )
-        if self.way.ramp:
-            u = self.u.copy()
-            u[self._w] = self.apu.w_r(slope)
-            r = run(np.append(self.x, self.w_r), u, self.theta, h, t0=t0)
-        else:
-            r = run(self.x, self.u, self.theta, h, t0=t0)
-        self.nsteps += int(r.stats.get("nsteps", 0))
-        means = np.array([r.mean[k] for k in (*MEANS, *RMS.values())])
-        return self._wrapped(r.x_end[: len(self.ss.x)]), means, r.t, r.y[self._rows]
-
-    def block(
-        self,
-        x: np.ndarray,
-        z: np.ndarray,
-        Wf_I: float,
-        u: np.ndarray,
-        theta: np.ndarray,
-        grid: np.ndarray,
-    ) -> BlockResult | None:
-        """Advance the whole unit over several exchange steps at once; None where that is not on."""
-        ready = self.may_propagate and self._settled and not self._noisy
-        if not ready or grid.size != BLOCK + 1 or np.abs(np.diff(grid) - self.dt).max() > _GRID_TOL:
-            return None
-        fast = self._propagator()
-        if fast is None or not fast.constant:
-            return None
-        if self._block is None:
-            self._block = JointBlock(self.apu, fast)
-        done = self._block(x, z, Wf_I, self.x, u, theta, self.u)
-        if done is not None:
-            self.x = done.x_sg
-            self.propagated += BLOCK
-            done = done._replace(waves=done.waves[:, self._kept])
-        return done
-
-    def block_times(self, grid: np.ndarray) -> np.ndarray:
-        """Instants of the samples of a block."""
-        fast = self._propagator()
-        if self.waveform_dt is None or fast is None:
-            return np.empty(0)
-        return np.concatenate([fast.times(float(t))[self._kept] for t in grid[:-1]])
-
-    def _propagator(self, fine: bool = False) -> Propagator | None:
-        """Return the propagator of this load and fault, or None where there is none."""
-        if fine not in self._fast:
-            # coarse waveforms are every k-th of samples fine enough for 1e-5 of peak
-            least = SUMMARY_SAMPLES[self.fault is None]
-            if self.waveform_dt is not None:
-                least = max(least, round(self.dt / FINE_SAMPLE))
-            every = 1 if self.waveform_dt is None else -(-least // self.n_out(self.dt))
-            n = least if self.waveform_dt is None else every * self.n_out(self.dt)
-            outputs = () if self.waveform_dt is None else WAVEFORMS
-            self._kept = slice(every - 1, None, every)
-            try:
-                self._fast[fine] = Propagator(
-                    self.gen, self.ss, self.u, self.theta, n_out=n, dt=self.dt, outputs=outputs,
-                    quad=(*MEANS, *RMS.values()), fine=fine,
-                )  # fmt: skip
-            except SimulationError as error:
-                _LOG.info("exact propagation not used, CVODES instead: %s", error)
-                self._fast[fine] = None
-        return self._fast[fine]
-
-    def _propagate(self, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-        """Advance by exact propagation; None where it does not hold."""
-        for fine in (False, True):
-            fast = self._propagator(fine)
-            if fast is None or not fast.valid(self.w_r):
-                return None
-            try:
-                x, w, means = fast(self.x, self.u, t0=t0)
-            except SimulationError as error:
-                _LOG.debug("exact propagation refused a step: %s", error)
-                continue
-            self.propagated += 1
-            return self._wrapped(x), means, fast.times(t0)[self._kept], w[:, self._kept]
-        return None
-
-    def _wrapped(self, x: np.ndarray) -> np.ndarray:
-        """Keep the rotor angle small, so that its cosine stays accurate over hours."""
-        x = x.copy()
-        x[self._angle] = math.remainder(x[self._angle], 2 * math.pi)
-        return x
-
-
 class _Book:
     """What a run keeps: outputs per exchange, means, health, severity, waveforms."""
 
-    def __init__(self, gg: GasGenerator, grid: np.ndarray, samples: int) -> None:
+    def __init__(self, gg: GasGenerator, grid: np.ndarray, samples: int, means: int) -> None:
         self.gg, self.grid = gg, grid
         K = grid.size
         self.Y = np.empty((len(gg.Y), K))
-        self.means = np.empty((len(MEANS) + len(RMS), K))
+        self.means = np.empty((means, K))
         self.factors = np.empty((len(gg.THETA), K))
         self.severity = np.empty((3, K))
         self.t_w = np.empty(samples)
@@ -546,15 +319,17 @@ class _Book:
         self.Y[:, k] = y
         self.means[:, k] = means
         self.factors[:, k] = tuple(factors.values())
-        self.severity[:, k] = _HEALTHY if fault is None else (fault.mu, fault.k_rf, fault.kappa)
+        self.severity[:, k] = _severity(fault)
 
-    def put_block(self, k: int, done: BlockResult, factors: Mapping[str, float]) -> None:
-        """Enter a block of healthy exchange instants, the first of which is k."""
+    def put_block(
+        self, k: int, done: BlockResult, factors: Mapping[str, float], fault: Ttsc | None
+    ) -> None:
+        """Enter a block of exchange instants, the first of which is k."""
         at = slice(k, k + BLOCK)
         self.Y[:, at] = done.y
         self.means[:, at] = done.means
         self.factors[:, at] = np.array(tuple(factors.values()))[:, None]
-        self.severity[:, at] = np.array(_HEALTHY)[:, None]
+        self.severity[:, at] = np.array(_severity(fault))[:, None]
 
     def wave(self, t: np.ndarray, w: np.ndarray) -> None:
         """Append waveform samples, where any are kept."""
@@ -565,11 +340,31 @@ class _Book:
             self._n += n
 
     def slow(self) -> dict[str, np.ndarray]:
-        """Means, rms values, health and severity by name."""
+        """Means, rms values, phasors, health and severity by name."""
         d = dict(zip(MEANS, self.means, strict=False))
-        d |= dict(zip(RMS, np.sqrt(self.means[len(MEANS) :]), strict=True))
+        n = len(MEANS) + len(RMS)
+        d |= dict(zip(RMS, np.sqrt(self.means[len(MEANS) : n]), strict=True))
+        if self.means.shape[0] > n:
+            d |= phasors_of(self.means[n:])
         d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
         return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
+
+
+def _severity(fault: Ttsc | None) -> tuple[float, float, float]:
+    if fault is None:
+        return _HEALTHY
+    return fault.mu, fault.k_rf, math.nan if fault.kappa is None else fault.kappa
+
+
+def _phasor_signals() -> list[Signal]:
+    kinds = {"V": ("V", "voltage"), "I": ("A", "current")}
+    parts = {"re": "along the rotor angle's cosine", "im": "ahead of it by a quarter turn"}
+    return [
+        Signal(f"{name}_{part}", unit, f"phase {name[2]} {what}, fundamental, rms, {where}")
+        for name in PHASORS
+        for unit, what in (kinds[name[0]],)
+        for part, where in parts.items()
+    ]
 
 
 def _balanced_part(load: Load) -> Load:
@@ -596,7 +391,7 @@ def _collect(
     measured = {
         f"{n}_meas": gas[n] + s * rng.standard_normal(grid.size) for n, s in noise.gas.items()
     }
-    signals = list(gg.Y)
+    signals = [*gg.Y, *_phasor_signals()]
     signals += [
         dataclasses.replace(gg.Y[n], name=f"{n}_meas", doc=f"measured: {gg.Y[n].doc}")
         for n in noise.gas

@@ -8,7 +8,7 @@ in the qd0 frame: constant coefficients for a healthy machine with a balanced lo
 ones otherwise.  Only the exciter is not linear, and it is slow.  So the windings need no small
 steps: their transition matrix over a sample h,
 
-    x(t + h) = P(theta(t)) [x; E; E'; E''; 1],        E(t + s) = E + s E' + s^2/2 E'',
+    x(t + h) = P(theta(t)) [x; E; E'; E''; E'''; 1],     E(t + s) = E + s E' + ... + s^3/6 E''',
 
 is computed once for a load, a fault and h.  P is an analytic function of the rotor angle: its
 Fourier series is cut where it has converged to ``TAIL``, and interpolated in speed.  The exciter
@@ -41,14 +41,15 @@ from apu_casadi.statespace import StateSpace
 
 SETTLING = 1e-3  # s, in which the windings follow a step of speed
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
-MAGNUS_TOL = 1e-8  # largest change of P, relative, when the steps it is made of are halved
-HARMONICS = (24, 48)  # harmonics resolved, in turn; a series that still goes on is refused
+STAGES = 8  # of the Radau method that P is made by; even where stiff its error falls as steps^-8
+STEP_TOL = 5e-7  # largest change of P, nominal units, when its steps are halved; then used: 2e-9
+HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goes on is refused
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; a
 #: quarter acts on average.  Where coefficients are constant a larger one tells of a limit met.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 1e-5, "fine": 2e-5}
+EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
 _NODES = 4  # Chebyshev nodes in speed
-_GAUSS = math.sqrt(3.0) / 6.0
 
 
 def linear_states(ss: StateSpace) -> list[str]:
@@ -80,7 +81,7 @@ def _split(ss: StateSpace) -> _Split:
 
 @lru_cache(maxsize=64)
 def _coefficients(ss: StateSpace) -> ca.Function:
-    """Function (theta_e, u, theta) -> augmented matrix M of d/dt [x; E; E'; E''; 1].
+    """Function (theta_e, u, theta) -> augmented matrix M of d/dt [x; E; E'; E''; E'''; 1].
 
     Checks that the model is linear in x and E where it is taken to be.
     """
@@ -93,48 +94,59 @@ def _coefficients(ss: StateSpace) -> ca.Function:
         raise SimulationError(f"{ss.name} is not linear in its windings: use another integrator")
     n = len(s.linear)
     rest = ca.substitute(rate, own, ca.SX.zeros(n + 1))
-    M = ca.SX.zeros(n + 4, n + 4)
+    M = ca.SX.zeros(n + EXTRA, n + EXTRA)
     M[:n, : n + 1] = J
-    M[:n, n + 3] = rest
-    M[n, n + 1] = 1
-    M[n + 1, n + 2] = 1
+    M[:n, -1] = rest
+    for k in range(n, n + EXTRA - 2):
+        M[k, k + 1] = 1
     return ca.Function("M", [x[s.angle], u, th], [ca.densify(M)], {"cse": True})
 
 
-def _expm(M: np.ndarray) -> np.ndarray:
-    """Exponentials of a stack of matrices (k, n, n): Taylor series with scaling and squaring."""
-    norm = np.abs(M).sum(axis=-1).max() if M.size else 0.0
-    squarings = max(0, math.ceil(math.log2(max(norm, 1e-300) / 0.25)))
-    A = M / 2.0**squarings
-    n = M.shape[-1]
-    E = np.broadcast_to(np.eye(n), M.shape) + A
-    term = A
-    for k in range(2, 10):  # 0.25^10/10! = 3e-13
-        term = term @ A / k
-        E = E + term
-    for _ in range(squarings):
-        E = E @ E
-    return E
+def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes in (0, 1], the last one 1, and Butcher matrix of a Radau IIA method."""
+    c = np.array(ca.collocation_points(stages, "radau"))
+    k = np.arange(stages)
+    return c, (c[:, None] ** (k + 1) / (k + 1)) @ np.linalg.inv(c[:, None] ** k)
 
 
 def _transition(
-    M_of: Any, theta0: np.ndarray, w: np.ndarray, h: float, steps: int, leaps: int = 1
+    M_of: Any, theta0: np.ndarray, w: np.ndarray, h: np.ndarray, steps: int, leaps: int = 1
 ) -> list[np.ndarray]:
-    """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Magnus steps.
+    """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Radau collocation.
 
-    Order 4, ``steps`` of them in h (Blanes, Casas, Oteo, Ros, Physics Reports 470, 2009: two Gauss
-    points and one commutator).
+    All three arrays have the shape (angles,).  There are ``steps`` of the method in h, of order 15
+    (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch that settles
+    within nanoseconds, or an open generator, needs no smaller steps.
+
+    Returns
+    -------
+    One array for each leap, shape (angles, n, n + EXTRA): the rows of the windings.
     """
-    hs = h / steps
-    P, out = None, []
+    c, a = _radau(STAGES)
+    hs, out = h / steps, []
+    X = np.empty(0)
     for k in range(leaps * steps):
-        M1 = M_of(theta0 + w * hs * (k + 0.5 - _GAUSS), w)
-        M2 = M_of(theta0 + w * hs * (k + 0.5 + _GAUSS), w)
-        Omega = hs / 2 * (M1 + M2) + math.sqrt(3.0) / 12 * hs * hs * (M2 @ M1 - M1 @ M2)
-        E = _expm(Omega)
-        P = E if P is None else E @ P
+        t = hs[:, None] * (k + c)
+        angles = theta0[:, None] + w[:, None] * t
+        M = M_of(angles.ravel(), np.repeat(w, STAGES))
+        n = M.shape[1] - EXTRA
+        M = M.reshape(theta0.size, STAGES, n + EXTRA, n + EXTRA)[:, :, :n]
+        drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
+        drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
+        drive[..., -1, -1] = 1.0
+        if k == 0:
+            X = np.broadcast_to(np.eye(n, n + EXTRA), (theta0.size, n, n + EXTRA))
+        by_h = hs[:, None, None]
+        G = -a[None, :, None, :, None] * M[:, None, :, :, :n].transpose(0, 1, 3, 2, 4)
+        G = G.reshape(theta0.size, STAGES, n, STAGES, n).reshape(theta0.size, STAGES * n, -1)
+        G = by_h * G + np.eye(STAGES * n)
+        rhs = np.repeat(X[:, None], STAGES, axis=1)
+        forced = M[..., n:] @ drive
+        forced = by_h * (a @ forced.reshape(theta0.size, STAGES, -1))
+        rhs[..., n:] += forced.reshape(*t.shape, n, EXTRA)
+        X = np.linalg.solve(G, rhs.reshape(theta0.size, STAGES * n, n + EXTRA))[:, -n:]
         if (k + 1) % steps == 0:
-            out.append(P)
+            out.append(X)
     return out
 
 
@@ -144,6 +156,75 @@ def _coefficients_at(ss: StateSpace, count: int) -> Caller:
     return Caller(compiled(_coefficients(ss).map(count), build=False))
 
 
+class Parity(NamedTuple):
+    """Which entries of a transition matrix repeat after half a turn, and which change their sign.
+
+    Half a turn reverses all phases.  The windings in the rotor's frame do not see that; the zero
+    sequence and the fault current, which belong to phases, change their sign.  So entries between
+    the two kinds have odd harmonics of the rotor angle only, all others even ones.
+
+    Parameters
+    ----------
+    sign : 1 or -1 for each linear state, E and its derivatives, 1; shape (n + EXTRA,).
+    even, odd : positions of the entries, column by column, one leap after the other.
+    """
+
+    sign: np.ndarray
+    even: np.ndarray
+    odd: np.ndarray
+
+
+def parity(ss: StateSpace, leaps: int) -> Parity:
+    """Return the parity of the entries of ``leaps`` transition matrices (:class:`Strides`)."""
+    names = linear_states(ss)
+    sign = np.array([-1.0 if k in ("lam_s0", "i_fault") else 1.0 for k in names] + [1.0] * EXTRA)
+    one = np.outer(sign, sign[: len(names)]).ravel()  # column by column
+    entries = np.tile(one, leaps)
+    return Parity(sign, np.flatnonzero(entries > 0), np.flatnonzero(entries < 0))
+
+
+_PROBE = np.array([0.1, 0.9, 2.3])  # rotor angles, rad, without any symmetry
+
+
+def _scale(ss: StateSpace) -> np.ndarray:
+    """Factors that make coefficients of all states comparable, shape (n + EXTRA, n + EXTRA)."""
+    nominal = np.append(ss.x.nominals[_split(ss).linear], np.ones(EXTRA))
+    return np.asarray(nominal / nominal[:, None])
+
+
+def _scaled(ss: StateSpace, u: np.ndarray, theta: np.ndarray) -> Any:
+    """Function (angles, speeds) -> matrices M of :func:`_coefficients` in nominal units."""
+    n, iw, scale = len(linear_states(ss)), ss.u.index("w_r"), _scale(ss)
+
+    def M_of(angle: np.ndarray, w: np.ndarray) -> np.ndarray:
+        U = np.repeat(u[:, None], angle.size, axis=1)
+        U[iw] = w
+        TH = np.repeat(theta.reshape(-1, 1), angle.size, axis=1)
+        out = _coefficients_at(ss, angle.size)(angle.reshape(1, -1), U, TH)[0]
+        return np.asarray(out.reshape(-1, angle.size, n + EXTRA).transpose(1, 0, 2)) * scale
+
+    return M_of
+
+
+def symmetry(ss: StateSpace, u: np.ndarray, theta: np.ndarray, w_rated: float) -> bool:
+    """Return whether the coefficients are constant; check that half a turn reverses the phases.
+
+    Raises
+    ------
+    SimulationError : it does not, and :class:`Parity` would not hold.
+    """
+    M = _scaled(ss, u, theta)(np.append(_PROBE, _PROBE + np.pi), np.full(6, w_rated))
+    sign = parity(ss, 1).sign
+    turned = M[3:] * np.outer(sign, sign) - M[:3]
+    largest = np.abs(M).max()
+    if np.abs(turned).max() > 1e-9 * largest:
+        raise SimulationError(
+            f"{ss.name}: half a turn does not reverse the phases; process noise in the zero "
+            "sequence? Use another integrator"
+        )
+    return bool(np.abs(M - M[0]).max() <= 1e-12 * largest)
+
+
 @dataclass(frozen=True)
 class Table:
     """Transition matrices of one load, fault and sample, as Fourier series in the rotor angle.
@@ -151,118 +232,155 @@ class Table:
     Parameters
     ----------
     centre, half : middle and half width of the speed range, rad/s.
-    series : coefficients of 1, cos k theta, sin k theta, each a polynomial in the relative speed
-        (w - centre)/half, shape (powers, m n (n + 4) (1 + 2 H)), with m leaps (:class:`Strides`).
-    harmonics : H.
-    error : largest relative change when the Magnus steps were halved.
+    even, odd : coefficients, for entries of either :class:`Parity`, of cos k theta and sin k theta
+        in turn, k = 0, 2, 4, ... and 1, 3, 5, ...; each a polynomial in the relative speed
+        (w - centre)/half.  Shape (powers, terms, entries).
+    harmonics : number of the highest one; 0 where the angle does not matter, and ``odd`` is empty.
+    error : largest change, in nominal units, when the steps were halved that it is made by.
     """
 
     centre: float
     half: float
-    series: np.ndarray
+    even: np.ndarray
+    odd: np.ndarray
     harmonics: int
     error: float
 
-    def at(self, w: float) -> np.ndarray:
-        """Series at speed w, rad/s, shape (m n (n + 4), 1 + 2 H)."""
+    def at(self, w: float) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients at speed w, rad/s: even and odd, shape (terms, entries)."""
         s = (w - self.centre) / self.half
         powers = np.array([1.0, s, s * s, s * s * s])
-        return np.asarray((powers @ self.series).reshape(-1, 1 + 2 * self.harmonics))
+        return np.tensordot(powers, self.even, 1), np.tensordot(powers, self.odd, 1)
 
 
 def transition_table(
     ss: StateSpace,
     u: np.ndarray,
     theta: np.ndarray,
-    h: float,
     w_rated: float,
-    n_out: int,
-    fine: bool = False,
+    *,
+    h: float | None = None,
+    angle: float | None = None,
+    leaps: int = 1,
 ) -> Table:
     """Compute the transition matrices for all rotor angles and nearby speeds.
 
-    Over h, 2 h, ... up to the exciter's step, one below the other (:class:`Strides`).
+    Parameters
+    ----------
+    ss, u, theta : model, inputs and fault parameters; ``w_r`` among the inputs does not matter.
+    w_rated : speed in the middle of the table, rad/s.
+    h, angle : length of a leap, in s or, at any speed, in rad of the rotor's turn.
+    leaps : the matrices are those over one leap, two leaps, and so on, one below the other.
 
     Raises
     ------
-    SimulationError : the Fourier series or the Magnus steps do not converge (a load so light
-        that the windings settle within a small part of h while the coefficients turn).
+    SimulationError : the Fourier series or the steps do not converge, or a noise in the zero
+        sequence does not change its sign with the phases.
     """
     n = len(linear_states(ss))
-    iw = ss.u.index("w_r")
     centre, half = w_rated, SPEED_RANGE * w_rated
     k = np.arange(_NODES)
     nodes = centre + half * np.cos(np.pi * (2 * k + 1) / (2 * _NODES))
     to_powers = np.linalg.inv(np.vander((nodes - centre) / half, _NODES, increasing=True))
+    M_of = _scaled(ss, u, theta)
+    constant, kinds = symmetry(ss, u, theta, w_rated), parity(ss, leaps)
 
-    def M_of(angle: np.ndarray, w: np.ndarray) -> np.ndarray:
-        U = np.repeat(u[:, None], angle.size, axis=1)
-        U[iw] = w
-        TH = np.repeat(theta.reshape(-1, 1), angle.size, axis=1)
-        out = _coefficients_at(ss, angle.size)(angle.reshape(1, -1), U, TH)[0]
-        return np.asarray(out.reshape(n + 4, angle.size, n + 4).transpose(1, 0, 2))
+    def length(w: np.ndarray) -> np.ndarray:
+        return angle / w if angle is not None else np.full(w.shape, h)
 
-    probe = np.array([0.1, 0.9, 2.3])
-    Mp = M_of(probe, np.full(3, centre))
-    constant = np.abs(Mp - Mp[0]).max() <= 1e-12 * np.abs(Mp[0]).max()
-    m = strides(n_out, h, bool(constant), fine).m
-    # the number of Magnus steps is doubled until a few angles agree, then used for all
-    steps, error = 1, 0.0
-    if not constant:
-        pw = np.full(3, nodes[0])
-        last = _transition(M_of, probe, pw, h, steps)[0]
-        while True:
-            new = _transition(M_of, probe, pw, h, 2 * steps)[0]
-            error = float(np.abs(new - last).max() / np.abs(new[:, :n, :n]).max()) / 15
-            steps *= 2
-            if error <= MAGNUS_TOL:
-                break
-            if steps >= 256:
-                raise SimulationError(
-                    f"{ss.name}: transition matrices over {h:.3g} s do not converge "
-                    f"(error {error:.1e} with {steps} steps)"
-                )
-            last = new
+    # the number of steps is doubled until the probes agree, then used for all angles
+    steps, error = 1, math.inf
+    probe = _PROBE[:1] if constant else _PROBE
+    slowest = np.full(probe.size, nodes.min())
+    last = _transition(M_of, probe, slowest, length(slowest), steps)[0]
+    while error > STEP_TOL:
+        if steps >= 64:
+            raise SimulationError(
+                f"{ss.name}: transition matrices over {length(slowest)[0]:.3g} s do not converge "
+                f"(error {error:.1e} with {steps} steps)"
+            )
+        new = _transition(M_of, probe, slowest, length(slowest), 2 * steps)[0]
+        error = float(np.abs(new - last).max())
+        steps, last = 2 * steps, new
 
     def sampled(angles: np.ndarray) -> np.ndarray:
-        """Entries for every node and angle: column-major, one leap after the other."""
+        """Entries in nominal units, column by column, leap after leap: (nodes, angles, entries)."""
         a, w = np.tile(angles, _NODES), np.repeat(nodes, angles.size)
-        leaps = _transition(M_of, a, w, h, steps, m)
-        entries = [L[:, :n, :].transpose(0, 2, 1).reshape(a.size, -1) for L in leaps]
-        P = np.concatenate(entries, axis=1)
-        return P.reshape(_NODES, angles.size, -1)
+        P = np.stack(_transition(M_of, a, w, length(w), steps, leaps), axis=1)
+        return P.transpose(0, 1, 3, 2).reshape(_NODES, angles.size, -1)
+
+    units = np.tile((1 / _scale(ss)[:n]).T.ravel(), leaps)
+
+    def powers(series: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Polynomials in speed from values at the nodes, shape (nodes, terms, entries); in SI."""
+        return np.tensordot(to_powers, series, 1) * units[which]
 
     if constant:
-        return Table(centre, half, to_powers @ sampled(np.zeros(1))[:, 0, :], 0, error)
+        P = sampled(np.zeros(1))
+        none = np.zeros((_NODES, 0, kinds.odd.size))
+        return Table(centre, half, powers(P[:, :, kinds.even], kinds.even), none, 0, error)
+    turn = np.ones(kinds.even.size + kinds.odd.size)
+    turn[kinds.odd] = -1.0
     for resolved in HARMONICS:
-        P = sampled(np.pi * np.arange(2 * resolved) / resolved)
-        F = np.fft.rfft(P, axis=1) / (2 * resolved)
+        P = sampled(np.pi * np.arange(resolved) / resolved)
+        F = np.fft.rfft(np.concatenate([P, P * turn], axis=1), axis=1) / (2 * resolved)
         size = np.abs(F).max(axis=(0, 2))
-        highest = int(np.nonzero(size > TAIL * size[0])[0][-1])
+        highest = int(np.nonzero(size > TAIL * size.max())[0][-1])
         if highest < resolved - 1:
             break
     else:
         raise SimulationError(
-            f"{ss.name}: the transition matrix over {h:.3g} s has over {highest} harmonics of the "
-            f"rotor angle above {TAIL:g}: the load is too light for this step"
+            f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s has over {highest} "
+            f"harmonics of the rotor angle above {TAIL:g}: the load is too light for this step"
         )
-    H = highest
-    series = np.empty((_NODES, P.shape[2], 1 + 2 * H))
-    series[:, :, 0] = F[:, 0].real
-    series[:, :, 1::2] = 2 * F[:, 1 : H + 1].real.transpose(0, 2, 1)
-    series[:, :, 2::2] = -2 * F[:, 1 : H + 1].imag.transpose(0, 2, 1)
-    return Table(centre, half, to_powers @ series.reshape(_NODES, -1), H, error)
+
+    def series(first: int, which: np.ndarray) -> np.ndarray:
+        part = F[:, first : highest + 1 : 2, which]
+        pairs = np.stack([2 * part.real, -2 * part.imag], axis=2)
+        if first == 0:
+            pairs[:, 0] /= 2
+        return powers(pairs.reshape(_NODES, -1, which.size), which)
+
+    even, odd = series(0, kinds.even), series(1, kinds.odd)
+    return Table(centre, half, even, odd, highest, error)
+
+
+def through(first: int, count: int) -> np.ndarray:
+    """Polynomials that are one at one of ``count`` integers from ``first``, zero at the others.
+
+    Row i has the coefficients of 1, x, x^2, ... of the i-th; shape (count, count).
+    """
+    x = np.arange(first, first + count, dtype=float)
+    return np.asarray(np.linalg.inv(np.vander(x, increasing=True)).T)
+
+
+def end_weights(count: int) -> np.ndarray:
+    """Weights of the first samples in an integral that goes on evenly; one afterwards.
+
+    Each interval is integrated by the polynomial through the ``count`` samples around it, the
+    first few by that through the first ``count`` samples.
+    """
+    k, near = np.arange(count), count // 2
+    polynomials = through(1 - near, count)
+    middle = polynomials @ (1 / (k + 1))
+    weights = -polynomials @ ((1.0 - near) ** (k + 1) / (k + 1))
+    for i in range(count):
+        weights[i:] += middle[: count - i]
+    return np.asarray(weights)
 
 
 def gregory(n: int) -> np.ndarray:
     """Weights, shape (n + 1,), of a mean over n equal intervals: trapezoids, ends corrected.
 
-    Gregory's formula of order six.  For what ripples periodically the trapezoidal rule inside is
-    spectrally accurate, which Simpson's is not.
+    The ends are of order ten, or six where there are fewer than 19 intervals.  For what ripples
+    periodically the trapezoidal rule inside is spectrally accurate, which Simpson's is not.
     """
     w = np.ones(n + 1)
-    ends = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
-    w[:5], w[-5:] = ends, ends[::-1]
+    if n >= 19:
+        ends = end_weights(10)
+    else:
+        ends = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
+    w[: ends.size], w[-ends.size :] = ends, ends[::-1]
     return w / n
 
 
@@ -296,20 +414,49 @@ def strides(n_out: int, h: float, constant: bool, fine: bool) -> Strides:
 
 
 @lru_cache(maxsize=64)
-def _leap(
-    gen: Generator, ss: StateSpace, m: int, constant: bool
+def exciter_step(gen: Generator, ss: StateSpace) -> tuple[ca.Function, ca.Function]:
+    """The exciter's drive and its step, of the states that are neither windings nor angle.
+
+    First: (slow, V_t, V_ref) -> (E, E', E'', E''').  Second, by the classical Runge-Kutta method:
+    (slow, V_t at start, middle and end, V_ref, length in s) -> slow at the end.
+    """
+    p, e = gen.machine, gen.exciter
+    names = [ss.x.names[i] for i in _split(ss).slow]
+    slow, V = ca.SX.sym("slow", len(names)), ca.SX.sym("V", 3)
+    V_ref, H = ca.SX.sym("V_ref"), ca.SX.sym("H")
+
+    def rates(slow: Any, V_t: Any) -> Any:
+        state = ac5a.ExciterState(**dict(zip(names, ca.vertsplit(slow), strict=True)))
+        d = ac5a.exciter_rates(e, state, V_t=V_t / p.V_rated_rms, V_ref=V_ref)
+        return ca.vertcat(*(getattr(d, k) for k in names))
+
+    k1 = rates(slow, V[0])
+    E = names.index("E_fd")
+    derivatives = [slow[E]]
+    for _ in range(EXTRA - 2):
+        derivatives.append(ca.jtimes(derivatives[-1], slow, k1))
+    drive = ca.Function("drive", [slow, V[0], V_ref], [ca.vertcat(*derivatives)])
+    k2 = rates(slow + H / 2 * k1, V[1])
+    k3 = rates(slow + H / 2 * k2, V[1])
+    k4 = rates(slow + H * k3, V[2])
+    end = slow + H / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return drive, ca.Function("exciter", [slow, V, V_ref, H], [end])
+
+
+@lru_cache(maxsize=64)
+def leap(
+    gen: Generator, ss: StateSpace, m: int, constant: bool, chained: bool = False
 ) -> tuple[ca.Function, ca.Function]:
     """One step of the exciter over m samples, and the terminal voltage with its rate.
 
     First: (x, V, P, u, theta, h) -> (x at the m samples, V at the end); V holds the terminal
-    voltage, its rate, and the largest error of the drive so far.  Second: (x, u, theta) -> (V_t,
-    dV_t/dt).
+    voltage, its rate, and the largest error of the drive so far; P the even and then the odd
+    entries of the transition matrices (:class:`Parity`), the even ones only where ``constant``.
+    These are matrices over one sample, two samples and so on, or, ``chained``, from each sample to
+    the next.  Second: (x, u, theta) -> (V_t, dV_t/dt).
     """
     s, n = _split(ss), len(linear_states(ss))
     nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-    p, e = gen.machine, gen.exciter
-    names = [ss.x.names[i] for i in s.slow]
-    i_E = names.index("E_fd")
     x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
     V_t = ss.g(x, u, th)[ss.y.index("V_t")]
     V_dot = ca.jtimes(V_t, x, ss.f(x, u, th))
@@ -317,76 +464,86 @@ def _leap(
         V_t, V_dot = ca.substitute([V_t, V_dot], [x[s.angle]], [ca.SX(0)])
     V_of = ca.Function("V_of", [x, u, th], [V_t, V_dot])
 
-    h, V, P = ca.SX.sym("h"), ca.SX.sym("V", 3), ca.SX.sym("P", m * n * (n + 4))
+    drive, exciter = exciter_step(gen, ss)
+    kinds = parity(ss, m)
+    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
+    P = ca.SX.sym("P", kinds.even.size + (0 if constant else kinds.odd.size))
+    size = n * (n + EXTRA)
+    entries = ca.SX(m * size, 1)  # without harmonics the odd ones are zero
+    entries[kinds.even] = P[: kinds.even.size]
+    if not constant:
+        entries[kinds.odd] = P[kinds.even.size :]
     u_d = ss.u.unpack(u)
-
-    def rates(slow: Any, V_t: Any) -> Any:
-        state = ac5a.ExciterState(**dict(zip(names, ca.vertsplit(slow), strict=True)))
-        d = ac5a.exciter_rates(e, state, V_t=V_t / p.V_rated_rms, V_ref=u_d["V_ref"])
-        return ca.vertcat(*(getattr(d, k) for k in names))
-
     slow = x[s.slow]
-    k1 = rates(slow, V[0])
-    E, E1 = slow[i_E], k1[i_E]
-    E2 = ca.jtimes(E1, slow, k1)
-    start = ca.vertcat(x[s.linear], E, E1, E2, 1)
+    E = ca.vertsplit(drive(slow, V[0], u_d["V_ref"]))
+
+    def E_at(t: Any, derivative: int = 0) -> Any:
+        return sum(e * t**i / math.factorial(i) for i, e in enumerate(E[derivative:]))
+
+    start = ca.vertcat(x[s.linear], *E, 1)
     samples = []
     for j in range(m):
         t = (j + 1) * h
-        block = ca.reshape(P[j * n * (n + 4) : (j + 1) * n * (n + 4)], n, n + 4)
+        block = ca.reshape(entries[j * size : (j + 1) * size], n, n + EXTRA)
         x_j = ca.SX(nx, 1)
         x_j[s.slow] = slow  # only the drive enters outputs between the exciter's steps
         x_j[s.linear], x_j[s.angle] = ca.mtimes(block, start), x[s.angle] + t * u_d["w_r"]
-        x_j[s.drive] = E + t * E1 + t**2 / 2 * E2
+        x_j[s.drive] = E_at(t)
         samples.append(x_j)
+        if chained:
+            start = ca.vertcat(x_j[s.linear], *(E_at(t, i) for i in range(len(E))), 1)
     end, H = samples[-1], m * h
-    # terminal voltage in between: cubic through values and rates at both ends (Hermite); under a
-    # fault it ripples with twice the frequency, which a straight line would cut by 1 %
-    V1, V1_dot = V_of(end, u, th)
-    Vm = (V[0] + V1) / 2 + H / 8 * (V[1] - V1_dot)
-    k2 = rates(slow + H / 2 * k1, Vm)
-    k3 = rates(slow + H / 2 * k2, Vm)
-    k4 = rates(slow + H * k3, V1)
+    # Under a fault the terminal voltage ripples with twice the frequency: a straight line would cut
+    # that by 1 %.  In the middle it is that of a sample, or, where there is none, of the cubic
+    # through values and rates at both ends.
+    if m % 2:
+        V1, V1_dot = V_of(end, u, th)
+        Vm = (V[0] + V1) / 2 + H / 8 * (V[1] - V1_dot)
+    else:
+        V1, V1_dot = V_of(end, u, th)[0], ca.SX.nan()  # the rate is not needed
+        Vm = V_of(samples[m // 2 - 1], u, th)[0]
     E_taken = end[s.drive]
-    end[s.slow] = slow + H / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    end[s.slow] = exciter(slow, ca.vertcat(V[0], Vm, V1), u_d["V_ref"], H)
     miss = ca.fmax(V[2], ca.fabs(end[s.drive] - E_taken))
-    leap = ca.Function(
+    one = ca.Function(
         "leap",
         [x, V, P, u, th, h],
         [ca.horzcat(*samples[:-1], end), ca.vertcat(V1, V1_dot, miss)],
         {"cse": True},
     )
-    return leap, V_of
+    return one, V_of
 
 
-def _fold(leap: ca.Function, m: int, steps: int, n_P: int, constant: bool,
+def _fold(step: ca.Function, steps: int, n_P: Sequence[int], constant: bool,
           sizes: tuple[int, int, int]) -> ca.Function:  # fmt: skip
     """``steps`` steps of the exciter: (start, P) -> (start of the next, x at all samples).
 
-    ``start`` holds x, V and what stays; a few steps are unrolled, which spares copies.
+    ``start`` holds x, V and what stays; ``P`` is one matrix of even entries where ``constant``,
+    else one of even and one of odd ones, with ``n_P`` rows.  A few steps are unrolled, which
+    spares copies.
     """
     nx, nu, nt = sizes
     size = next(k for k in (5, 4, 2, 1) if steps % k == 0)
     x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
     h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
-    P = ca.SX.sym("P", n_P, 1 if constant else size)
+    P = [ca.SX.sym("P", n, 1 if constant else size) for n in n_P]
     xk, Vk, states = x, V, []
     for k in range(size):
-        X, Vk = leap(xk, Vk, P if constant else P[:, k], u, th, h)
-        xk = X[:, m - 1]
+        X, Vk = step(xk, Vk, ca.vertcat(*(p if constant else p[:, k] for p in P)), u, th, h)
+        xk = X[:, -1]
         states.append(X)
-    fixed = [u, th, h, *([P] if constant else [])]
+    fixed = [u, th, h, *(P if constant else [])]
     group = ca.Function(
         "group",
-        [ca.vertcat(x, V, *fixed), *([] if constant else [P])],
+        [ca.vertcat(x, V, *fixed), *([] if constant else P)],
         [ca.vertcat(xk, Vk, *fixed), ca.horzcat(*states)],
         {"cse": True},
     )
     run = group.mapaccum("run", steps // size, 1)
     S = ca.MX.sym("S", nx + 3 + nu + nt + 1)
-    PP = ca.MX.sym("P", n_P, 1 if constant else steps)
-    last, X_all = run(ca.vertcat(S, PP)) if constant else run(S, PP)
-    return ca.Function("fold", [S, PP], [last[: S.numel(), steps // size - 1], X_all])
+    PP = [ca.MX.sym("P", n, 1 if constant else steps) for n in n_P]
+    last, X_all = run(ca.vertcat(S, *PP)) if constant else run(S, *PP)
+    return ca.Function("fold", [S, *PP], [last[: S.numel(), steps // size - 1], X_all])
 
 
 @lru_cache(maxsize=64)
@@ -394,25 +551,29 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs:
              quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
     """n_out samples at once: (x0, P, u, theta, h) -> (x, y, mean, miss).
 
-    ``P`` holds one column of transition matrix entries for the whole step (``constant``) or one
-    for each step of the exciter; means by :func:`gregory`.
+    Where ``constant``, ``P`` is one column of even transition matrix entries for the whole step;
+    else there are P and Q, the even and the odd ones, with one column for each step of the
+    exciter.  Means by :func:`gregory`.
     """
-    n = len(linear_states(ss))
     nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-    n_P = n * (n + 4)
     X0, U, TH, H = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt), ca.MX.sym("h")
-    PP = ca.MX.sym("P", plan.m * n_P, 1 if constant else plan.head + plan.many)
-    single, V_of = _leap(gen, ss, 1, constant)
+    one, all_ = parity(ss, 1), parity(ss, plan.m)
+    kinds = ("even",) if constant else ("even", "odd")
+    rows = {m: [getattr(p, k).size for k in kinds] for m, p in ((1, one), (plan.m, all_))}
+    columns = 1 if constant else plan.head + plan.many
+    PP = [ca.MX.sym(k, n, columns) for k, n in zip("PQ", rows[plan.m], strict=False)]
+    single, V_of = leap(gen, ss, 1, constant)
     S = ca.vertcat(X0, *V_of(X0, U, TH), 0, U, TH, H)
     parts = []
     if plan.head:
-        fold = _fold(single, 1, plan.head, n_P, constant, (nx, nu, nt))
-        S, X = fold(S, PP[:n_P, :] if constant else PP[:n_P, : plan.head])
+        fold = _fold(single, plan.head, rows[1], constant, (nx, nu, nt))
+        first = [p[:n, : (1 if constant else plan.head)] for p, n in zip(PP, rows[1], strict=True)]
+        S, X = fold(S, *first)
         parts.append(X)
     if plan.many:
-        leap, _ = _leap(gen, ss, plan.m, constant)
-        fold = _fold(leap, plan.m, plan.many, plan.m * n_P, constant, (nx, nu, nt))
-        S, X = fold(S, PP if constant else PP[:, plan.head :])
+        long, _ = leap(gen, ss, plan.m, constant)
+        fold = _fold(long, plan.many, rows[plan.m], constant, (nx, nu, nt))
+        S, X = fold(S, *(p if constant else p[:, plan.head :] for p in PP))
         parts.append(X)
     X_all, miss = ca.horzcat(*parts), S[nx + 2]
     # outputs and means
@@ -434,11 +595,28 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs:
     means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
     return ca.Function(
         f"advance_{ss.name}_{n_out}" + ("" if plan.many else "_fine"),
-        [X0, PP, U, TH, H],
+        [X0, *PP, U, TH, H],
         [X_all[:, n_out - 1], Y[:k, :], means, miss],
-        ["x0", "P", "u", "theta", "h"],
+        ["x0", *(p.name() for p in PP), "u", "theta", "h"],
         ["x", "y", "mean", "miss"],
     )
+
+
+@lru_cache(maxsize=64)
+def _at_any_speed(function: ca.Function, at: int, n_out: int, entries: int) -> ca.Function:
+    """A function of :func:`_advance` for constant coefficients that takes the table itself.
+
+    (x0, series with middle and half width of the speed range, u, dt) -> (x, y, mean, miss); the
+    speed is input ``at``.
+    """
+    X0, U = ca.MX.sym("x0", function.numel_in("x0")), ca.MX.sym("u", function.numel_in("u"))
+    series, dt = ca.MX.sym("series", _NODES * entries + 2), ca.MX.sym("dt")
+    w = U[at]
+    s = (w - series[-2]) / series[-1]
+    powers = ca.vertcat(1, s, s**2, s**3)
+    P = ca.mtimes(ca.reshape(series[:-2], entries, _NODES), powers)
+    out = function(X0, P, U, ca.DM(0, 1), dt / n_out)
+    return ca.Function(f"{function.name()}_series", [X0, series, U, dt], list(out))
 
 
 class Propagator:
@@ -483,12 +661,12 @@ class Propagator:
         self.h = dt / n_out
         self.theta = np.array(theta, dtype=float)
         w_rated = gen.machine.w_rated
-        self.table = _cached_table(ss, u, self.theta, self.h, w_rated, n_out, fine)
-        constant = self.table.harmonics == 0
-        self.constant = constant
+        self.constant = constant = symmetry(ss, u, self.theta, w_rated)
         plan = strides(n_out, self.h, constant, fine)
+        self.table = cached_table(ss, u, self.theta, w_rated, h=self.h, leaps=plan.m)
         self.function = _advance(gen, ss, n_out, plan, self.outputs, self.quad, constant)
         self.tol = DRIVE_TOL["fine" if fine else "constant" if constant else "periodic"]
+        self.limits = np.array([self.tol])
         self.layout = (gen, ss, plan, self.outputs, self.quad)  # what ``function`` depends on
         self._compiled: Caller | None = None
         self._t = dt * (np.arange(1, n_out + 1) / n_out)  # rounded as a Stepper does
@@ -496,7 +674,20 @@ class Propagator:
         self._iw = ss.u.index("w_r")
         self._w_ok = (1 - SPEED_RANGE) * w_rated, (1 + SPEED_RANGE) * w_rated
         self._starts = self.h * plan.starts()
-        self._trig = np.ones((1 + 2 * self.table.harmonics, self._starts.size))
+        # powers of exp(j theta), columns as in Table: 0, 2, 4, ... and 1, 3, 5, ...
+        n_even, n_odd = (s.shape[1] // 2 for s in (self.table.even, self.table.odd))
+        self._even = np.ones((self._starts.size, n_even), complex)
+        self._odd = np.ones((self._starts.size, n_odd), complex)
+
+    @property
+    def advance(self) -> ca.Function:
+        """Function (x0, series, u, dt) -> (x, y, mean, miss), for constant coefficients."""
+        return _at_any_speed(self.function, self._iw, self.n_out, self.table.even[0].size)
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """What :attr:`advance` takes as ``series``."""
+        return np.append(self.table.even.ravel(), [self.table.centre, self.table.half])
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the table."""
@@ -523,19 +714,21 @@ class Propagator:
                 f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table's "
                 f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
             )
-        P = self.table.at(w)
-        if not self.constant:
-            phase = float(x0[self._angle]) + w * self._starts
-            c1, s1 = np.cos(phase), np.sin(phase)
-            T = self._trig
-            T[1], T[2] = c1, s1
-            for k in range(2, self.table.harmonics + 1):
-                T[2 * k - 1] = T[2 * k - 3] * c1 - T[2 * k - 2] * s1
-                T[2 * k] = T[2 * k - 2] * c1 + T[2 * k - 3] * s1
-            P = P @ T
+        even, odd = self.table.at(w)
         if self._compiled is None:  # a run in blocks may never need it
             self._compiled = _caller(self.function)
-        x, y, mean, miss = self._compiled(x0, P, u, self.theta, self.h)
+        if self.constant:
+            x, y, mean, miss = self._compiled(x0, even, u, self.theta, self.h)
+        else:
+            z = np.exp(1j * (float(x0[self._angle]) + w * self._starts))
+            E, O = self._even, self._odd
+            E[:, 1] = z * z
+            for k in range(2, E.shape[1]):
+                np.multiply(E[:, k - 1], E[:, 1], out=E[:, k])
+            np.multiply(E[:, : O.shape[1]], z[:, None], out=O)
+            # one row for each step of the exciter is one column of the compiled function's input
+            P, Q = (Z.view(float) @ c for Z, c in ((E, even), (O, odd)))
+            x, y, mean, miss = self._compiled(x0, P.T, Q.T, u, self.theta, self.h)
         if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
             raise SimulationError(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
@@ -568,24 +761,24 @@ def _caller(fun: ca.Function) -> Any:
 _TABLES: OrderedDict[tuple[Any, ...], tuple[StateSpace, Table]] = OrderedDict()
 
 
-def _cached_table(
+def cached_table(
     ss: StateSpace,
     u: np.ndarray,
     theta: np.ndarray,
-    h: float,
     w_rated: float,
-    n_out: int,
-    fine: bool,
+    *,
+    h: float | None = None,
+    angle: float | None = None,
+    leaps: int = 1,
 ) -> Table:
-    """Tables are kept by what they depend on: load, noise, fault, sample; not speed, not V_ref."""
+    """Return a table of :func:`transition_table`, kept by all that it depends on."""
     key_u = np.array(u, dtype=float)
     key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
-    key = (id(ss), key_u.tobytes(), theta.tobytes(), round(h, 15), w_rated, n_out, fine)
+    length = (None if h is None else round(h, 15), angle)
+    key = (id(ss), key_u.tobytes(), theta.tobytes(), *length, w_rated, leaps)
     if key not in _TABLES:
-        _TABLES[key] = (
-            ss,
-            transition_table(ss, np.array(u, float), theta, h, w_rated, n_out, fine),
-        )
+        made = transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps)
+        _TABLES[key] = (ss, made)
         if len(_TABLES) > 256:
             _TABLES.popitem(last=False)
     _TABLES.move_to_end(key)

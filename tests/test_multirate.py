@@ -135,6 +135,32 @@ def test_exact_propagation_gives_the_same_run(run):
         np.testing.assert_allclose(fast[n], tight[n], rtol=1e-6)
 
 
+def test_means_and_phasors_without_waveforms():
+    """Blocks of steps without samples, healthy and faulty, against CVODES: 1e-5, phasors 2e-5.
+
+    Phasors of the balanced steady start: equal, a third of a turn apart, and as large as the rms
+    value; the fault brings a negative sequence.
+    """
+    events = [LoadChange(0.1, KW100), FaultChange(0.5113, Ttsc(0.05, 20.0, phase="b"))]
+    kw = {"duration": 1.0, "load": KW225, "waveform_dt": None, "phasors": True, "events": events}
+    fast = simulate_joint(APU, solver="propagator", **kw)
+    tight = simulate_joint(APU, rtol=1e-10, atol=1e-12, **kw)
+    assert json.loads(fast.attrs["solver"])["steps_propagated"] >= 40
+    for n in ("N", "PW", "T4", "P_loss_fault", "V_a_rms", "V_b_rms", "I_c_rms"):
+        np.testing.assert_allclose(fast[n], tight[n], atol=1e-5 * float(abs(tight[n]).max()))
+    V, I = (np.array([fast[f"{q}_{p}_re"] + 1j * fast[f"{q}_{p}_im"] for p in "abc"]) for q in "VI")
+    exact = np.array([tight[f"V_{p}_re"] + 1j * tight[f"V_{p}_im"] for p in "abc"])
+    np.testing.assert_allclose(V, exact, atol=2e-5 * np.abs(exact).max())
+    a = np.exp(2j * np.pi / 3)
+    np.testing.assert_allclose(V[:, 0], V[0, 0] * np.array([1, a**2, a]), rtol=1e-12)
+    np.testing.assert_allclose(V[:, 0], V[:, 1], rtol=1e-6)
+    np.testing.assert_allclose(abs(V[0, :4]), fast.V_a_rms[:4], rtol=1e-6)
+    np.testing.assert_allclose(V[:, -1] / I[:, -1], KW100.R, rtol=1e-6)
+    negative = np.abs(V[0] + a**2 * V[1] + a * V[2]) / 3
+    assert negative[:5].max() < 1e-3 and negative[-1] > 1.0
+    assert fast.V_a_re.attrs["units"] == "V" and "fundamental" in fast.I_b_im.attrs["long_name"]
+
+
 def test_exact_propagation_leaves_to_cvodes_what_is_not_linear():
     """A constant-power load runs by CVODES although the propagator was asked for."""
     kw = {"duration": 0.1, "load": ConstantPowerLoad(90e3), "waveform_dt": None}

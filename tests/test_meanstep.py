@@ -1,0 +1,136 @@
+"""Exchange steps of which only means are wanted, against CVODES; refusals."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from apu_casadi import meanstep, simulation
+from apu_casadi.errors import SimulationError
+from apu_casadi.generator import Generator
+from apu_casadi.machine.load import ConstantPowerLoad, SeriesLoad
+from apu_casadi.machine.ttsc import Ttsc
+from apu_casadi.machinestep import MEANS, RMS, phasors_of, with_moments
+from apu_casadi.meanstep import MeanStep
+
+GEN = Generator()
+W = GEN.machine.w_rated
+KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)
+LAGGING = SeriesLoad.from_power(100e3, 0.9)
+UNEVEN = SeriesLoad.from_power(100e3, 0.9, unbalance=(1.3, 1.0, 0.7))
+QUAD = (*MEANS, *RMS.values())
+
+
+def settled(gen, load, fault, ss=None):
+    """Variant, inputs, fault parameters and state 100 ms after the switch from 225 kW."""
+    point = gen.steady_state(KW225, theta_e=0.3)
+    plain = gen.variant(load, fault)
+    u, theta = gen.inputs(load, V_ref=point.V_ref, w_r=1.01 * W), gen.fault_vector(load, fault)
+    x = gen.transfer(point.x, point.ss, plain, u=point.u, theta=[], u_target=u)
+    x = simulation.stepper(plain, 1, rtol=1e-11, atol=1e-13)(x, u, theta, 0.1).x_end.copy()
+    return ss or plain, u, theta, x
+
+
+@pytest.mark.parametrize(
+    ("gen", "load", "fault"),
+    [
+        (GEN, KW100, None),
+        (GEN, LAGGING, None),
+        (GEN, UNEVEN, None),
+        (GEN, KW100, Ttsc(0.05, 20.0)),
+        (GEN, KW100, Ttsc(0.05, 20.0, 0.052, phase="b")),
+        (Generator(neutral="isolated"), KW100, Ttsc(0.05, 20.0, 1.0, phase="c")),
+    ],
+)
+def test_means_equal_those_of_cvodes(gen, load, fault):
+    """Three steps, the speed jumping by 2e-4 between them: means to 1e-5, windings to 2e-5 nominal.
+
+    CVODES runs at rtol 1e-11.  What is left is the sampling of the ripple and of what follows the
+    jump within microseconds.
+    """
+    ss, u, theta, x = settled(gen, load, fault)
+    fast = MeanStep(gen, ss, u, theta, dt=0.02, quad=QUAD)
+    exact = simulation.stepper(ss, 1, quad=QUAD, rtol=1e-11, atol=1e-13)
+    ours = x.copy()
+    windings = [i for i, n in enumerate(ss.x.names) if n.startswith("lam") or n == "E_fd"]
+    for k in range(3):
+        u[ss.u.index("w_r")] = (1.01 + 2e-4 * k) * W
+        ours, means = fast(ours, u)
+        theirs = exact(x, u, theta, 0.02)
+        x = theirs.x_end.copy()
+        for name, mean in zip(QUAD, means, strict=True):
+            scale = max(abs(theirs.mean[name]), 1.0)
+            assert abs(mean - theirs.mean[name]) < 1e-5 * scale, name
+        off = (ours - x) / ss.x.nominals
+        assert_allclose(off[windings], 0.0, rtol=0, atol=2e-5)
+        assert ours[ss.x.index("theta_e")] == pytest.approx(x[ss.x.index("theta_e")], rel=1e-12)
+
+
+@pytest.mark.parametrize("fault", [None, Ttsc(0.05, 20.0)], ids=["healthy", "fault"])
+def test_every_speed_of_the_range_and_other_lengths_of_step(fault):
+    """From -3 to +3 % the step ends at all places between samples; 10 and 30 ms as well.
+
+    1e-5, and 1e-3 of the jump in speed: that is some hundred times what a unit's is, and what
+    follows it within 20 us falls between the samples.
+    """
+    ss, u, theta, x = settled(GEN, KW100, fault)
+    quad = tuple(RMS.values())
+    exact = simulation.stepper(ss, 1, quad=quad, rtol=1e-10, atol=1e-12)
+    for dt, share in ((0.02, -0.03), (0.02, -0.0173), (0.02, 0.0111), (0.02, 0.03), (0.01, 0.013),
+                      (0.03, -0.007)):  # fmt: skip
+        u[ss.u.index("w_r")] = (1.01 + share) * W
+        _, means = MeanStep(GEN, ss, u, theta, dt=dt, quad=quad)(x, u)
+        theirs = exact(x, u, theta, dt).mean
+        assert_allclose(means, [theirs[q] for q in quad], rtol=1e-5 + 1e-3 * abs(share))
+
+
+def test_phasors_are_those_of_the_samples():
+    """Least squares on 4000 samples of CVODES, under a fault and off rated speed: 1e-5 of V_a.
+
+    The samples' own quadrature errs by that.
+    """
+    ss, u, theta, x = settled(GEN, KW100, Ttsc(0.05, 20.0, phase="b"))
+    more = with_moments(ss)
+    moments = [n for n in more.y.names if n not in ss.y]
+    _, means = MeanStep(GEN, more, u, theta, dt=0.02, quad=moments)(x, u)
+    found = phasors_of(means.reshape(-1, 1))
+    run = simulation.stepper(ss, 4000, rtol=1e-10, atol=1e-12)(x, u, theta, 0.02)
+    angle = run.x[ss.x.index("theta_e")]
+    basis = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    V = []
+    for p in "abc":
+        c, s = np.linalg.lstsq(basis, run.y[ss.y.index(f"v_{p}")], rcond=None)[0]
+        ours = complex(found[f"V_{p}_re"][0], found[f"V_{p}_im"][0])
+        V.append(ours)
+        assert abs(ours - complex(c, -s) / math.sqrt(2)) < 2e-5 * abs(ours)
+    # symmetrical components: the positive sequence is nearly all, the negative one the fault
+    a = np.exp(2j * np.pi / 3)
+    positive, negative = (V[0] + a * V[1] + a**2 * V[2]) / 3, (V[0] + a**2 * V[1] + a * V[2]) / 3
+    assert abs(positive) > 200 and 1.0 < abs(negative) < 15.0
+
+
+def test_what_does_not_hold_is_refused(monkeypatch):
+    """Each message says what is wrong; a step that moves too fast is not passed off as good."""
+    load = ConstantPowerLoad(90e3)
+    with pytest.raises(SimulationError, match="not linear"):
+        MeanStep(GEN, GEN.variant(load), GEN.inputs(load), np.zeros(0), dt=0.02, quad=())
+    for fault in (None, Ttsc(0.05, 20.0)):
+        ss, u, theta, x = settled(GEN, KW100, fault)
+        with pytest.raises(SimulationError, match="less than two turns"):
+            MeanStep(GEN, ss, u, theta, dt=0.004, quad=QUAD)
+        fast = MeanStep(GEN, ss, u, theta, dt=0.02, quad=QUAD)
+        off = u.copy()
+        off[ss.u.index("w_r")] = 1.2 * W
+        with pytest.raises(SimulationError, match="outside the table"):
+            fast(x, off)
+        moved = x.copy()
+        moved[ss.x.index("V_R")] += 2000.0  # runs away from any polynomial
+        with pytest.raises(SimulationError, match="errors of E_fd"):
+            fast(moved, u)
+        moved[ss.x.index("V_R")] = np.nan
+        with pytest.raises(SimulationError, match="not finite"):
+            fast(moved, u)
+    monkeypatch.setattr(meanstep, "HARMONICS", (4,))
+    with pytest.raises(SimulationError, match="harmonics of the rotor angle, 4 fit"):
+        MeanStep(GEN, ss, u, theta, dt=0.02, quad=QUAD)
