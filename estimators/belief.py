@@ -14,6 +14,12 @@ from apu_casadi.signals import Signals
 __all__ = ["Belief"]
 
 
+def _not_negative(sigma: Mapping[str, float]) -> None:
+    for name, value in sigma.items():
+        if not value >= 0:
+            raise SignalError(f"belief: standard deviation of {name} must be >= 0, got {value!r}")
+
+
 @dataclass(frozen=True, eq=False)
 class Belief:
     """A Gaussian belief of named states.
@@ -36,6 +42,8 @@ class Belief:
     def __post_init__(self) -> None:
         """Check shapes, finiteness, symmetry and that no direction has negative variance."""
         n = len(self.x)
+        for name in ("mean", "cov"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         if np.shape(self.mean) != (n,) or np.shape(self.cov) != (n, n):
             raise SignalError(
                 f"belief of {n} states: mean ({n},) and cov ({n}, {n}) expected, got "
@@ -43,8 +51,13 @@ class Belief:
             )
         bad = [s for s, m, v in zip(self.x.names, self.mean, np.diag(self.cov), strict=True)
                if not (np.isfinite(m) and np.isfinite(v) and v >= 0)]  # fmt: skip
-        if bad or not np.isfinite(self.cov).all():
-            raise SignalError(f"belief: mean not finite or variance negative of {', '.join(bad)}")
+        if bad:
+            raise SignalError(
+                f"belief: mean not finite, or variance negative or not finite, of {', '.join(bad)}"
+            )
+        if not np.isfinite(self.cov).all():
+            i, j = (self.x.names[k] for k in np.argwhere(~np.isfinite(self.cov))[0])
+            raise SignalError(f"belief: the covariance of {i} and {j} is not finite")
         # judged in correlations, so that units do not matter
         sigma = np.sqrt(np.diag(self.cov))
         scale = np.where(sigma > 0, sigma, 1.0)
@@ -63,8 +76,9 @@ class Belief:
 
         Raises
         ------
-        SignalError : unknown or missing names.
+        SignalError : unknown or missing names, a negative standard deviation.
         """
+        _not_negative(sigma)
         s = Signals(
             [type(q)(q.name, q.unit, q.doc, None, q.nominal) for q in x]
         )  # a standard deviation has no default
@@ -87,8 +101,9 @@ class Belief:
 
         Raises
         ------
-        SignalError : unknown name.
+        SignalError : unknown name, a negative standard deviation.
         """
+        _not_negative(sigma or {})
         m, P = self.mean.copy(), self.cov.copy()
         for name, value in (mean or {}).items():
             m[self.x.index(name)] = value

@@ -50,15 +50,17 @@ class Corrected(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _kernel(n: int, ny: int, fixed: tuple[int, ...]) -> ca.Function:
-    """The update as an SX Function (P, H, nu, R) -> Corrected; ``fixed`` rows have no gain."""
-    P, H, nu, R = (
-        ca.SX.sym("P", n, n),
-        ca.SX.sym("H", ny, n),
-        ca.SX.sym("nu", ny),
-        ca.SX.sym("R", ny),
-    )
-    return ca.Function("correct", [P, H, nu, R], list(_corrected(P, H, nu, R, fixed)))
+def _kernel(P_at: tuple[int, ...], H_at: tuple[int, ...], fixed: tuple[int, ...]) -> ca.Function:
+    """The update as an SX Function (P, H, nu, R) -> Corrected; ``fixed`` rows have no gain.
+
+    ``P_at``, ``H_at`` are the patterns of P and H, compressed: what is zero by structure is left
+    out.
+    """
+    P, H = (ca.SX.sym(n, ca.Sparsity.compressed(list(at))) for n, at in (("P", P_at), ("H", H_at)))
+    ny = H.shape[0]
+    nu, R = ca.SX.sym("nu", ny), ca.SX.sym("R", ny)
+    out = ca.cse(list(_corrected(P, H, nu, R, fixed)))
+    return ca.Function("correct", [P, H, nu, R], [ca.densify(o) for o in out])
 
 
 def _corrected(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) -> Corrected:
@@ -98,20 +100,39 @@ def correct(P: Any, H: Any, nu: Any, R: Any, fixed: tuple[int, ...] = ()) -> Cor
     """
     if isinstance(P, ca.SX):
         return _corrected(P, H, nu, R, fixed)
-    return Corrected(*_kernel(P.shape[0], H.shape[0], fixed)(P, H, nu, R))
+    P_at, H_at = (tuple(M.sparsity().compress()) for M in (P, H))
+    return Corrected(*_kernel(P_at, H_at, fixed)(P, H, nu, R))
 
 
-def projected(m: Any, P: Any, lower: np.ndarray, upper: np.ndarray) -> Any:
-    """Return the mean moved into its bounds, one after the other, along the covariance.
+def projected(
+    m: Any, P: Any, lower: np.ndarray, upper: np.ndarray, fixed: tuple[int, ...] = ()
+) -> Any:
+    """Return the mean moved into its bounds along the covariance.
 
-    The nearest point of each bound in the metric of P; the covariance is left as it is, which is
-    on the safe side.
+    One bound after the other, each to the nearest point in the metric of P; where one move pushes
+    an earlier state out again, that state is then set on its bound.  The covariance is left as it
+    is, which is on the safe side.  What is known exactly does not move.
+
+    Parameters
+    ----------
+    m, P : mean and covariance; only the columns of bounded states are used.
+    lower, upper : bounds.
+    fixed : considered states, which stay.
     """
-    for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)):
-        inside = ca.fmin(ca.fmax(m[int(i)], lower[i]), upper[i])
-        move = inside - m[int(i)]
-        v = P[int(i), int(i)]
-        m = m + P[:, int(i)] * ca.if_else(v > 0, move / v, 0)
+    bound = [int(i) for i in np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))]
+    bound = [i for i in bound if i not in fixed]
+    free = np.ones(m.shape[0])
+    free[list(fixed)] = 0
+    for i in bound:
+        move = ca.fmin(ca.fmax(m[i], lower[i]), upper[i]) - m[i]
+        v = P[i, i]
+        m = m + ca.DM(free) * P[:, i] * ca.if_else(v > 0, move / v, 0)
+    if len(bound) > 1:
+        parts = ca.vertsplit(m)
+        for i in bound:
+            inside = ca.fmin(ca.fmax(parts[i], lower[i]), upper[i])
+            parts[i] = ca.if_else(P[i, i] > 0, inside, parts[i])
+        m = ca.vertcat(*parts)
     return m
 
 
@@ -139,10 +160,12 @@ def ekf_step(model: FilterModel, iterations: int = 1) -> FilterStep:
 
     Raises
     ------
-    ParameterError : iterations not a whole number from 1 to 10.
+    ParameterError : iterations not a whole number from 1 to 10; a model without states.
     """
     if not (isinstance(iterations, int) and 1 <= iterations <= 10):
         raise ParameterError(f"iterations must be a whole number from 1 to 10, got {iterations!r}")
+    if not len(model.x):
+        raise ParameterError(f"{model.name} has no states to estimate")
     model = model.expanded()
     kind = kind_of(model)
     nx, _, _, nw, _ = model.sizes
@@ -167,14 +190,14 @@ def ekf_step(model: FilterModel, iterations: int = 1) -> FilterStep:
             first = done, y - h
         at, check = prior + done.d, check + c
     assert done is not None and first is not None
-    at = projected(at, done.P, *(np.append(b, np.full(nw, s)) for b, s in
-                                 ((model.lower, -np.inf), (model.upper, np.inf))))  # fmt: skip
+    at = projected(at, done.P, model.lower, model.upper, fixed)
     x1, F, c = forecast(at, u, p, dt)
     C = done.P[:nx, :] @ F.T
-    P1 = F @ done.P @ F.T + ca.diag(ca.DM(model.walk**2)) * dt
+    P1 = ca.mtimes(F, done.P @ F.T) + ca.diag(ca.DM(model.walk**2)) * dt
+    P1 = ca.tril(P1) + ca.tril(P1, False).T  # half the work, exactly symmetric
     nu = ca.if_else(R >= 0, first[1], 0)
     stats = ca.vertcat(check + c, first[0].nis, first[0].loglik, first[0].measured)
-    out = [x1, (P1 + P1.T) / 2, at[:nx], done.P[:nx, :nx], C, nu, first[0].S, stats]
+    out = [x1, P1, at[:nx], done.P[:nx, :nx], C, nu, first[0].S, stats]
     out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
     name = f"ekf{'' if iterations == 1 else iterations}_{model.name}"
     return FilterStep(model, ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT))

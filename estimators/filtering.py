@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.backend import Caller, compiled
+from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import EstimationError, SignalError
 from apu_casadi.results import dataset
 from apu_casadi.signals import Signal, Signals
+from estimators.algebra import cholesky_semidefinite, root_of
 from estimators.belief import Belief
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["BLOCK", "STEP_IN", "STEP_OUT", "FilterResult", "FilterStep", "run"]
 
-BLOCK = 100  # samples in one call
+CHAIN = 10  # a block is this many chains of this many steps
+BLOCK = CHAIN**2  # samples in one call
 STEP_IN = ["m", "P", "u", "p", "y", "R", "dt"]
 STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
 """Of a step: belief before the sample, inputs, parameters, sample, variances (< 0: not measured),
@@ -45,10 +47,31 @@ class FilterStep:
     ----------
     model : the model.
     function : Function ``STEP_IN`` -> ``STEP_OUT``.
+    root : the filter carries square roots: ``P`` and ``P1`` (and only these) are lower triangular
+        factors L of the covariance L L'.
     """
 
     model: FilterModel
     function: ca.Function
+    root: bool = False
+
+    @cached_property
+    def plain(self) -> FilterStep:
+        """The same filter with covariances in and out, for use inside other functions.
+
+        A filter that carries square roots then takes one root more at each step.
+        """
+        if not self.root:
+            return self
+        s = [ca.MX.sym(self.function.name_in(i), self.function.size1_in(i),
+                       self.function.size2_in(i)) for i in range(len(STEP_IN))]  # fmt: skip
+        P = ca.SX.sym("P", s[1].shape[0], s[1].shape[0])
+        root = ca.Function("root", [P], [ca.densify(cholesky_semidefinite(P))])
+        out = list(self.function(s[0], root(s[1]), *s[2:]))
+        P1 = out[1] @ out[1].T
+        out[1] = ca.densify(ca.tril(P1) + ca.tril(P1, False).T)
+        name = f"{self.function.name()}_plain"
+        return FilterStep(self.model, ca.Function(name, s, out, STEP_IN, STEP_OUT))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +90,11 @@ class FilterResult:
     measured : number of outputs measured at each instant, shape (K,).
     loglik : log-likelihood of the recording.
     final : belief at the last instant, after its sample.
-    predicted : belief at the last instant carried over ``dt`` = 0, for going on.
     cov : filtered covariances, shape (K, nx, nx); None unless kept.
     mean_pred, cov_pred : belief before each sample, shapes (nx, K), (K, nx, nx); None unless kept.
     cross : covariance of the filtered state at k and the predicted one at k+1, (K, nx, nx).
+    innovation_cov : covariances of the innovations, (K, ny, ny), 1 on the diagonal where nothing
+        was measured; None unless kept.
     """
 
     x: Signals
@@ -88,6 +112,7 @@ class FilterResult:
     mean_pred: np.ndarray | None = None
     cov_pred: np.ndarray | None = None
     cross: np.ndarray | None = None
+    innovation_cov: np.ndarray | None = None
 
     def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (mean, standard deviation) of one state, each of shape (K,)."""
@@ -122,22 +147,54 @@ class FilterResult:
         )
 
 
+def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
+    """Call ``f`` n times, as one function.
+
+    The first ``carried`` outputs go to the inputs of the same place in the next call; the last
+    input is the same for all calls, the others stand side by side, as do the last ``kept`` outputs;
+    of the others only the last are returned.
+
+    The same as ``mapaccum``, which takes a hundred times as long to build in CasADi 3.8.
+    """
+    ins = [ca.MX.sym(f.name_in(i), f.size1_in(i), f.size2_in(i)) for i in range(f.n_in())]
+    # a symbol without elements has no name to ask for
+    wide = [
+        ca.MX.sym(f.name_in(carried + i), s.shape[0], s.shape[1] * n)
+        for i, s in enumerate(ins[carried:-1])
+    ]
+    split = [ca.horzsplit(w, s.shape[1]) for w, s in zip(wide, ins[carried:-1], strict=True)]
+    now, results = ins[:carried], []
+    for k in range(n):
+        out = f(*now, *(s[k] for s in split), ins[-1])
+        now = out[:carried]
+        results.append(out)
+    first = f.n_out() - kept
+    out = [*results[-1][:first], *(ca.horzcat(*(r[i] for r in results))
+                                   for i in range(first, f.n_out()))]  # fmt: skip
+    return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
+
+
 @lru_cache(maxsize=64)
-def _block(step: FilterStep, full: bool, backend: str | None) -> Caller:
-    """``BLOCK`` steps in one function; without the matrices unless ``full``."""
+def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> ca.Function:
+    """``BLOCK`` steps in one function; ``_in_use`` keeps the forms of each backend apart.
+
+    (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
+    before each sample and C, S; matrices as columns.
+    """
     nx, nu, np_, _, ny = step.model.sizes
     s = [ca.MX.sym(n, *shape) for n, shape in zip(
         STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
     )]  # fmt: skip
-    out = dict(zip(STEP_OUT, step.function(*s), strict=True))
-    kept = [out["m_f"], ca.diag(out["P_f"]), out["nu"], ca.diag(out["S"]), out["stats"]]
+    m, P, u, p, y, R, dt = s
+    o = dict(zip(STEP_OUT, step.function(*s), strict=True))
+    kept = [o["m_f"], ca.vec(o["P_f"]), o["nu"], ca.diag(o["S"]), o["stats"]]
     if full:
-        kept += [ca.vec(out["P_f"]), ca.vec(out["C"])]
-    one = ca.Function(
-        f"{step.function.name()}_kept", s, [out["m1"], out["P1"], *(ca.densify(k) for k in kept)]
-    )
-    many = one.mapaccum(f"{step.function.name()}_block{'_full' if full else ''}", BLOCK, 2)
-    return Caller(compiled(many, backend=backend), copy=False)
+        kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
+    name = f"{step.function.name()}{'_full' if full else ''}"
+    out = [o["m1"], o["P1"], *(ca.densify(k) for k in kept)]
+    one = ca.Function(f"{name}_one", [m, P, u, y, R, dt, p], out)
+    chain = _chained(one, CHAIN, f"{name}_chain", 2, len(kept))
+    return compiled(_chained(chain, CHAIN, f"{name}_block", 2, len(kept)), backend=backend)
 
 
 def run(
@@ -173,51 +230,77 @@ def run(
         raise SignalError(
             f"prior of {', '.join(prior.x.names)}; {model.name} has {', '.join(model.x.names)}"
         )
-    call = _block(step, full, backend)
+    # the buffers are this run's own: runs may be nested, or go on in several threads
+    call = Caller(_block(step, full, backend, backend_in_use()), copy=False)
     nx, _, _, _, ny = model.sizes
     K = data.size
     n_blocks = -(-K // BLOCK)
     pad = n_blocks * BLOCK - K
     missing = np.isnan(data.y)
-    # a padded sample measures nothing and lasts no time: the belief stays
+    # a padded sample measures nothing and lasts no time; what comes out of it is dropped
     y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
     R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
     u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
     dt = np.pad(data.dt, (0, pad))[None, :]
-    p = np.repeat(data.p[:, None], BLOCK, axis=1)
     mean, var = np.empty((nx, K)), np.empty((nx, K))
     nu, S = np.empty((ny, K)), np.empty((ny, K))
     stats = np.empty((len(STATS), K))
-    covs = [np.empty((K, nx, nx)) for _ in range(3)] if full else None
-    mean_pred = np.empty((nx, K)) if full else None
-    m, P = prior.mean.copy(), prior.cov.copy()
+    kept = _Kept.of(K, nx, ny) if full else None
+    m, P = prior.mean.copy(), root_of(prior.cov) if step.root else prior.cov.copy()
+    last = P
     for b in range(n_blocks):
         s = slice(b * BLOCK, (b + 1) * BLOCK)
         n = min(BLOCK, K - b * BLOCK)
         r = slice(b * BLOCK, b * BLOCK + n)
-        out = call(m, P, u[:, s], p, y[:, s], R[:, s], dt[:, s])
-        m1, P1 = out[0], out[1].reshape(nx, BLOCK, nx) if nx else out[1]
-        for target, source in ((mean, out[2]), (var, out[3]), (nu, out[4]), (S, out[5])):
+        out = call(m, P, u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
+        P_f = out[3][:, :n]
+        for target, source in ((mean, out[2]), (var, P_f[:: nx + 1]), (nu, out[4]), (S, out[5])):
             target[:, r] = source[:, :n]
         stats[:, r] = out[6][:, :n]
         _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
-        if covs is not None and mean_pred is not None:
-            # columns are vec(P), column-major; P_f is symmetric, C is not
-            covs[0][r] = out[7][:, :n].T.reshape(n, nx, nx)
-            covs[2][r] = out[8][:, :n].T.reshape(n, nx, nx).transpose(0, 2, 1)
-            mean_pred[:, r.start] = m
-            covs[1][r.start] = P
-            mean_pred[:, r.start + 1 : r.stop] = m1[:, : n - 1]
-            covs[1][r.start + 1 : r.stop] = P1[:, : n - 1].transpose(1, 0, 2)
-        m, P = m1[:, -1].copy(), P1[:, -1].copy()
+        if kept is not None:
+            kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=step.root)
+        last = P_f[:, -1].reshape(nx, nx)
+        last = (last + last.T) / 2
+        np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
+        m, P = out[0].copy(), out[1].copy()
         if progress is not None:
             progress(b * BLOCK + n, K)
+    np.maximum(var, 0.0, out=var)  # rounding, judged above
     nu[missing], S[missing] = np.nan, np.nan
     return FilterResult(
         model.x, model.y, data.t, mean, var, nu, S, stats[1], stats[3], float(stats[2].sum()),
-        Belief(model.x, m, (P + P.T) / 2),
-        *((covs[0], mean_pred, covs[1], covs[2]) if covs is not None else ()),
+        Belief(model.x, mean[:, -1].copy(), last),
+        *(() if kept is None else (kept.cov, kept.mean_pred, kept.cov_pred, kept.cross, kept.S)),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """The matrices of a run with ``full``; see :class:`FilterResult`."""
+
+    cov: np.ndarray
+    mean_pred: np.ndarray
+    cov_pred: np.ndarray
+    cross: np.ndarray
+    S: np.ndarray
+
+    @classmethod
+    def of(cls, K: int, nx: int, ny: int) -> _Kept:
+        square = [np.empty((K, n, n)) for n in (nx, nx, nx, ny)]
+        return cls(square[0], np.empty((nx, K)), *square[1:])
+
+    def put(self, r: slice, columns: list[np.ndarray], *, root: bool) -> None:
+        """Take P_f, m, P, C, S of some instants; matrices are columns in column-major order."""
+        nx, ny = self.cov.shape[1], self.S.shape[1]
+        P_f, m, P, C, S = columns
+        n = m.shape[1]
+        self.cov[r] = P_f.T.reshape(n, nx, nx)
+        self.mean_pred[:, r] = m
+        before = P.T.reshape(n, nx, nx).transpose(0, 2, 1)
+        self.cov_pred[r] = before @ before.transpose(0, 2, 1) if root else before
+        self.cross[r] = C.T.reshape(n, nx, nx).transpose(0, 2, 1)
+        self.S[r] = S.T.reshape(n, ny, ny)
 
 
 def _believable(
@@ -231,7 +314,8 @@ def _believable(
     """Refuse a block in which a check failed or a number is lost."""
     failed = ~(stats[0] <= CHECK_TOL)
     # rounding may leave a tiny negative variance of what is known exactly
-    floor = -1e-12 * (np.square(model.x.nominals) + np.square(mean).max(1, initial=0.0))
+    size = np.where(np.isfinite(mean), mean, 0.0)
+    floor = -1e-12 * (np.square(model.x.nominals) + np.square(size).max(1, initial=0.0))
     lost = ~np.isfinite(mean) | ~(var >= floor[:, None])
     bad = failed | lost.any(0)
     if not bad.any():

@@ -41,6 +41,7 @@ __all__ = [
     "discretise",
     "gains",
     "measure",
+    "measured_inputs",
     "noisy_inputs",
 ]
 
@@ -97,7 +98,8 @@ class FilterModel:
 
     Raises
     ------
-    SignalError : a function's or vector's shape does not match the declared signals.
+    SignalError : a function's or vector's shape does not match the declared signals; a walk, a pair
+        of bounds or a considered state is impossible.
     """
 
     name: str
@@ -131,7 +133,19 @@ class FilterModel:
             shape = np.shape(getattr(self, label))
             if shape != (nx,):
                 raise SignalError(f"{self.name}.{label}: shape ({nx},) expected, got {shape}")
-        self.x.indices(self.consider)
+        fixed = self.x.indices(self.consider)
+        for i, s in enumerate(self.x):
+            if not (math.isfinite(self.walk[i]) and self.walk[i] >= 0):
+                raise SignalError(
+                    f"{self.name}: walk of {s.name} must be finite and >= 0, got {self.walk[i]!r}"
+                )
+            if not self.lower[i] < self.upper[i]:
+                raise SignalError(
+                    f"{self.name}: bounds of {s.name}: {self.lower[i]!r} must be below "
+                    f"{self.upper[i]!r}"
+                )
+            if i in fixed and self.walk[i]:
+                raise SignalError(f"{self.name}: {s.name} is considered, its walk must be 0")
 
     @property
     def sizes(self) -> tuple[int, int, int, int, int]:
@@ -145,23 +159,31 @@ class FilterModel:
         return (*(kind.sym(n, m) for n, m in names), kind.sym("dt"))
 
     def with_walk(self, walks: Mapping[str, float]) -> FilterModel:
-        """Return the model with other random-walk standard deviations, by state name."""
-        new = self.walk.copy()
+        """Return the model with other random-walk standard deviations, by state name.
+
+        Raises
+        ------
+        SignalError : unknown name, a walk that is negative or not finite, a considered state.
+        """
+        new = np.array(self.walk, dtype=float)
         for name, value in walks.items():
-            new[self.x.index(name)] = Unknown(walk=value).walk
+            new[self.x.index(name)] = value
         return dataclasses.replace(self, walk=new)
 
     def expanded(self) -> FilterModel:
         """Return the same model in scalar operations, faster, where that is possible.
 
-        Functions that hold a root finder or a spline cannot be expanded and stay as they are.
+        Functions that hold a root finder or a table cannot be expanded and stay as they are.
         """
 
         def scalar(fun: ca.Function) -> ca.Function:
             try:
-                return fun.expand()
+                made = fun.expand()
             except RuntimeError:
                 return fun
+            # CasADi may wrap what it cannot write out in calls; those are better left to MX
+            calls = any(made.instruction_id(k) == ca.OP_CALL for k in range(made.n_instructions()))
+            return fun if calls else made
 
         return dataclasses.replace(
             self, transition=scalar(self.transition), output=scalar(self.output)
@@ -281,7 +303,10 @@ def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
     """
     cols = model.u.indices(list(sigma))
     for name, value in sigma.items():
-        Unknown(walk=value)  # same demand: finite and >= 0
+        if not (math.isfinite(value) and value >= 0):
+            raise ParameterError(
+                f"noisy_inputs: sigma of {name} must be finite and >= 0, got {value!r}"
+            )
         if f"w_{name}" in model.w:
             raise SignalError(f"{model.name}: input {name} is noisy already")
     x, u, p, _, dt = model.symbols()
@@ -396,4 +421,47 @@ def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
         np.concatenate([model.lower, [k.lower for k in new]]),
         np.concatenate([model.upper, [k.upper for k in new]]),
         (*model.consider, *(name for name, k in unknowns.items() if k.consider)),
+    )
+
+
+def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
+    """Return the model for inputs whose white noise comes with the data.
+
+    As :func:`noisy_inputs`, but the standard deviations are inputs themselves, appended as
+    ``sigma_<name>``: they may change from sample to sample.
+
+    Raises
+    ------
+    SignalError : unknown input, or one that is noisy already.
+    """
+    cols = model.u.indices(names)
+    for name in names:
+        if f"w_{name}" in model.w:
+            raise SignalError(f"{model.name}: input {name} is noisy already")
+    nu, nw = len(model.u), len(model.w)
+    x, _, p, _, dt = model.symbols()
+    u, w = ca.MX.sym("u", nu + len(cols)), ca.MX.sym("w", nw + len(cols))
+    spread = ca.DM(nu, len(cols))
+    for j, i in enumerate(cols):
+        spread[i, j] = 1
+    true = u[:nu] - ca.mtimes(spread, u[nu:] * w[nw:])
+    sigmas = [
+        Signal(f"sigma_{n}", model.u[n].unit, f"standard deviation of the measured {n}", None,
+               model.u[n].nominal)
+        for n in names
+    ]  # fmt: skip
+    noises = [
+        Signal(f"w_{n}", "1", f"error of the measured {n} over its standard deviation")
+        for n in names
+    ]
+    return _model(
+        model.name,
+        (model.x, model.u + Signals(sigmas), model.p, model.w + Signals(noises), model.y),
+        (x, u, p, w, dt),
+        model.transition(x, true, p, w[:nw], dt),
+        model.output(x, true, p, w[:nw]),
+        model.walk,
+        model.lower,
+        model.upper,
+        model.consider,
     )

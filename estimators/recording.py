@@ -49,13 +49,18 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Check everything once, so that the filters need not."""
+        for name in ("t", "u", "y", "variance", "p"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         K = np.size(self.t)
         if np.shape(self.t) != (K,) or K == 0:
             raise DataError(f"t: shape (K,) with K > 0 expected, got {np.shape(self.t)}")
+        if not np.isfinite(self.t).all():
+            k = int(np.argmin(np.isfinite(self.t)))
+            raise DataError(f"t must be finite; t = {self.t[k]} at sample {k}")
         step = np.diff(self.t)
-        if not (np.isfinite(self.t).all() and (step > 0).all()):
-            k = int(np.argmax(~(step > 0))) if step.size else 0
-            raise DataError(f"t must increase and be finite; it does not after t = {self.t[k]:.9g}")
+        if not (step > 0).all():
+            k = int(np.argmax(~(step > 0)))
+            raise DataError(f"t must increase; it does not after t = {self.t[k]:.9g} (sample {k})")
         for name in ("u", "y", "variance"):
             shape = np.shape(getattr(self, name))
             if len(shape) != 2 or shape[1] != K:
@@ -64,6 +69,8 @@ class Recording:
             raise DataError(
                 f"variance: shape {np.shape(self.y)} expected, got {np.shape(self.variance)}"
             )
+        if self.p.ndim != 1:
+            raise DataError(f"p: shape (np,) expected, got {self.p.shape}")
         if not (np.isfinite(self.u).all() and np.isfinite(self.p).all()):
             raise DataError("inputs u and parameters p must be finite")
         if np.isinf(self.y).any():
@@ -113,13 +120,35 @@ def _stamped(name: str, data: Any) -> tuple[np.ndarray, np.ndarray]:
         raise DataError(
             f"{name}: times and values of one length expected, got {t.shape}, {v.shape}"
         )
-    if not np.isfinite(t).all() or (np.diff(t) <= SAME_TIME).any():
-        k = int(np.argmax(np.diff(t) <= SAME_TIME)) if t.size > 1 else 0
+    if not np.isfinite(t).all():
+        k = int(np.argmin(np.isfinite(t)))
+        raise DataError(f"{name}: times must be finite; t = {t[k]!r} (sample {k}) is not")
+    if (np.diff(t) <= SAME_TIME).any():
+        k = int(np.argmax(np.diff(t) <= SAME_TIME))
         raise DataError(
-            f"{name}: times must be finite and increase; near t = {t[k]:.9g} s (sample {k}) they "
-            "do not: sort the stream, or drop one of two samples of the same stamp"
+            f"{name}: times must increase; after t = {t[k]:.9g} s (sample {k}) they do not: sort "
+            "the stream, or drop one of two samples of the same stamp"
         )
     return t, v
+
+
+def _variance(name: str, sigma: Any, values: np.ndarray) -> np.ndarray:
+    """Variance of each sample; refuses infinite samples and impossible standard deviations."""
+    if np.isinf(values).any():
+        k = int(np.argmax(np.isinf(values)))
+        raise DataError(f"{name}: sample {k} is infinite; a gap is NaN")
+    s = np.asarray(sigma, dtype=float)
+    if s.shape not in ((), values.shape):
+        raise DataError(
+            f"sigma of {name}: a number or shape {values.shape} expected, got {s.shape}"
+        )
+    s = np.broadcast_to(s, values.shape)
+    wrong = ~(np.isfinite(s) & (s > 0)) & ~np.isnan(values)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise DataError(f"sigma of {name} must be finite and > 0, got {s[k]!r} at sample {k}")
+    # where there is no sample, any number does
+    return np.where(np.isfinite(s) & (s > 0), s, 1.0) ** 2
 
 
 def record(
@@ -146,8 +175,9 @@ def record(
 
     Raises
     ------
-    DataError : unknown name, stamps that do not increase, missing sigma, an input that begins
-        after the first measurement.
+    DataError : unknown name, stamps that do not increase, infinite samples, a sigma that is missing
+        or not positive, an input that begins after the first measurement.
+    SignalError : a missing input or parameter, or one that is not finite.
     """
     for what, names, known in (
         ("output", outputs, model.y), ("sigma of output", sigma, model.y),
@@ -191,9 +221,13 @@ def record(
     variance = np.ones_like(y)
     for name, (t, v) in streams.items():
         i = model.y.index(name)
-        k = np.searchsorted(grid, t - SAME_TIME)
+        k = np.searchsorted(grid, t + SAME_TIME, side="right") - 1
+        if np.unique(k).size < k.size:
+            raise DataError(
+                f"{name}: samples closer than {2 * SAME_TIME:.0e} s cannot be told apart"
+            )
         y[i, k] = v
-        variance[i, k] = np.broadcast_to(np.asarray(sigma[name], dtype=float) ** 2, v.shape)
+        variance[i, k] = _variance(name, sigma[name], v)
     return Recording(grid, u, y, variance, model.p.pack(p or {}))
 
 

@@ -26,13 +26,16 @@ LAYERS = (
     ("atmosphere", "maps"),
     ("components", "machine"),
     ("cycle",),
-    ("gasgenerator", "generator"),
+    ("gasgenerator", "generator", "terminalmodel"),
     ("trimkernel",),
-    ("trimming", "propagation"),
-    ("calibration",),
+    ("steadypoint",),
+    ("trimsolver",),
+    ("trimming", "trimbatch", "propagation"),
+    ("calibration", "meanstep"),
     ("control", "events"),
     ("apu",),
     ("jointstep",),
+    ("machinestep",),
     ("jointmodel", "multirate"),
     ("linearisation", "monolithic"),
 )
@@ -48,12 +51,25 @@ ONLY = {
     # these two draw what they are given a model of: eigenvalues, operating lines on a map
     "eigenplot": {"errors", "figstyle", "linearisation"},
     "benchplot": {"errors", "figstyle"},
-    "mapplots": {"results", "errors", "figstyle", "maps", "trimming", "gasgenerator"},
+    "isolationplot": {"errors", "figstyle"},
+    "fitplot": {"errors", "figstyle"},
+    "jointestimateplot": {"errors", "figstyle"},
+    "studyplot": {"errors", "figstyle"},
+    "estimationplot": {"errors", "figstyle"},
+    "mapplots": {
+        "results",
+        "errors",
+        "figstyle",
+        "maps",
+        "steadypoint",
+        "trimming",
+        "gasgenerator",
+    },
 }
 # Upward imports that are known, with the reason; an entry that is no longer needed fails.
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 # apu_casadi/__init__.py is the front door: it names modules, and no module comes in through it.
-# Estimators know f, g and names; of the solvers only how to make a step of f, and how to compile it.
+# Estimators know f, g and names; of the solvers only how to make a step of f and to compile it.
 ESTIMATORS = {"statespace", "signals", "results", "errors", "backend", "discretisation"}
 
 RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}

@@ -19,6 +19,8 @@ MODULES: tuple[str, ...] = (
     "scenarios.commands.compile",
     "scenarios.commands.deck",
     "scenarios.commands.errata",
+    "scenarios.commands.fit",
+    "scenarios.commands.identify",
     "scenarios.commands.list",
     "scenarios.commands.maps",
     "scenarios.commands.multirate",
