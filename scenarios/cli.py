@@ -1,6 +1,6 @@
 """The console command ``apu``.
 
-Exit status: 0 done; 1 the simulation failed; 2 wrong usage, scenario, parameter or file;
+Exit status: 0 done; 1 a simulation or an estimate failed; 2 wrong usage, scenario, parameter or file;
 130 interrupted by Ctrl-C.
 """
 
@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from apu_casadi.errors import ApuError, OperatingPointError, SimulationError
+from apu_casadi.errors import ApuError, EstimationError, OperatingPointError, SimulationError
 from scenarios import commands
 
 
@@ -49,7 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except ApuError as e:
         print(f"apu: error: {' '.join(str(e).split())}", file=sys.stderr)
-        return 1 if isinstance(e, OperatingPointError | SimulationError) else 2
+        failed = isinstance(e, EstimationError | OperatingPointError | SimulationError)
+        return 1 if failed else 2
     except KeyboardInterrupt:
         print("apu: interrupted; nothing further was written", file=sys.stderr)
         return 130

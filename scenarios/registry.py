@@ -76,6 +76,7 @@ def run(
     out: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
     solver: str = "cvodes",
+    phasors: bool = False,
     **overrides: Any,
 ) -> xr.Dataset:
     """Run a scenario and return the joint dataset.
@@ -87,6 +88,7 @@ def run(
     progress : called with the simulated and the total time [s].
     solver : ``"cvodes"``, ``"idas"`` or the fast ``"propagator"``: see
         :func:`apu_casadi.multirate.simulate_joint`.
+    phasors : keep the fundamental phasors of voltages and currents of each exchange step.
     overrides : attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
         ``parameters={"machine.r_s": 0.01}``).
 
@@ -100,7 +102,7 @@ def run(
         s = s.change(**overrides)
     if out is not None:
         prepare(out)
-    ds = _simulate(s, progress, solver)
+    ds = _simulate(s, progress, solver, phasors)
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     if out is not None:
@@ -116,7 +118,7 @@ def _unit(parameters: str) -> Apu:
     return Apu().change(json.loads(parameters))
 
 
-def _simulate(s: Scenario, progress: Progress | None, solver: str) -> xr.Dataset:
+def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:
     from apu_casadi.multirate import simulate_joint
 
     apu = _unit(json.dumps(dict(s.parameters), sort_keys=True))
@@ -131,6 +133,7 @@ def _simulate(s: Scenario, progress: Progress | None, solver: str) -> xr.Dataset
         noise=None if s.noise is None else s.noise.build(),
         seed=s.seed,
         solver=solver,
+        phasors=phasors,
         progress=progress,
     )
 

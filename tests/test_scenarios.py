@@ -281,8 +281,10 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
         waveform_dt=None,
         seed=3,
         parameters={"machine.r_s": 0.01},
+        phasors=True,
         progress=lambda done, total: None,
     )
+    assert seen["phasors"] is True
     assert seen["parameters"] == {"machine.r_s": 0.01}
     assert seen["duration"] == 14.0 and seen["dt"] == 0.02 and seen["waveform_dt"] is None
     assert seen["seed"] == 3 and seen["ambient"] == Ambient(dT_isa=5.0)

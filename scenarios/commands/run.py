@@ -30,6 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-waveforms", action="store_true", help="keep no waveforms: a small file, rms figures"
     )
     parser.add_argument(
+        "--phasors",
+        action="store_true",
+        help="keep the fundamental phasors of voltages and currents of every exchange step",
+    )
+    parser.add_argument(
         "--solver", default="cvodes", metavar="NAME",
         help="cvodes (default), idas, or propagator: exact and fast where the load is linear",
     )  # fmt: skip
@@ -46,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with _bar(s.name, s.duration, show=show) as bar, _stoppable(bar) as progress:
-        ds = registry.run(s, progress=progress, solver=args.solver)
+        ds = registry.run(s, progress=progress, solver=args.solver, phasors=args.phasors)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
     if args.json:
