@@ -18,7 +18,7 @@ def fake(monkeypatch, tmp_path):
     """Replace the simulation; work in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
-    def simulate(s, progress, solver):
+    def simulate(s, progress, solver, phasors):
         if progress:
             for k in range(15):
                 progress(float(k), 14.0)
@@ -103,7 +103,7 @@ def test_usage_errors_and_version(capsys):
 
 
 def test_ctrl_c_in_a_run_waits_for_the_exchange_step(fake, capsys, monkeypatch):
-    def simulate(s, progress, solver):
+    def simulate(s, progress, solver, phasors):
         signal.raise_signal(signal.SIGINT)  # as if inside the integrator: no exception here
         progress(1.0, 14.0)
 

@@ -22,7 +22,7 @@ def test_a_campaign_can_catch_the_family(error):
 )
 def test_each_is_also_of_the_builtin_kind(error):
     """Python convention: wrong input is a ValueError, a calculation that failed a RuntimeError."""
-    failed = {"OperatingPointError", "SimulationError", "BackendError"}
+    failed = {"EstimationError", "OperatingPointError", "SimulationError", "BackendError"}
     assert issubclass(error, RuntimeError if error.__name__ in failed else ValueError)
 
 
