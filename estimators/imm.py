@@ -1,0 +1,489 @@
+"""Several models at once: which of them holds, and what is the state then?
+
+:func:`interacting_multiple_models` follows a mode that may change from sample to sample as a
+Markov chain (Blom and Bar-Shalom 1988, IEEE Trans. Automatic Control 33, 780-783):
+mix the beliefs of all modes, let each mode's filter take the sample, weigh the modes anew.
+:func:`multiple_models` is the static case: one mode holds throughout, and the log-likelihoods of
+whole filters decide (Magill 1965, IEEE Trans. Automatic Control 10, 434-439).
+
+Probabilities are kept as logarithms: a mode that a thousand samples have spoken against may come
+back, and 1e-300 is a number like any other.
+
+A mode r(k) governs the output at sample k and the transition from k to k+1, as in
+:mod:`estimators.model`, where both share their noise; the chain moves between samples.  (Blom and
+Bar-Shalom let the mode at k govern the transition *to* k; for modes that differ in outputs,
+parameters or constants only, the two are the same.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm
+
+from apu_casadi.backend import Caller, compiled
+from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.signals import Signals
+from estimators.belief import Belief
+from estimators.ekf import ekf_step
+from estimators.filtering import FilterResult, FilterStep, run
+from estimators.model import CHECK_TOL, FilterModel
+from estimators.recording import Recording
+
+__all__ = [
+    "ImmResult",
+    "ModelProbabilities",
+    "interacting_multiple_models",
+    "log_normalised",
+    "multiple_models",
+]
+
+BLOCK = 50  # samples in one call
+IMPOSSIBLE = -1e30  # stands for the logarithm of 0: finite, so that differences are defined
+
+
+def log_normalised(logs: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Return logarithms of probabilities that sum to one along an axis.
+
+    Raises
+    ------
+    ParameterError : a NaN or +inf, or nothing possible at all.
+    """
+    a = np.asarray(logs, float)
+    top = a.max(axis=axis, keepdims=True)
+    if not np.isfinite(top).all():
+        raise ParameterError(f"logarithms of probabilities expected, the largest is {top.max()!r}")
+    return np.asarray(a - top - np.log(np.exp(a - top).sum(axis=axis, keepdims=True)))
+
+
+# ------------------------------------------------------------------------------ static
+
+
+@dataclass(frozen=True, eq=False)
+class ModelProbabilities:
+    """How well each of several models explains a whole recording.
+
+    Parameters
+    ----------
+    names : of the models.
+    loglik : log-likelihoods of the recording, (M,).
+    log_probability : logarithms of the posterior probabilities, (M,).
+    results : each filter's result.
+    """
+
+    names: tuple[str, ...]
+    loglik: np.ndarray
+    log_probability: np.ndarray
+    results: tuple[FilterResult, ...]
+
+    @property
+    def best(self) -> str:
+        """The most probable model."""
+        return self.names[int(np.argmax(self.log_probability))]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return numbers that JSON can hold."""
+        return {
+            "best": self.best,
+            "loglik": dict(zip(self.names, self.loglik.tolist(), strict=True)),
+            "log_probability": dict(zip(self.names, self.log_probability.tolist(), strict=True)),
+        }
+
+
+def multiple_models(
+    models: Mapping[str, FilterModel | FilterStep],
+    prior: Belief | Mapping[str, Belief],
+    data: Recording | Mapping[str, Recording],
+    *,
+    prior_probability: Mapping[str, float] | None = None,
+    full: bool = False,
+    backend: str | None = None,
+) -> ModelProbabilities:
+    """Run one filter for each model, and compare their likelihoods by Bayes' rule.
+
+    A model with an unknown size is penalised for it by the spread of its own prior: the likelihood
+    is that of the samples with the size integrated out.
+
+    Parameters
+    ----------
+    models : models (taken by extended Kalman filters) or filters, by name.
+    prior : belief at the first instant, one for all or one for each.
+    data : recording, one for all or one for each (of the same measurements).
+    prior_probability : of the models, equal by default.
+    full, backend : see :func:`estimators.filtering.run`.
+
+    Raises
+    ------
+    ParameterError : no models, unknown names, probabilities that are none.
+    """
+    steps = _steps(models)
+    logp = _log_prior(tuple(steps), prior_probability)
+    results = [
+        run(
+            step,
+            prior if isinstance(prior, Belief) else prior[name],
+            data if isinstance(data, Recording) else data[name],
+            full=full,
+            backend=backend,
+        )
+        for name, step in steps.items()
+    ]
+    loglik = np.array([r.loglik for r in results])
+    return ModelProbabilities(tuple(steps), loglik, log_normalised(loglik + logp), tuple(results))
+
+
+def _steps(models: Mapping[str, FilterModel | FilterStep]) -> dict[str, FilterStep]:
+    if not models:
+        raise ParameterError("no models were given")
+    return {n: m if isinstance(m, FilterStep) else ekf_step(m) for n, m in models.items()}
+
+
+def _log_prior(names: tuple[str, ...], given: Mapping[str, float] | None) -> np.ndarray:
+    if given is None:
+        return np.full(len(names), -math.log(len(names)))
+    for n in given:
+        if n not in names:
+            raise ParameterError(f"unknown mode {n!r} {nearest(n, names)}")
+    p = np.array([given.get(n, math.nan) for n in names])
+    if not (np.isfinite(p).all() and (p >= 0).all() and p.sum() > 0):
+        raise ParameterError(
+            f"prior probabilities >= 0 are needed for all of {', '.join(names)}; got {dict(given)}"
+        )
+    return _logs(p / p.sum())
+
+
+def _logs(p: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(p > 0, np.log(p), IMPOSSIBLE))
+
+
+# ------------------------------------------------------------------------------ interacting
+
+
+@dataclass(frozen=True, eq=False)
+class ImmResult:
+    """What interacting filters believed along a recording of K instants.
+
+    Parameters
+    ----------
+    names : of the M modes.
+    x : states that all modes have.
+    t : instants, s, (K,).
+    log_probability : logarithms of the modes' probabilities after each sample, (M, K).
+    mean, variance : of the mixture after each sample, (nx, K).
+    mode_mean : each mode's own filtered mean, all its states, (nx_j, K).
+    loglik : log-likelihood of the recording.
+    final : each mode's belief at the last instant, after its sample.
+    """
+
+    names: tuple[str, ...]
+    x: Signals
+    t: np.ndarray
+    log_probability: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+    mode_mean: tuple[np.ndarray, ...]
+    loglik: float
+    final: tuple[Belief, ...]
+
+    @property
+    def probability(self) -> np.ndarray:
+        """Probabilities of the modes after each sample, (M, K)."""
+        return np.exp(self.log_probability)
+
+    @property
+    def best(self) -> np.ndarray:
+        """Index of the most probable mode after each sample, (K,)."""
+        return np.asarray(np.argmax(self.log_probability, axis=0))
+
+    def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (mean, standard deviation) of one state of the mixture, each of shape (K,)."""
+        i = self.x.index(name)
+        return self.mean[i], np.sqrt(self.variance[i])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return numbers that JSON can hold: the modes at the end, and when the best changed."""
+        change = np.flatnonzero(np.diff(self.best)) + 1
+        return {
+            "loglik": self.loglik,
+            "log_probability": dict(
+                zip(self.names, self.log_probability[:, -1].tolist(), strict=True)
+            ),
+            "path": [
+                {"t": float(self.t[k]), "mode": self.names[int(self.best[k])]}
+                for k in (0, *change.tolist())
+            ],
+        }
+
+
+def _log_sum(v: ca.SX) -> ca.SX:
+    top = v[0]
+    for i in range(1, v.numel()):
+        top = ca.fmax(top, v[i])
+    return top + ca.log(ca.sum1(ca.exp(v - top)))
+
+
+def _mixer(x: Sequence[Signals]) -> ca.Function:
+    """Mixing as an SX Function (logs, m, P, logT) -> (logs, m, P); m, P of all modes stacked.
+
+    What a mode lacks it takes no part in: into mode j it carries j's own belief of that state,
+    uncorrelated with the rest (Yuan et al. 2012, unbiased mixing).
+    """
+    M, n = len(x), [len(s) for s in x]
+    logs, logT = ca.SX.sym("logs", M), ca.SX.sym("logT", M * M)
+    ms = [ca.SX.sym(f"m{i}", k) for i, k in enumerate(n)]
+    Ps = [ca.SX.sym(f"P{i}", k, k) for i, k in enumerate(n)]
+    T = ca.reshape(logT, M, M)  # column-major: T[i, j] from i to j
+    predicted, m_out, P_out = [], [], []
+    for j in range(M):
+        c = _log_sum(logs + T[:, j])
+        predicted.append(c)
+        weights = ca.exp(logs + T[:, j] - c)
+        carried = []
+        for i in range(M):
+            if x[i].names == x[j].names:
+                carried.append((ms[i], Ps[i]))
+                continue
+            m, P = ca.SX(ms[j]), ca.SX(Ps[j])
+            here = [b for b, s in enumerate(x[j].names) if s in x[i]]
+            there = [x[i].index(x[j].names[b]) for b in here]
+            rest = [b for b in range(n[j]) if b not in here]
+            m[here] = ms[i][there]
+            P[here, here] = Ps[i][there, there]
+            P[here, rest] = 0
+            P[rest, here] = 0
+            carried.append((m, P))
+        mean, cov = ca.SX(n[j], 1), ca.SX(n[j], n[j])
+        for i, (m, _) in enumerate(carried):
+            mean += weights[i] * m
+        for i, (m, P) in enumerate(carried):
+            cov += weights[i] * (P + (m - mean) @ (m - mean).T)
+        m_out.append(mean)
+        P_out.append(ca.vec(cov))
+    m_in, P_in = ca.vertcat(*ms), ca.vertcat(*(ca.vec(P) for P in Ps))
+    out = [ca.vertcat(*predicted), ca.vertcat(*m_out), ca.vertcat(*P_out)]
+    return ca.Function("mix", [logs, m_in, P_in, logT], [ca.densify(o) for o in ca.cse(out)])
+
+
+def _weigher(x: Sequence[Signals], common: Signals) -> ca.Function:
+    """SX Function (logs, logliks, m_f, P_f) -> (logs, loglik, mean, variance) of the mixture."""
+    M, n = len(x), [len(s) for s in x]
+    logs, ll = ca.SX.sym("logs", M), ca.SX.sym("ll", M)
+    m_in, P_in = ca.SX.sym("m", sum(n)), ca.SX.sym("P", sum(k * k for k in n))
+    total = _log_sum(logs + ll)
+    new = logs + ll - total
+    weights = ca.exp(new)
+    ms = ca.vertsplit(m_in, [0, *np.cumsum(n).tolist()])
+    Ps = ca.vertsplit(P_in, [0, *np.cumsum([k * k for k in n]).tolist()])
+    rows = [x[i].indices(common.names) for i in range(M)]
+    mean, var = ca.SX(len(common), 1), ca.SX(len(common), 1)
+    for i in range(M):
+        mean += weights[i] * ms[i][rows[i]]
+    for i in range(M):
+        own = ca.diag(ca.reshape(Ps[i], n[i], n[i]))[rows[i]]
+        var += weights[i] * (own + (ms[i][rows[i]] - mean) ** 2)
+    out = [new, total, ca.densify(mean), ca.densify(var)]
+    return ca.Function("weigh", [logs, ll, m_in, P_in], out)
+
+
+@lru_cache(maxsize=16)
+def _block(steps: tuple[FilterStep, ...], common: Signals, backend: str | None) -> Caller:
+    """``BLOCK`` cycles of mixing, filtering and weighing in one function."""
+    models = [s.model for s in steps]
+    x = [m.x for m in models]
+    n = [len(s) for s in x]
+    _, nu, np_, _, ny = models[0].sizes
+    shapes = {
+        "logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2, "u": nu,
+        "p": np_, "y": ny, "R": ny, "dt": 1,
+    }  # fmt: skip
+    s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
+    logs, m, P = _mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
+    ms = ca.vertsplit(m, [0, *np.cumsum(n).tolist()])
+    Ps = ca.vertsplit(P, [0, *np.cumsum([k * k for k in n]).tolist()])
+    # covariances are mixed, so filters that carry square roots hand them over as such
+    outs = [
+        step.plain.function(
+            ms[i], ca.reshape(Ps[i], n[i], n[i]), s["u"], s["p"], s["y"], s["R"], s["dt"]
+        )
+        for i, step in enumerate(steps)
+    ]
+    m_f = ca.vertcat(*(o[2] for o in outs))
+    P_f = ca.vertcat(*(ca.vec(o[3]) for o in outs))
+    ll = ca.vertcat(*(o[7][2] for o in outs))
+    check = ca.vertcat(*(o[7][0] for o in outs))
+    new, total, mean, var = _weigher(x, common)(logs, ll, m_f, P_f)
+    one = ca.Function(
+        "imm",
+        list(s.values()),
+        [
+            new, ca.vertcat(*(o[0] for o in outs)), ca.vertcat(*(ca.vec(o[1]) for o in outs)),
+            m_f, mean, var, ca.vertcat(total, check),
+        ],
+    )  # fmt: skip
+    return Caller(compiled(one.mapaccum("imm_block", BLOCK, 3), backend=backend), copy=False)
+
+
+def _log_transitions(
+    M: int, data: Recording, transition: Any, rates: Any, names: tuple[str, ...]
+) -> np.ndarray:
+    """Logarithms of the transition probabilities into each sample, (M*M, K), column-major."""
+    if (transition is None) == (rates is None):
+        raise ParameterError("give either transition (for each sample) or rates (per second)")
+    T = np.asarray(transition if rates is None else rates, float)
+    if T.shape != (M, M) or not np.isfinite(T).all():
+        raise ParameterError(f"a finite matrix of {M} x {M} is needed for {', '.join(names)}")
+    off = T - np.diag(np.diag(T))
+    want = 1.0 if rates is None else 0.0
+    bad = np.abs(T.sum(1) - want) > 1e-9 * max(1.0, float(np.abs(T).max()))
+    bad |= (off < 0).any(1)
+    if rates is None:
+        bad |= np.diag(T) < 0
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ParameterError(
+            f"row {names[i]!r} of the transitions: entries >= 0 that sum to {want:g} expected "
+            f"(rates: except the diagonal), got {T[i].tolist()}"
+        )
+    out = np.empty((M * M, data.size))
+    out[:, 0] = _logs(np.eye(M)).ravel(order="F")  # the prior is of the first sample's mode
+    if rates is None:
+        out[:, 1:] = _logs(T).ravel(order="F")[:, None]
+        return out
+    # the same step returns again and again, up to rounding of the stamps
+    steps, back = np.unique(np.round(data.dt[:-1], 12), return_inverse=True)
+    logs = np.array([_logs(np.maximum(expm(T * d), 0.0)).ravel(order="F") for d in steps])
+    out[:, 1:] = logs[back].T if steps.size else 0.0
+    return out
+
+
+def interacting_multiple_models(
+    models: Mapping[str, FilterModel | FilterStep],
+    prior: Belief | Mapping[str, Belief],
+    data: Recording,
+    *,
+    transition: Any = None,
+    rates: Any = None,
+    prior_probability: Mapping[str, float] | None = None,
+    backend: str | None = None,
+) -> ImmResult:
+    """Filter a recording with a mode that may change.
+
+    Parameters
+    ----------
+    models : models (taken by extended Kalman filters) or filters, by name; same inputs, parameters
+        and outputs.  States may differ: beliefs are exchanged by name.
+    prior : belief at the first instant, before its sample; one for all modes or one for each.
+    data : the recording.
+    transition : (M, M) probabilities of going from mode i (row) to j between two samples, whatever
+        the time between them; the identity makes the modes static.
+    rates : instead, (M, M) transition rates, 1/s, rows summing to zero: the matrix exponential over
+        each step, so that samples may come at any instants.
+    prior_probability : of the modes at the first sample, equal by default.
+    backend : see :func:`apu_casadi.backend.compiled`.
+
+    Raises
+    ------
+    ParameterError : transitions that are none, unknown or missing modes.
+    SignalError : models or priors that do not fit together.
+    EstimationError : a mode's belief was lost; names the mode and the instant.
+    """
+    steps = _steps(models)
+    names = tuple(steps)
+    M = len(names)
+    first = next(iter(steps.values())).model
+    for name, step in steps.items():
+        for kind in ("u", "p", "y"):
+            mine, want = getattr(step.model, kind).names, getattr(first, kind).names
+            if mine != want:
+                raise SignalError(
+                    f"modes {names[0]!r} and {name!r} differ in {kind}: {', '.join(want)} and "
+                    f"{', '.join(mine)}"
+                )
+    data.check(first)
+    priors = [prior if isinstance(prior, Belief) else prior[n] for n in names]
+    for name, b, step in zip(names, priors, steps.values(), strict=True):
+        if b.x.names != step.model.x.names:
+            raise SignalError(
+                f"mode {name!r}: prior of {', '.join(b.x.names)}; its model has "
+                f"{', '.join(step.model.x.names)}"
+            )
+    common = Signals([s for s in first.x if all(s.name in b.x for b in priors)])
+    logT = _log_transitions(M, data, transition, rates, names)
+    n = [len(b.x) for b in priors]
+    K = data.size
+    blocks = -(-K // BLOCK)
+    pad = blocks * BLOCK - K
+    missing = np.isnan(data.y)
+    y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
+    R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
+    u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
+    dt = np.pad(data.dt, (0, pad))[None, :]
+    # a padded sample measures nothing, lasts no time and changes no mode
+    logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
+    p = np.repeat(data.p[:, None], BLOCK, axis=1)
+    call = _block(tuple(steps.values()), common, backend)
+    logs = _log_prior(names, prior_probability)
+    m = np.concatenate([b.mean for b in priors])
+    P = np.concatenate([b.cov.ravel(order="F") for b in priors])
+    kept: list[list[np.ndarray]] = [[], [], [], [], []]
+    for block in range(blocks):
+        s = slice(block * BLOCK, (block + 1) * BLOCK)
+        out = call(logs, m, P, logT[:, s], u[:, s], p, y[:, s], R[:, s], dt[:, s])
+        count = min(BLOCK, K - block * BLOCK)
+        for target, source in zip(kept, (out[0], *out[3:]), strict=True):
+            target.append(source[:, :count].copy())
+        _believable(
+            names, n, data, out[1][:, :count], out[2][:, :count], kept[4][-1], block * BLOCK
+        )
+        logs, m, P = out[0][:, -1].copy(), out[1][:, -1].copy(), out[2][:, -1].copy()
+    logp, m_f, mean, var, stats = (np.concatenate(k, axis=1) for k in kept)
+    edges = np.cumsum([0, *n])
+    squares = np.cumsum([0, *(k * k for k in n)])
+    final = []
+    for j, belief in enumerate(priors):
+        cov = P[squares[j] : squares[j + 1]].reshape(n[j], n[j])
+        final.append(Belief(belief.x, m[edges[j] : edges[j + 1]], (cov + cov.T) / 2))
+    return ImmResult(
+        names,
+        common,
+        data.t,
+        logp,
+        mean,
+        var,
+        tuple(m_f[edges[j] : edges[j + 1]] for j in range(M)),
+        float(stats[0].sum()),
+        tuple(final),
+    )
+
+
+def _believable(
+    names: tuple[str, ...],
+    n: list[int],
+    data: Recording,
+    m1: np.ndarray,
+    P1: np.ndarray,
+    stats: np.ndarray,
+    start: int,
+) -> None:
+    """Refuse a block in which a mode's filter failed, whose NaN would reach all others."""
+    ok = stats[1:] <= CHECK_TOL
+    edges, squares = np.cumsum([0, *n]), np.cumsum([0, *(k * k for k in n)])
+    for j in range(len(names)):
+        ok[j] &= np.isfinite(m1[edges[j] : edges[j + 1]]).all(0)
+        ok[j] &= np.isfinite(P1[squares[j] : squares[j + 1]]).all(0)
+    if (ok.all(0) & np.isfinite(stats[0])).all():
+        return
+    k = int(np.argmin(ok.all(0) & np.isfinite(stats[0])))
+    j = int(np.argmin(ok[:, k]))
+    raise EstimationError(
+        f"mode {names[j]!r} at t = {data.t[start + k]:.9g} s (sample {start + k}): its belief is "
+        f"lost (model check {stats[1 + j, k]:.1e}); a mode must be solvable wherever the others "
+        "may lead it"
+    )
