@@ -28,10 +28,10 @@ from apu_casadi.backend import Caller, compiled
 from apu_casadi.errors import EstimationError, ParameterError, nearest
 from apu_casadi.generator import Generator
 from apu_casadi.machine.load import Load, SeriesLoad
-from apu_casadi.machine.park import Qd0, qd0_to_abc
+from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.machine.wrsg import Windings, currents, flux_rates
-from apu_casadi.terminalmodel import FLUXES, shunt_parameters
+from apu_casadi.terminalmodel import FLUXES, shunt_parameters, voltage_weight
 from estimators.belief import Belief
 from estimators.bounds import posterior_bound
 from estimators.ekf import ekf_step, extended_kalman_filter
@@ -123,6 +123,22 @@ class Truth:
             value = known.get(name, self.values.get(name, 0.0))
             rows.append(np.broadcast_to(value, self.t.shape))
         return np.array(rows)
+
+    def carried(self, filt: ElectricalFilter, samples: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return what a filter without gains carries: s(k) = x(k) + G e(k), shape (nx, K).
+
+        The fluxes as if the last voltages read were true; that is what its covariance is of.
+        """
+        s = self.state(filt)
+        e = {n: samples[n] - self.values[n] for n in VOLTAGES}
+        e_qd0 = abc_to_qd0(self.values["theta_e"], Abc(*(e[n] for n in VOLTAGES[:3])))
+        dt_last = np.append(0.0, np.diff(self.t))  # the first voltages have moved no flux yet
+        weight = [float(voltage_weight(w, h)) for w, h in zip(self.values["w_r"], dt_last,
+                                                              strict=True)]  # fmt: skip
+        for n, d in zip(("lam_sq", "lam_sd", "lam_s0"), e_qd0, strict=True):
+            s[filt.model.x.index(n)] += np.array(weight) * np.ravel(d)
+        s[filt.model.x.index("lam_fd")] += dt_last / 2 * e["V_fd"]
+        return s
 
 
 @lru_cache(maxsize=16)
@@ -394,7 +410,8 @@ def _scored(
         mean += error[i_h]
         nees_h += _nees(error[i_h].T, r.cov[checks][:, i_h][:, :, i_h])
         if full_nees:
-            nees_x += _nees(error.T, r.cov[checks])
+            carried = (r.mean - truth.carried(filt, samples))[:, checks]
+            nees_x += _nees(carried.T, r.cov[checks])
         nis += r.nis[checks]
     rmse = np.sqrt(err2 / n_seeds)
     sigma = np.sqrt(np.diagonal(bound[checks][:, i_h][:, :, i_h], axis1=1, axis2=2)).T
