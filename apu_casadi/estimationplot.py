@@ -79,7 +79,10 @@ def plot_gain_of_a_sensor(
                    label=f"without {sensor}")  # fmt: skip
         left.set_ylim(0, 100)
         right.set_yscale("log")
-        right.set_yticks(ticks, [f"{t:g}" for t in ticks])
+        seen = [np.min(c["null_after"]) for c in curves.values()]
+        levels = [t for t in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
+                  if 50 * min(seen) <= t <= 101 * prior[-1]]  # fmt: skip
+        right.set_yticks(levels, [f"{t:g}" for t in levels])
         right.minorticks_off()
         left.set_ylabel("reduction of the rms error, %")
         right.set_ylabel("1 sigma along the null direction, %")

@@ -19,6 +19,7 @@ MODULES: tuple[str, ...] = (
     "scenarios.commands.compile",
     "scenarios.commands.deck",
     "scenarios.commands.errata",
+    "scenarios.commands.estimate",
     "scenarios.commands.fit",
     "scenarios.commands.identify",
     "scenarios.commands.list",

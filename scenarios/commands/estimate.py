@@ -1,0 +1,246 @@
+"""Estimate faults with confidence: along a joint run, and in studies over many random runs.
+
+apu estimate joint                 along the paper's joint scenario: summary, data, figure
+apu estimate study NAME            one study (or all), kept part by part
+apu estimate page                  ESTIMATION.md from the kept studies
+apu estimate sensors               what is measured, how well, and where that is from
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+NAME = "estimate"
+HELP = "estimate faults with confidence: joint run, studies, their page"
+KEPT = "docs/estimation"
+NAMES = (
+    "correctness", "electrical", "detection", "gaspath", "shaft-power", "isolation", "fitting",
+    "joint", "speed",
+)  # fmt: skip
+"""The studies; here as well, so that the help needs nothing heavy.  A test compares."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the four actions."""
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+
+    def action(name: str, call: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+        p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
+        p.set_defaults(action=call)
+        return p
+
+    p = action("joint", _joint)
+    p.add_argument(
+        "--scenario", default="joint", metavar="NAME|FILE",
+        help="what is true: of the library, .toml or .py (default %(default)s)",
+    )  # fmt: skip
+    p.add_argument("--seed", type=int, default=1, metavar="N", help="of all errors (default 1)")
+    p.add_argument("--out", metavar="DIR", help="folder (default results/estimate_NAME)")
+    p.add_argument("--figures", action=argparse.BooleanOptionalAction, default=True,
+                   help="draw truth, estimate and band (default)")  # fmt: skip
+    p.add_argument("--json", action="store_true", help="print the summary as JSON only")
+    p.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
+
+    p = action("study", _study)
+    p.add_argument("study", metavar="NAME", help=f"all, or one of {', '.join(NAMES)}")
+    p.add_argument("--seeds", type=int, metavar="N", help="fresh seeds (default: the study's own)")
+    p.add_argument("--out", metavar="DIR", default=KEPT, help="where results are kept "
+                   "(default %(default)s)")  # fmt: skip
+    p.add_argument("--again", action="store_true", help="also run what is kept")
+    p.add_argument("--json", action="store_true", help="print the claims as JSON")
+    p.add_argument("--quiet", action="store_true", help="no progress bar")
+
+    p = action("page", _page)
+    p.add_argument("--from", dest="source", metavar="DIR", default=KEPT,
+                   help="where results are kept (default %(default)s)")  # fmt: skip
+    p.add_argument(
+        "--write", metavar="FILE", default="ESTIMATION.md",
+        help="the page, figures in docs/images beside it (default %(default)s)",
+    )  # fmt: skip
+
+    p.add_argument("--readme", metavar="FILE", help="also put the short table between its marks")
+
+    p = action("sensors", _sensors)
+    p.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what was asked for."""
+    status: int = args.action(args)
+    return status
+
+
+# ------------------------------------------------------------------------------ joint
+
+
+def _joint(args: argparse.Namespace) -> int:
+    """Simulate a scenario, measure it with noise, estimate along it, and compare."""
+    from apu_casadi import results
+    from apu_casadi.errors import ScenarioError
+    from scenarios import registry
+    from scenarios.commands.run import _bar, _stoppable
+    from scenarios.estimation import jointrun
+    from scenarios.pages import write_text
+
+    if args.seed < 0:
+        raise ScenarioError(f"--seed must be >= 0, got {args.seed}")
+    s = registry.get(args.scenario)
+    folder = registry.prepare(args.out or f"results/estimate_{s.name}")
+    show = not args.quiet and sys.stderr.isatty()
+    with _bar(f"{s.name}, truth", s.duration, show=show) as bar, _stoppable(bar) as progress:
+        truth = jointrun.truth(s, progress=progress)
+    if show:
+        print("estimating ...", file=sys.stderr)
+    with _interruptible():
+        e = jointrun.estimate(truth, args.seed)
+    report = jointrun.report(e)
+    made = [results.save(e, folder / f"estimate_{s.name}.nc")]
+    text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
+    made.append(write_text(folder / "estimate.json", text + "\n"))
+    if args.figures:
+        path = folder / f"estimate_{s.name}.png"
+        made.append(jointrun.draw(jointrun.saved(e, every=1), path))
+    if args.json:
+        print(text)
+        return 0
+    print(f"{s.name}, seed {args.seed}: estimate +- half width of the 95 % band\n")
+    print(jointrun.table(report), "", *jointrun.words(report), sep="\n")
+    if not args.quiet:
+        print("\nwritten:", *(f"  {p}" for p in made), sep="\n")
+    return 0
+
+
+# ------------------------------------------------------------------------------ studies
+
+
+def _study(args: argparse.Namespace) -> int:
+    """Run a study over fresh random seeds; parts that are kept are not run again."""
+    from apu_casadi.errors import ParameterError, nearest
+    from scenarios import registry
+    from scenarios.estimation import studies
+    from scenarios.estimation.reports import REPORTS
+
+    known = [*studies.STUDIES, "all"]
+    if args.study not in known:
+        raise ParameterError(f"unknown study {args.study!r} {nearest(args.study, known)}")
+    names = list(studies.STUDIES) if args.study == "all" else [args.study]
+    if args.seeds is not None and args.seeds < 2:
+        raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
+    folder = registry.prepare(args.out)
+    show = not args.quiet and sys.stderr.isatty()
+    found: dict[str, list[Any]] = {}
+    for name in names:
+        n = args.seeds or studies.get(name).seeds
+        todo = list(studies.get(name).parts) if args.again else studies.pending(
+            studies.get(name), folder, n
+        )  # fmt: skip
+        if not args.json:
+            print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
+        with _interruptible(), _study_bar(name, show=show) as progress:
+            record = studies.run(name, folder, n_seeds=n, again=args.again, progress=progress)
+        found[name] = REPORTS[name].claims(studies.results(record))
+        if not args.json:
+            for c in found[name]:
+                mark = "" if c.met is None else "  met   " if c.met else "  MISSED"
+                print(f"{mark}  {c.what}: {c.achieved} ({c.target}; {c.interval})", flush=True)
+    if args.json:
+        import dataclasses
+
+        table = {k: [dataclasses.asdict(c) for c in v] for k, v in found.items()}
+        print(json.dumps(table, indent=2, ensure_ascii=False))
+    else:
+        print(f"kept in {folder}; apu estimate page makes the page")
+    return 0
+
+
+@contextmanager
+def _study_bar(name: str, *, show: bool) -> Iterator[Callable[[str, float, float], None] | None]:
+    """Yield a callback that moves a bar of expected seconds, or None."""
+    if not show:
+        yield None
+        return
+    from tqdm import tqdm
+
+    columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
+    form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
+    with tqdm(total=1.0, desc=name, bar_format=form, ncols=columns, file=sys.stderr) as bar:
+
+        def progress(part: str, done: float, total: float) -> None:
+            bar.set_description_str(f"{name}, {part}", refresh=False)
+            bar.total = max(total, 1e-9)
+            bar.update(max(done - bar.n, 0.0))
+
+        yield progress
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let Ctrl-C come out as such, also where an integrator or a filter turned it into an error."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked = threading.Event()
+
+    def handler(*_: object) -> None:
+        asked.set()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    except Exception:
+        if asked.is_set():
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# ------------------------------------------------------------------------------ page, sensors
+
+
+def _page(args: argparse.Namespace) -> int:
+    """Write the page and its figures from the kept studies."""
+    from apu_casadi.errors import DataError
+    from scenarios.estimation import page
+    from scenarios.pages import write_text
+
+    try:
+        records = page.load(args.source)
+        made = page.write(args.write, records)
+        if args.readme:
+            path = Path(args.readme)
+            text = page.put_summary(path.read_text(encoding="utf-8"), records)
+            made.append(write_text(path, text))
+    except OSError as e:
+        raise DataError(f"{e.filename or args.write}: {e.strerror or e}") from None
+    print("written:", *(f"  {p}" for p in made), sep="\n")
+    return 0
+
+
+def _sensors(args: argparse.Namespace) -> int:
+    """Print the 1-sigma tables with their sources."""
+    from scenarios.estimation.sensors import ELECTRICAL, GAS_PATH
+
+    sets = {"gas path, every 20 ms": GAS_PATH, "electrical, at 10 kHz": ELECTRICAL}
+    if args.json:
+        print(json.dumps({k: v.table() for k, v in sets.items()}, indent=2, ensure_ascii=False))
+        return 0
+    for head, table in sets.items():
+        print(head)
+        for s in table.sensors:
+            noise = f"{100 * s.noise:g} %" if s.relative else f"{s.noise:g} {s.unit}"
+            gain = f"{100 * s.gain:g} %" if s.gain else "-"
+            print(f"  {s.name:<5} noise {noise:<8} gain {gain:<6} {s.source}")
+        print()
+    print("1 sigma; noise in per cent is of the reading, a gain error is constant")
+    return 0
