@@ -224,12 +224,16 @@ def jumps(
     for x in (2.0 / 3.0 * (turn @ v), v.mean(axis=0)):
         D = np.abs(x[:-2] - 2 * np.cos(a) * x[1:-1] + x[2:])
         size = np.concatenate([D[:1], np.minimum(D[:-1], D[1:]), D[-1:], [0.0]])
-        jump = np.zeros(K)
-        for k in np.flatnonzero(size > floor):
-            before = size[max(k - period, 0) : k] if k >= 4 else size[k + 1 : k + 1 + period]
-            if size[k] > 2 * np.quantile(before, 0.9):
-                jump[k] = size[k]
-        found.append(jump)
+        k = np.flatnonzero(size > floor)
+        early, late = k[k < period], k[k >= period]
+        usual = np.zeros(K)
+        for j in early:  # too few samples before: what there is, or the period after
+            before = size[:j] if j >= 4 else size[j + 1 : j + 1 + period]
+            usual[j] = np.quantile(before, 0.9)
+        if late.size:
+            windows = np.lib.stride_tricks.sliding_window_view(size, period)
+            usual[late] = np.quantile(windows[late - period], 0.9, axis=1)
+        found.append(np.where((size > floor) & (size > 2 * usual), size, 0.0))
     return found[0], found[1]
 
 

@@ -717,6 +717,53 @@ def pycycle(size: Size) -> list[Row]:
     ]  # fmt: skip
 
 
+# ------------------------------------------------------------------------------ estimation
+
+
+def estimation(size: Size) -> list[Row]:
+    """A step of the electrical EKF and UKF in generated C, filterpy's UKF, and the joint estimate.
+
+    Fastest of some: a filter step is micro-seconds, and anything else that runs only adds to it.
+    """
+    from estimators.ekf import extended_kalman_filter
+    from estimators.ukf import unscented_kalman_filter
+    from scenarios.estimation import electrical_study as study
+    from scenarios.estimation import jointrun, timing
+    from scenarios.estimation.electrical import electrical_filter
+
+    steps = study.speed(repeat=size.repeats)
+    name, fastest = next(iter(steps["rows"].items()))
+    peer = timing.filterpy_step_us(repeat=max(1, size.repeats // 2))
+    samples = study.samples_of(study.generator_truth(study.FULL, 0.05), np.random.default_rng(0))
+    filt = electrical_filter()
+    data, prior = filt.recording(samples), filt.prior(samples)
+    rows = []
+    for kind, run_filter in (("ekf", extended_kalman_filter), ("ukf", unscented_kalman_filter)):
+        c, vm = (run_filter(filt.model, prior, data, backend=b) for b in ("auto", "vm"))
+        error = float((np.abs(c.mean - vm.mean) / np.sqrt(vm.variance)).max())
+        other = kind == "ukf" and peer is not None
+        rows.append(
+            Row(f"step of the electrical {kind.upper()}, {name}", fastest[f"{kind}_us"], "us",
+                steps["goal_us"][kind], error, 1e-6,
+                "means against the virtual machine's, in standard deviations",
+                peer="filterpy's UKF, same functions" if other else "",
+                ratio=peer / fastest["ukf_us"] if other and peer is not None else None)
+        )  # fmt: skip
+    joint = timing.joint_seconds(repeat=max(1, size.repeats // 2))
+    ends = jointrun.report(jointrun.estimate(jointrun.truth("joint"), 1))["phases"]
+    error = max(
+        abs(v["estimate"] - v["true"]) / (v["half_width"] / jointrun.Z95)
+        for p in ends
+        for v in p["values"].values()
+    )
+    rows.append(
+        Row(f"joint estimation of {joint['simulated']:g} s, electrical and gas path",
+            joint["seconds"], "s", 5.0, error, 4.0,
+            "largest error at the ends of the phases, in claimed standard deviations")
+    )  # fmt: skip
+    return rows
+
+
 # ------------------------------------------------------------------------------ all of it
 
 Part = Callable[[Size], list[Row]]
@@ -729,6 +776,7 @@ PARTS: Mapping[str, Part] = {
     "joint": joint,
     "memory": memory,
     "campaign": campaign,
+    "estimation": estimation,
 }
 PEERS: Mapping[str, Part] = {"dpsim": dpsim, "pycycle": pycycle}
 LINEAR = "linear"

@@ -1,7 +1,7 @@
 """The console command ``apu``.
 
-Exit status: 0 done; 1 a simulation or an estimate failed; 2 wrong usage, scenario, parameter or file;
-130 interrupted by Ctrl-C.
+Exit status: 0 done; 1 a simulation or an estimate failed; 2 wrong usage, scenario, parameter or
+file; 130 interrupted by Ctrl-C.
 """
 
 from __future__ import annotations

@@ -109,3 +109,10 @@ def test_the_command(capsys, tmp_path, monkeypatch):
     assert main(["bench", "--runs", "0"]) == 2
     with pytest.raises(ScenarioError, match="unknown part"):
         bench.run(["trin"])
+
+
+@pytest.mark.slow
+def test_the_estimation_part_runs_and_is_accurate():
+    """Compiles six filters: some minutes."""
+    rows = bench.estimation(TINY)
+    assert len(rows) == 3 and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
