@@ -42,7 +42,9 @@ __all__ = ["filterpy_ekf", "filterpy_ukf", "run_filterpy"]
 class _Evaluated:
     """f and g of a model with numbers: values, Jacobians and process noise, checked."""
 
-    def __init__(self, model: FilterModel, p: Mapping[str, float] | None, backend: str | None):
+    def __init__(
+        self, model: FilterModel, p: Mapping[str, float] | None, backend: str | None
+    ) -> None:
         """Refuse what filterpy cannot express, compile the rest."""
         if model.output.sparsity_jac(3, 0).nnz():
             J = ca.DM(model.output.sparsity_jac(3, 0), 1)

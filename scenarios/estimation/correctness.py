@@ -18,6 +18,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 
 from apu_casadi.errors import EstimationError
 from apu_casadi.signals import Signal, Signals
@@ -94,20 +95,26 @@ def _drawn(seed: int, *, plain: bool) -> tuple[Parts, Belief, Recording]:
 
 
 def _kalman(parts: Parts, prior: Belief, data: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Filtered means (NX, K) and covariances (K, NX, NX) by the covariance form."""
+    """Filtered means (NX, K) and covariances (K, NX, NX) by the covariance form.
+
+    State and noise together; Joseph's update, since the short form P - P C' S^-1 C P loses digits
+    where a system that is nearly unobserved has grown (2e-9 on one of 500 systems).
+    """
     A, B, G, C, D = parts
     m, P, Q = prior.mean, prior.cov, np.diag(np.square(WALK))
     mean, cov = np.empty((NX, data.size)), np.empty((data.size, NX, NX))
+    nw = G.shape[1]
+    F = np.hstack([A, G])
     for k in range(data.size):
         i = np.flatnonzero(~np.isnan(data.y[:, k]))
-        S = C[i] @ P @ C[i].T + D[i] @ D[i].T + np.diag(data.variance[i, k])
-        gain = np.linalg.inv(S)
-        e = data.y[i, k] - C[i] @ m
-        mean[:, k], cov[k] = m + P @ C[i].T @ gain @ e, P - P @ C[i].T @ gain @ C[i] @ P
-        # a sample tells of the noise that also drives the state
-        cross = A @ P @ C[i].T + G @ D[i].T
-        m = A @ m + B @ data.u[:, k] + cross @ gain @ e
-        P = A @ P @ A.T + G @ G.T + Q * data.dt[k] - cross @ gain @ cross.T
+        H, R = np.hstack([C[i], D[i]]), np.diag(data.variance[i, k])
+        both = scipy.linalg.block_diag(P, np.eye(nw))
+        gain = np.linalg.solve(H @ both @ H.T + R, H @ both).T
+        at = np.append(m, np.zeros(nw)) + gain @ (data.y[i, k] - C[i] @ m)
+        rest = np.eye(NX + nw) - gain @ H
+        both = rest @ both @ rest.T + gain @ R @ gain.T
+        mean[:, k], cov[k] = at[:NX], both[:NX, :NX]
+        m, P = F @ at + B @ data.u[:, k], F @ both @ F.T + Q * data.dt[k]
     return mean, cov
 
 
