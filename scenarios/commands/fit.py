@@ -128,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
                 profiles.append(profile(fit.result, name))
     figures = _draw(fit, args.figure, steady) if args.figure else []
     found = report(fit, profiles, ignored, steady=steady)
+    found["assumed_ambient"] = _assumed(data)
     if args.json:
         print(json.dumps(found, indent=2, allow_nan=False))
         return 0
@@ -266,6 +267,15 @@ def _data(table: Table, t: Any, sensors: SensorSet, args: argparse.Namespace) ->
         ambient = {n: v if np.ndim(v) == 0 else v[there] for n, v in ambient.items()}
         rows = rows[there]
     return EngineData(table.source, rows, readings, ambient)
+
+
+def _assumed(data: Sequence[EngineData]) -> dict[str, float]:
+    """Ambient conditions that neither option nor column gave, at the values that were taken."""
+    from apu_casadi.gasgenerator import GasGenerator
+    from scenarios.estimation.fitting import AMBIENT
+
+    U = GasGenerator.U
+    return {n: U[n].default or 0.0 for n in AMBIENT if any(n not in d.ambient for d in data)}
 
 
 def _ignored(tables: Sequence[Table], sensors: SensorSet, time: str | None) -> list[str]:
@@ -427,6 +437,12 @@ def text(found: Mapping[str, Any]) -> str:
         lines.append(f"not measured, and left open: {', '.join(open_)}")
     if found["considered"]:
         lines.append(f"intervals include the uncertainty of {', '.join(found['considered'])}")
+    if found.get("assumed_ambient"):
+        taken = ", ".join(f"{n} = {v:g}" for n, v in found["assumed_ambient"].items())
+        lines.append(
+            f"assumed, since neither option nor column gives it: {taken}; a wrong ambient "
+            "condition is taken for a change of health"
+        )
     if found["ignored_columns"]:
         lines.append(f"columns not used: {', '.join(found['ignored_columns'])}")
     return "\n".join(lines)

@@ -563,6 +563,7 @@ def track(
     *,
     backend: str | None = None,
     max_resets: int = 20,
+    own_level: bool | None = None,
 ) -> tuple[FilterResult, list[float]]:
     """Filter a recording in which faults come and go: h follows steps at once.
 
@@ -570,8 +571,15 @@ def track(
     innovations are watched: where their normalised square, averaged over ``RESET_WINDOW`` samples,
     exceeds ``RESET_LEVEL``, h and fluxes become uncertain again at the window's start
     (``RESET_SIGMA``), and the filter goes on from there.  The first two windows of a piece are not
-    judged, since a start needs them to settle.  With gains considered, a window is compared with
-    those before it (the first four are not judged).
+    judged, since a start needs them to settle.
+
+    Parameters
+    ----------
+    filt, prior, data, backend : as of the filter.
+    max_resets : more than these, and the model is refused.
+    own_level : whether a window is compared with those before it (the first four are not judged)
+        instead of with what white innovations give: where gain errors are considered (the
+        default there), or taken as noise, each unit has a level of its own.
 
     Returns
     -------
@@ -582,6 +590,7 @@ def track(
     ------
     EstimationError : more than ``max_resets`` resets: the model does not fit the data at all.
     """
+    own_level = filt.gains == "consider" if own_level is None else own_level
     begin = 0
     pieces: list[FilterResult] = []
     resets: list[float] = []
@@ -592,7 +601,7 @@ def track(
         # judged window by window; the first two after a start are not
         full = r.nis.size // RESET_WINDOW
         share = r.nis[: full * RESET_WINDOW].reshape(full, RESET_WINDOW) @ mean_of
-        usual = _usual(share) if filt.gains == "consider" else np.full(full, float(len(MEASURED)))
+        usual = _usual(share) if own_level else np.full(full, float(len(MEASURED)))
         share[:2] = 0.0
         bad = np.flatnonzero(share > usual + RESET_LEVEL - len(MEASURED))
         if not bad.size:

@@ -213,7 +213,7 @@ def _electrical_side(
         data = dataclasses.replace(part, u=u, p=filt.model.p.pack({}))
         resets: list[float] = []
         if any(n.startswith("h_") for n in filt.model.x.names):
-            r, resets = track(filt, prior, data, backend=backend)
+            r, resets = track(filt, prior, data, backend=backend, own_level=gain_errors or None)
         else:  # a healthy machine's filter has no step to look for
             r = extended_kalman_filter(filt.model, prior, data, backend=backend)
         ends, P, var = window_power(filt, r, data)
