@@ -54,7 +54,8 @@ class Size:
     repeats : timings of each, of which the median counts.
     runs, checked : runs of the campaign, and how many of them CVODES runs again.
     hour : duration of the long run, s.
-    durations, counts, rates : of the linearity plot: s, runs, samples per second.  Waveforms below
+    durations, counts, rates : of the linearity plot: s, runs (each has faults of its own, which
+        cost more or less; many even that out), samples per second.  Waveforms below
         20 kHz are computed at 20 kHz and thinned, so lower rates cost what that costs.
     """
 
@@ -68,7 +69,7 @@ class Size:
     checked: int = 2
     hour: float = 3600.0
     durations: tuple[float, ...] = (14.0, 28.0, 56.0, 84.0, 112.0)
-    counts: tuple[int, ...] = (1, 4, 8, 12, 16)
+    counts: tuple[int, ...] = (8, 16, 32, 64, 96)
     rates: tuple[float, ...] = (0.0, 20e3, 40e3, 60e3, 80e3)
 
 
