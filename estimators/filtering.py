@@ -197,6 +197,19 @@ def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> c
     return compiled(_chained(chain, CHAIN, f"{name}_block", 2, len(kept)), backend=backend)
 
 
+def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:
+    """Return (y, R, u, dt) as a step takes them, ``pad`` samples longer, one column a sample.
+
+    A padded sample measures nothing and lasts no time; what comes out of it is dropped.
+    """
+    missing = np.isnan(data.y)
+    y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
+    R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
+    u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
+    dt = np.pad(data.dt, (0, pad))[None, :]
+    return y, R, u, dt
+
+
 def run(
     step: FilterStep,
     prior: Belief,
@@ -237,11 +250,7 @@ def run(
     n_blocks = -(-K // BLOCK)
     pad = n_blocks * BLOCK - K
     missing = np.isnan(data.y)
-    # a padded sample measures nothing and lasts no time; what comes out of it is dropped
-    y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
-    R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
-    u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
-    dt = np.pad(data.dt, (0, pad))[None, :]
+    y, R, u, dt = padded(data, pad)
     mean, var = np.empty((nx, K)), np.empty((nx, K))
     nu, S = np.empty((ny, K)), np.empty((ny, K))
     stats = np.empty((len(STATS), K))

@@ -32,7 +32,7 @@ from apu_casadi.errors import EstimationError, ParameterError, SignalError, near
 from apu_casadi.signals import Signals
 from estimators.belief import Belief
 from estimators.ekf import ekf_step
-from estimators.filtering import FilterResult, FilterStep, run
+from estimators.filtering import FilterResult, FilterStep, padded, run
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording
 
@@ -420,12 +420,8 @@ def interacting_multiple_models(
     K = data.size
     blocks = -(-K // BLOCK)
     pad = blocks * BLOCK - K
-    missing = np.isnan(data.y)
-    y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
-    R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
-    u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
-    dt = np.pad(data.dt, (0, pad))[None, :]
-    # a padded sample measures nothing, lasts no time and changes no mode
+    y, R, u, dt = padded(data, pad)
+    # a padded sample changes no mode
     logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
     p = np.repeat(data.p[:, None], BLOCK, axis=1)
     call = _block(tuple(steps.values()), common, backend)
