@@ -58,14 +58,13 @@ __all__ = [
 log = logging.getLogger("apu_casadi")
 
 BACKENDS = ("auto", "vm", "c")
-# -O1 compiles in half the time of -O2 and runs as fast on this kind of code (long straight-line
-# blocks); no -ffast-math, because NaN must survive.
-FLAGS = ("-O1", "-fPIC", "-shared", "-fno-math-errno")
+FLAGS = ("-fPIC", "-shared", "-fno-math-errno")  # no -ffast-math, because NaN must survive
+LEVELS = (1, 2, 3)  # -O1, -O2, -O3
 COMPILE_TIMEOUT = 900.0  # s
 
 _chosen: list[str | None] = [None]
 _said: set[str] = set()
-_compiled: OrderedDict[tuple[int, str], tuple[ca.Function, ca.Function]] = OrderedDict()
+_compiled: OrderedDict[tuple[int, str, int], tuple[ca.Function, ca.Function]] = OrderedDict()
 _loaded: dict[str, ca.Function] = {}
 _failed: dict[str, str] = {}
 _MEMO = 512
@@ -230,7 +229,9 @@ def clear_cache() -> int:
 # ------------------------------------------------------------------------------ compile and load
 
 
-def compiled(fun: ca.Function, *, backend: str | None = None, build: bool = True) -> ca.Function:
+def compiled(
+    fun: ca.Function, *, backend: str | None = None, build: bool = True, level: int = 1
+) -> ca.Function:
     """Return ``fun`` compiled from generated C, or ``fun`` itself in the virtual machine.
 
     The second call with the same function costs nothing.
@@ -241,16 +242,21 @@ def compiled(fun: ca.Function, *, backend: str | None = None, build: bool = True
         ``bspline`` and ``map`` do; ``cvodes``, ``idas``, ``newton`` and ``kinsol`` do not).
     backend : overrides the backend in use.
     build : compile if no library is found; False only loads, which suits a single short call.
+    level : how hard the C compiler optimises, 1 to 3.  Long straight-line code, a filter's block
+        or a trim, runs as fast at 1 and compiles in half the time; short bodies in loops over many
+        samples gain up to a third from 3.
 
     Raises
     ------
     BackendError : ``backend="c"`` was demanded and there is no compiler, no folder for the library,
-        or the compiler failed.
+        or the compiler failed; no such level.
     """
+    if level not in LEVELS:
+        raise BackendError(f"{fun.name()}: level must be one of {LEVELS}, got {level!r}")
     wanted = _wanted(backend)
     if wanted == "vm":
         return fun
-    memo = (fun.__hash__(), wanted)
+    memo = (fun.__hash__(), wanted, level)
     known = _compiled.get(memo)
     if known is not None:
         _compiled.move_to_end(memo)
@@ -259,12 +265,12 @@ def compiled(fun: ca.Function, *, backend: str | None = None, build: bool = True
     if command is None:
         return fun
     text = f"{fun.name()}\n{fun.serialize()}"
-    key = _library_key(hashlib.sha256(text.encode()).hexdigest(), command)
+    key = _library_key(hashlib.sha256(text.encode()).hexdigest(), command, level)
     made = _load(fun.name(), key)
     if made is None and not build:
         return fun
     if made is None:
-        made = _make(fun, key, command, wanted)
+        made = _make(fun, key, (*command, f"-O{level}"), wanted)
     if made is None:
         return fun
     _remember(memo, fun, made)
@@ -366,12 +372,13 @@ def _toolchain(wanted: str) -> tuple[str, ...] | None:
 _SUFFIX = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def _library_key(content: str, command: tuple[str, ...]) -> str:
-    parts = (content, ca.__version__, _identity(command), *FLAGS, sys.platform, platform.machine())
+def _library_key(content: str, command: tuple[str, ...], level: int = 1) -> str:
+    made_by = (_identity(command), f"-O{level}", *FLAGS)
+    parts = (content, ca.__version__, *made_by, sys.platform, platform.machine())
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:40]
 
 
-def _remember(memo: tuple[int, str], fun: ca.Function, made: ca.Function) -> None:
+def _remember(memo: tuple[int, str, int], fun: ca.Function, made: ca.Function) -> None:
     _compiled[memo] = (fun, made)  # fun is held, so that its address is not given to another
     while len(_compiled) > _MEMO:
         _compiled.popitem(last=False)

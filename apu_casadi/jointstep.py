@@ -36,6 +36,8 @@ class BlockResult(NamedTuple):
     y : gas generator's outputs after each step, shape (ny, BLOCK).
     means : means over each step, shape (quantities, BLOCK).
     waves : samples, shape (outputs, BLOCK * n_out).
+
+    ``y``, ``means`` and ``waves`` are overwritten by the next block.
     """
 
     N: np.ndarray
@@ -127,6 +129,7 @@ class JointBlock:
         if not good:
             return None
         n_x, n_z = N.size, z.size
+        last = last.copy()  # the state stays when a later block is refused
         return BlockResult(
             last[:n_x],
             last[n_x : n_x + n_z],
@@ -145,5 +148,5 @@ def _caller(apu: Apu, machine: Propagator | MeanStep) -> Caller:
     """One compiled block for each unit and layout."""
     key = (apu, *machine.layout)
     if key not in _CALLERS:
-        _CALLERS[key] = Caller(compiled(_function(apu, machine)))
+        _CALLERS[key] = Caller(compiled(_function(apu, machine), level=3), copy=False)
     return _CALLERS[key]

@@ -306,14 +306,12 @@ class MachineStep:
         grid: np.ndarray,
     ) -> BlockResult | None:
         """Advance the whole unit over several exchange steps at once; None where that is not on."""
-        if (
-            not self._ready
-            or grid.size != BLOCK + 1
-            or np.abs(np.diff(grid) - self.dt).max() > GRID_TOL
-        ):
+        if not self._ready or grid.size != BLOCK + 1:
             return None
         fast = self._means() if self.waveform_dt is None else self._samples()
         if fast is None or (isinstance(fast, Propagator) and not fast.constant):
+            return None
+        if np.abs(np.diff(grid) - self.dt).max() > GRID_TOL:
             return None
         if self._block is None:
             self._block = JointBlock(self.apu, fast)

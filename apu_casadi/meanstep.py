@@ -466,7 +466,7 @@ class MeanStep:
         if not self.valid(w):
             raise SimulationError(f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table")
         if self._compiled is None:
-            self._compiled = Caller(compiled(self.advance))
+            self._compiled = Caller(compiled(self.advance, level=3))
         held = [self.theta] if self.theta.size else []
         x, mean, miss = self._compiled(x0, self.parameters, u, *held, self.dt)
         if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):

@@ -250,7 +250,11 @@ class Table:
         """Coefficients at speed w, rad/s: even and odd, shape (terms, entries)."""
         s = (w - self.centre) / self.half
         powers = np.array([1.0, s, s * s, s * s * s])
-        return np.tensordot(powers, self.even, 1), np.tensordot(powers, self.odd, 1)
+        even, odd = (
+            (powers @ part.reshape(_NODES, -1)).reshape(part.shape[1:])
+            for part in (self.even, self.odd)
+        )
+        return even, odd
 
 
 def transition_table(
@@ -723,12 +727,23 @@ class Propagator:
             z = np.exp(1j * (float(x0[self._angle]) + w * self._starts))
             E, O = self._even, self._odd
             E[:, 1] = z * z
-            for k in range(2, E.shape[1]):
-                np.multiply(E[:, k - 1], E[:, 1], out=E[:, k])
+            known = 2
+            while known < E.shape[1]:  # powers by doubling: fewer, longer operations
+                more = E[:, known : 2 * known]
+                top = E[:, known - 1, None] * E[:, 1, None]
+                np.multiply(E[:, : more.shape[1]], top, out=more)
+                known *= 2
             np.multiply(E[:, : O.shape[1]], z[:, None], out=O)
             # one row for each step of the exciter is one column of the compiled function's input
-            P, Q = (Z.view(float) @ c for Z, c in ((E, even), (O, odd)))
-            x, y, mean, miss = self._compiled(x0, P.T, Q.T, u, self.theta, self.h)
+            buffers = self._compiled.inputs
+            np.matmul(E.view(float), even, out=buffers[1].T)
+            np.matmul(O.view(float), odd, out=buffers[2].T)
+            for buffer, value in zip(
+                (buffers[0], *buffers[3:]), (x0, u, self.theta, self.h), strict=True
+            ):
+                buffer[...] = value
+            self._compiled.evaluate()
+            x, y, mean, miss = self._compiled.outputs
         if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
             raise SimulationError(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
@@ -754,7 +769,7 @@ _CALLERS: dict[int, tuple[ca.Function, Any]] = {}
 def _caller(fun: ca.Function) -> Any:
     """One compiled caller per function; the function is kept, so that its id stays valid."""
     if id(fun) not in _CALLERS:
-        _CALLERS[id(fun)] = (fun, Caller(compiled(fun)))
+        _CALLERS[id(fun)] = (fun, Caller(compiled(fun, level=3), copy=False))
     return _CALLERS[id(fun)][1]
 
 

@@ -343,3 +343,19 @@ def test_clear_cache_counts_libraries(fresh):
     assert backend.clear_cache() == 1
     assert not list(fresh.iterdir())
     assert np.isfinite(backend.Caller(c)(X, P)[0]).all()
+
+
+@needs_compiler
+def test_level_is_part_of_the_name(monkeypatch):
+    """A function compiled at another level is another library; results are the same."""
+    runs = count_compilations(monkeypatch)
+    f = pendulum()
+    first, again, hard = (backend.compiled(f, level=k) for k in (1, 1, 3))
+    assert len(runs) == 2 and first is again
+    assert "-O1" in runs[0][0] and "-O3" in runs[1][0]
+    # -O3 may order sums otherwise
+    np.testing.assert_allclose(
+        backend.Caller(first)(X, P)[0], backend.Caller(hard)(X, P)[0], rtol=1e-14
+    )
+    with pytest.raises(BackendError, match=r"level must be one of \(1, 2, 3\), got 4"):
+        backend.compiled(f, level=4)
