@@ -52,7 +52,7 @@ class Solver:
                 f"{self._digest} {which}", lambda: getattr(self.kernel, which),
                 compile_missing=compile,
             )  # fmt: skip
-            loaded = compile or f.is_a("External")
+            loaded = compile or f.class_name() == "External"
             self._made[(which, "c") if loaded else tried] = f
             return f
         return self._made[(which, "c")]

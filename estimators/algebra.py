@@ -14,7 +14,6 @@ import numpy as np
 __all__ = [
     "RootUpdate",
     "append_column",
-    "as_symbols_of",
     "backward",
     "cholesky",
     "cholesky_semidefinite",
@@ -226,14 +225,6 @@ def symmetric(P: ca.SX) -> ca.SX:
             out[i, j] = P[i, j]
             out[j, i] = P[i, j]
     return out
-
-
-def as_symbols_of(kind: type, fun: ca.Function) -> ca.Function:
-    """Return ``fun`` as it should be called from expressions of ``kind``.
-
-    Called with SX it is written out and its structural zeros vanish; with MX it stays a call.
-    """
-    return fun if kind is ca.MX else fun.expand()
 
 
 def root_of(cov: np.ndarray) -> np.ndarray:

@@ -27,7 +27,16 @@ from estimators.recording import Recording
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["BLOCK", "STEP_IN", "STEP_OUT", "FilterResult", "FilterStep", "run"]
+__all__ = [
+    "BLOCK",
+    "STEP_IN",
+    "STEP_OUT",
+    "FilterResult",
+    "FilterStep",
+    "block_of",
+    "padded",
+    "run",
+]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
@@ -174,6 +183,21 @@ def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.F
     return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
 
 
+def block_of(one: ca.Function, name: str, carried: int) -> ca.Function:
+    """Return ``BLOCK`` calls of a step as one function.
+
+    Parameters
+    ----------
+    one : step; its first ``carried`` outputs are those inputs of the next call, its last input is
+        the same in all calls.
+    name : of the result, which takes the other inputs and gives the other outputs side by side.
+    carried : number of inputs that are handed on; of these outputs the last is returned.
+    """
+    kept = one.n_out() - carried
+    chain = _chained(one, CHAIN, f"{name}_chain", carried, kept)
+    return _chained(chain, CHAIN, f"{name}_block", carried, kept)
+
+
 @lru_cache(maxsize=64)
 def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> ca.Function:
     """``BLOCK`` steps in one function; ``_in_use`` keeps the forms of each backend apart.
@@ -193,8 +217,7 @@ def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> c
     name = f"{step.function.name()}{'_full' if full else ''}"
     out = [o["m1"], o["P1"], *(ca.densify(k) for k in kept)]
     one = ca.Function(f"{name}_one", [m, P, u, y, R, dt, p], out)
-    chain = _chained(one, CHAIN, f"{name}_chain", 2, len(kept))
-    return compiled(_chained(chain, CHAIN, f"{name}_block", 2, len(kept)), backend=backend)
+    return compiled(block_of(one, name, 2), backend=backend)
 
 
 def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
+from scipy.special import ndtri
 
 from apu_casadi.errors import EstimationError, ParameterError, nearest
 from estimators.belief import Belief
@@ -44,6 +45,7 @@ __all__ = [
     "Profile",
     "fit",
     "profile",
+    "quantile",
 ]
 
 #: Eigenvalue of the information, parameters scaled to unit information each, below which a
@@ -53,9 +55,13 @@ WEAK_TOL = 1e-4
 _AT_BOUND = 1e-6  # of the parameter's magnitude
 
 
-def _quantile(level: float) -> float:
-    from scipy.special import ndtri
+def quantile(level: float) -> float:
+    """Return how many standard deviations on either side hold a share ``level`` of a Gaussian.
 
+    Raises
+    ------
+    ParameterError : a level outside (0, 1).
+    """
     if not 0 < level < 1:
         raise ParameterError(f"level = {level!r} must lie between 0 and 1")
     return float(ndtri(0.5 + level / 2))
@@ -147,7 +153,7 @@ class FitResult:
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval of one parameter, from its standard error."""
         m, s = self[name]
-        z = _quantile(level)
+        z = quantile(level)
         return m - z * s, m + z * s
 
     @cached_property
@@ -670,7 +676,7 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
     run, i = result._run, result._run.problem.free[j]
     program = run.problem.program
     scale = program.theta_scale[i]
-    best, target = run.solution, _quantile(level)
+    best, target = run.solution, quantile(level)
     at = best.z[i] * scale
     sigma = result.sigma[j] if np.isfinite(result.sigma[j]) and result.sigma[j] > 0 else None
     seen: dict[float, float] = {at: 0.0}

@@ -27,12 +27,12 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from apu_casadi.backend import Caller, compiled
+from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.signals import Signals
 from estimators.belief import Belief
 from estimators.ekf import ekf_step
-from estimators.filtering import FilterResult, FilterStep, padded, run
+from estimators.filtering import BLOCK, FilterResult, FilterStep, block_of, padded, run
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording
 
@@ -44,7 +44,6 @@ __all__ = [
     "multiple_models",
 ]
 
-BLOCK = 50  # samples in one call
 IMPOSSIBLE = -1e30  # stands for the logarithm of 0: finite, so that differences are defined
 
 
@@ -293,15 +292,22 @@ def _weigher(x: Sequence[Signals], common: Signals) -> ca.Function:
 
 
 @lru_cache(maxsize=16)
-def _block(steps: tuple[FilterStep, ...], common: Signals, backend: str | None) -> Caller:
-    """``BLOCK`` cycles of mixing, filtering and weighing in one function."""
+def _block(
+    steps: tuple[FilterStep, ...], common: Signals, backend: str | None, _in_use: str
+) -> ca.Function:
+    """``BLOCK`` cycles of mixing, filtering and weighing in one function.
+
+    (logs, m, P, logT, u, y, R, dt, p) -> (logs, m, P) for the next block, and for each sample logs,
+    the predicted m, P, the filtered m, P, mean and variance of the mixture, and log-likelihood with
+    checks; m, P of all modes stacked.
+    """
     models = [s.model for s in steps]
     x = [m.x for m in models]
     n = [len(s) for s in x]
     _, nu, np_, _, ny = models[0].sizes
     shapes = {
         "logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2, "u": nu,
-        "p": np_, "y": ny, "R": ny, "dt": 1,
+        "y": ny, "R": ny, "dt": 1, "p": np_,
     }  # fmt: skip
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
     logs, m, P = _mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
@@ -319,15 +325,14 @@ def _block(steps: tuple[FilterStep, ...], common: Signals, backend: str | None) 
     ll = ca.vertcat(*(o[7][2] for o in outs))
     check = ca.vertcat(*(o[7][0] for o in outs))
     new, total, mean, var = _weigher(x, common)(logs, ll, m_f, P_f)
-    one = ca.Function(
-        "imm",
-        list(s.values()),
-        [
-            new, ca.vertcat(*(o[0] for o in outs)), ca.vertcat(*(ca.vec(o[1]) for o in outs)),
-            m_f, mean, var, ca.vertcat(total, check),
-        ],
-    )  # fmt: skip
-    return Caller(compiled(one.mapaccum("imm_block", BLOCK, 3), backend=backend), copy=False)
+    carried = [
+        new,
+        ca.vertcat(*(o[0] for o in outs)),
+        ca.vertcat(*(ca.vec(o[1]) for o in outs)),
+    ]
+    kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check)]
+    one = ca.Function("imm_one", list(s.values()), [*carried, *kept])
+    return compiled(block_of(one, "imm", len(carried)), backend=backend)
 
 
 def _log_transitions(
@@ -423,29 +428,29 @@ def interacting_multiple_models(
     y, R, u, dt = padded(data, pad)
     # a padded sample changes no mode
     logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
-    p = np.repeat(data.p[:, None], BLOCK, axis=1)
-    call = _block(tuple(steps.values()), common, backend)
+    # the buffers are this run's own, as in estimators.filtering
+    block = _block(tuple(steps.values()), common, backend, backend_in_use())
+    call = Caller(block, copy=False)
     logs = _log_prior(names, prior_probability)
     m = np.concatenate([b.mean for b in priors])
     P = np.concatenate([b.cov.ravel(order="F") for b in priors])
     kept: list[list[np.ndarray]] = [[], [], [], [], []]
-    for block in range(blocks):
-        s = slice(block * BLOCK, (block + 1) * BLOCK)
-        out = call(logs, m, P, logT[:, s], u[:, s], p, y[:, s], R[:, s], dt[:, s])
-        count = min(BLOCK, K - block * BLOCK)
-        for target, source in zip(kept, (out[0], *out[3:]), strict=True):
-            target.append(source[:, :count].copy())
-        _believable(
-            names, n, data, out[1][:, :count], out[2][:, :count], kept[4][-1], block * BLOCK
-        )
-        logs, m, P = out[0][:, -1].copy(), out[1][:, -1].copy(), out[2][:, -1].copy()
+    for start in range(0, blocks * BLOCK, BLOCK):
+        s = slice(start, start + BLOCK)
+        out = call(logs, m, P, logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
+        each = [o[:, : K - start] for o in out[3:]]
+        for target, i in zip(kept, (0, 3, 5, 6, 7), strict=True):
+            target.append(each[i].copy())
+        _believable(names, n, data, each[1], each[2], each[7], start)
+        logs, m, P = (o.ravel().copy() for o in out[:3])
+        last = each[4][:, -1].copy()  # not P: what is padded may be carried on
     logp, m_f, mean, var, stats = (np.concatenate(k, axis=1) for k in kept)
     edges = np.cumsum([0, *n])
     squares = np.cumsum([0, *(k * k for k in n)])
     final = []
     for j, belief in enumerate(priors):
-        cov = P[squares[j] : squares[j + 1]].reshape(n[j], n[j])
-        final.append(Belief(belief.x, m[edges[j] : edges[j + 1]], (cov + cov.T) / 2))
+        cov = last[squares[j] : squares[j + 1]].reshape(n[j], n[j])
+        final.append(Belief(belief.x, m_f[edges[j] : edges[j + 1], -1].copy(), (cov + cov.T) / 2))
     return ImmResult(
         names,
         common,

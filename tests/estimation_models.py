@@ -63,17 +63,35 @@ def linear(A, B, G, C, D, walk, *, name="linear"):
     dt = ca.SX.sym("dt")
     f = ca.DM(A) @ x + ca.DM(B) @ u + ca.DM(G) @ w
     h = ca.DM(C) @ x + ca.DM(D) @ w
-    names = (" ".join(f"{c}{i}" for i in range(k)) for c, k in
-             (("x", nx), ("u", nu), ("p", 0), ("w", nw), ("y", ny)))  # fmt: skip
     return FilterModel(
         name,
-        *(signals(n) for n in names),
+        *(named(c, k) for c, k in (("x", nx), ("u", nu), ("p", 0), ("w", nw), ("y", ny))),
         transition=ca.Function(f"{name}_f", [x, u, p, w, dt], [f, ca.SX(0)]),
         output=ca.Function(f"{name}_g", [x, u, p, w], [h, ca.SX(0)]),
         walk=np.asarray(walk, float),
         lower=np.full(nx, -np.inf),
         upper=np.full(nx, np.inf),
     )
+
+
+def named(prefix, n):
+    """Signals of unit 1: x0, x1, ..."""
+    return signals(" ".join(f"{prefix}{i}" for i in range(n)))
+
+
+def model_of(f, g, p=(), *, nx=1, nu=0, nw=0, ny=1, walk=None, lower=None, upper=None):
+    """A model from Python functions f(x, u, p, w, dt) and g(x, u, p, w); states x0, x1, ..."""
+    theta = Signals([Signal(n, "1", "", 0.0) for n in p])
+    x, u, q = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", len(theta))
+    w, dt = ca.MX.sym("w", nw), ca.MX.sym("dt")
+    return FilterModel(
+        "toy", named("x", nx), named("u", nu), theta, named("w", nw), named("y", ny),
+        ca.Function("f", [x, u, q, w, dt], [f(x, u, q, w, dt), 0]),
+        ca.Function("g", [x, u, q, w], [g(x, u, q, w), 0]),
+        np.zeros(nx) if walk is None else np.array(walk, float),
+        np.full(nx, -np.inf) if lower is None else np.array(lower, float),
+        np.full(nx, np.inf) if upper is None else np.array(upper, float),
+    )  # fmt: skip
 
 
 def random_linear(seed, nx=3, nu=1, nw=2, ny=3):

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 
 from estimators.algebra import (
     append_column,
-    as_symbols_of,
     backward,
     cholesky,
     cholesky_semidefinite,
@@ -158,11 +157,8 @@ def test_root_of(cov):
     assert (L[s == 0] == 0).all()
 
 
-def test_symmetric_and_kinds():
-    """The lower triangle rules; functions are written out for SX, and called from MX."""
+def test_symmetric():
+    """The lower triangle rules."""
     P = np.arange(9.0).reshape(3, 3)
     Q = evaluate(symmetric, P)
     assert (Q == Q.T).all() and (np.tril(Q) == np.tril(P)).all()
-    x = ca.MX.sym("x")
-    f = ca.Function("f", [x], [x**2])
-    assert as_symbols_of(ca.MX, f) is f and as_symbols_of(ca.SX, f).is_a("SXFunction")

@@ -1,8 +1,8 @@
-"""The extended Kalman filter against a Kalman filter and a batch fit written here by hand.
+"""The extended Kalman filter: its linearisation, iterations, considered states, bounds, refusals.
 
-Anderson and Moore (1979), section 5.5 (correlated noises); Bell and Cathey (1993): the iterated
-update is Gauss-Newton; Schmidt (1966), considered parameters.  On linear models everything is
-exact, so that 1e-9 only leaves room for rounding in systems of a few hundred unknowns.
+Bell and Cathey (1993): the iterated update is Gauss-Newton; Schmidt (1966), considered parameters.
+On linear models everything is exact, so that 1e-9 only leaves room for rounding.  What it shares
+with other filters is in ``test_filters.py``.
 """
 
 import dataclasses
@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from estimation_models import (
-    batch_by_hand,
     constant_velocity,
     cv_model,
     cv_parts,
@@ -23,8 +22,6 @@ from estimation_models import (
     random_belief,
     random_linear,
     signals,
-    stateless,
-    with_root_finder,
 )
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
@@ -44,44 +41,6 @@ def ekf(model, prior, data, **options):
     return extended_kalman_filter(model, prior, data, **({"full": True, "backend": "vm"} | options))
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 3])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_is_the_kalman_filter_on_linear_models(seed, iterations):
-    """Noise shared by output and transition, gaps, one silent sensor; iterating changes nothing:
-    a filter that took its posterior for the prior would count each sample again."""
-    model, parts = random_linear(seed)
-    prior = random_belief(seed, model)
-    data = gappy(seed, model, 50, silent=[1] if seed else [])
-    exact = kalman_by_hand(parts, model.walk, prior, data)
-    r = ekf(model, prior, data, iterations=iterations)
-    for name in ("mean", "cov", "mean_pred", "cov_pred", "nis", "loglik"):
-        assert_allclose(getattr(r, name), getattr(exact, name), **EXACT, err_msg=name)
-    assert_allclose(r.final.cov, exact.cov[-1], **EXACT)
-    assert_allclose(r.measured, (~np.isnan(data.y)).sum(0))
-    assert np.isnan(r.innovation[np.isnan(data.y)]).all()
-
-
-def test_irregular_instants_and_a_held_noisy_input():
-    """The discretised model at varying dt, a parameter as a state, against its matrices by hand."""
-    model = cv_model()
-    prior, data = random_belief(5, model), gappy(5, model, 60)
-    exact = kalman_by_hand(cv_parts, model.walk, prior, data)
-    r = ekf(model, prior, data)
-    assert_allclose(r.mean, exact.mean, **EXACT)
-    assert_allclose(r.cov, exact.cov, **EXACT)
-    assert_allclose(r.loglik, exact.loglik, **EXACT)
-
-
-def test_last_instant_is_the_batch_fit():
-    """At the last instant the filter knows all samples, like least squares of everything."""
-    model, parts = random_linear(2)
-    prior, data = random_belief(2, model), gappy(2, model, 30)
-    mean, cov = batch_by_hand(parts, model.walk, prior, data)
-    r = ekf(model, prior, data)
-    assert_allclose(r.mean[:, -1], mean[:, -1], **EXACT)
-    assert_allclose(r.cov[-1], cov[-1], **EXACT)
-
-
 def test_agrees_with_filterpy_on_a_linear_model():
     """filterpy's KalmanFilter, which knows no correlated noise: D = 0."""
     _, (A, B, G, C, D) = random_linear(4)
@@ -95,21 +54,6 @@ def test_agrees_with_filterpy_on_a_linear_model():
         assert_allclose(r.mean[:, k], kf.x, **EXACT)
         assert_allclose(r.cov[k], kf.P, **EXACT)
         kf.predict(data.u[:, k], Q=G @ G.T + np.diag(model.walk**2) * data.dt[k])
-
-
-def test_nothing_measured_is_prediction_only():
-    """All samples missing: mean and covariance follow the model, the likelihood is 1."""
-    model, (A, B, G, _, _) = random_linear(6)
-    data = gappy(6, model, 3, missing=2.0)
-    prior = random_belief(6, model)
-    r = ekf(model, prior, data)
-    m, P = prior.mean, prior.cov
-    for k in range(2):
-        m = A @ m + B @ data.u[:, k]
-        P = A @ P @ A.T + G @ G.T + np.diag(model.walk**2) * data.dt[k]
-    assert_allclose(r.mean[:, 2], m, **EXACT)
-    assert_allclose(r.cov[2], P, **EXACT)
-    assert r.loglik == 0 and not r.nis.any() and not r.measured.any()
 
 
 def test_nonlinear_step_against_finite_differences():
@@ -251,18 +195,6 @@ def test_projection_of_a_state_known_exactly_does_not_divide_by_zero():
     assert_allclose(np.array(m).ravel(), [2.0, 5.0])
 
 
-@pytest.mark.parametrize("iterations", [1, 2])
-def test_models_in_matrix_operations_give_the_same(iterations):
-    """z + z^3 = a + a^3 has the root a: the same model, up to the root finder's tolerance."""
-    model = with_root_finder(cv_model())
-    assert model.expanded().output.is_a("MXFunction")
-    prior, data = random_belief(12, model), gappy(12, model, 20)
-    a = ekf(cv_model(), prior, data, iterations=iterations)
-    b = ekf(model, prior, data, iterations=iterations)
-    for name in ("mean", "cov", "cross", "innovation_cov", "loglik"):
-        assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-8, atol=1e-8, err_msg=name)
-
-
 def test_update_of_matrices_as_expressions_of_either_kind():
     """SX written out and MX through one function: the same numbers, sparse H included."""
     rng = np.random.default_rng(0)
@@ -298,12 +230,6 @@ def test_impossible_numbers_of_iterations_are_refused(iterations):
     """Whole numbers from 1 to 10."""
     with pytest.raises(ParameterError, match="whole number from 1 to 10"):
         ekf_step(cv_model(), iterations)
-
-
-def test_a_model_without_states_is_refused():
-    """There is nothing to estimate."""
-    with pytest.raises(ParameterError, match="empty has no states"):
-        ekf_step(stateless())
 
 
 def _root_model():

@@ -5,9 +5,11 @@ checked against the dataset itself.
 """
 
 import argparse
+import dataclasses
 import json
 import signal
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -17,10 +19,12 @@ from apu_casadi.results import dataset
 from apu_casadi.signals import Signal
 from scenarios import cli
 from scenarios.commands import estimate as command
-from scenarios.estimation import jointrun, studies
+from scenarios.estimation import fingerprint, jointrun, studies
 from scenarios.estimation.correctness import correctness
 from scenarios.estimation.electrical import FAULT_LEVEL
+from scenarios.estimation.gaspath_study import FRESH
 from scenarios.estimation.joint import GAIN_SHARE
+from scenarios.estimation.reports import REPORTS
 from scenarios.schema import Scenario
 
 ONSET_HEALTH, ONSET_H = 1.0, 2.0
@@ -199,11 +203,61 @@ def test_other_constants_make_all_parts_pending(toy, tmp_path, monkeypatch):
     assert studies.pending(study, tmp_path, 40) == ["a", "b", "c"]
 
 
+def test_other_seeds_make_a_part_pending_and_are_printed_as_they_were(toy, tmp_path, monkeypatch):
+    """A report tells the seeds of the numbers that it reads, never those of today."""
+    study, *_ = toy
+    record = studies.run("correctness", tmp_path, n_seeds=40)
+    later = dataclasses.replace(study, seed0=7001)
+    assert studies.pending(later, tmp_path, 40) == ["a", "b"]  # c has no seeds
+    r = studies.results(record)
+    assert (r.seeds_to("a"), r.seeds_from("b")) == ("1000 to 1039", "4 from 1000")
+    assert list(r) == ["a", "b", "c"] and len(r) == 3 and r["b"]["n"] == 4
+    fresh = studies.get("gaspath")
+    assert (fresh.seed0, fresh.seeds) == (FRESH.start, len(FRESH))
+    # the study itself with seeds that are not today's
+    kept = {"seeds": 9, "reduction": 0.6, "interval": [0.5, 0.7], "null_rmse": [0.01, 0.02]}
+    part = {"seeds": [1, 9], "result": {"seeds": 9, "snapshot": kept, "transient": kept}}
+    said = REPORTS["shaft-power"].claims(studies.Results({"filter": part}))
+    assert {c.seeds for c in said} == {"9 from 1"}
+
+
+def test_parts_made_with_other_filters_are_named(toy, tmp_path, capsys, monkeypatch):
+    """Seeds and constants do not tell that the code has changed; the filters' equations do."""
+    study, *_ = toy
+    record = studies.run("correctness", tmp_path, n_seeds=40)
+    assert studies.other_code(study, record) == ""
+    record["parts"]["a"]["code"] = "of before"
+    del record["parts"]["b"]["code"]
+    record["parts"]["c"]["versions"]["casadi"] = "3.7.0"
+    said = studies.other_code(study, record)
+    assert "made with other code: a (--again" in said
+    assert said.endswith("not known whether made with this code: b, c")
+    monkeypatch.setattr(studies, "digest", lambda name: "of tomorrow")
+    line = ["estimate", "study", "correctness", "--seeds", "40", "--out", str(tmp_path), "--quiet"]
+    assert cli.main(line) == 0
+    assert "correctness: kept\n  made with other code: all parts (--ag" in capsys.readouterr().out
+
+
+def test_the_digest_of_the_filters_sees_a_constant_and_no_name():
+    """Two models built alike are one; another step, another constant are not."""
+    assert set(fingerprint.FUNCTIONS) == set(studies.STUDIES)
+    assert fingerprint.digest("correctness") == fingerprint.digest_of(
+        fingerprint.FUNCTIONS["correctness"]()
+    )
+    x, y = ca.SX.sym("x"), ca.SX.sym("x")
+    one, same, other = (ca.Function("f", [v], [c * v]) for v, c in ((x, 2), (y, 2), (x, 2.0001)))
+    digests = [fingerprint.digest_of([f]) for f in (one, same, other)]
+    assert digests[0] == digests[1] != digests[2]
+
+
 def test_constants_are_those_in_capitals():
     found = studies.constants("scenarios.estimation.electrical")
     assert found["FAULT_LEVEL"] == FAULT_LEVEL and "H_WALK" in found
     assert "window_lengths" not in found
     assert studies.constants("scenarios.estimation.joint")["TEST"]["margin"] > 1
+    # of a package: those of its modules together
+    isolation = studies.constants("scenarios.estimation.isolation")
+    assert isolation["METHODS"] and isolation["SUBSTEPS"] and isolation["DEFAULT"]["every"]
     for s in studies.STUDIES.values():
         json.dumps(s.fixed(), allow_nan=False)
 

@@ -7,6 +7,7 @@ one model, lifted and eliminated, against each other.
 import casadi as ca
 import numpy as np
 import pytest
+from estimation_models import model_of, named
 from numpy.testing import assert_allclose
 from scipy.optimize import brentq, minimize_scalar
 
@@ -19,7 +20,6 @@ from estimators.belief import Belief
 from estimators.fit import FitProblem, fit, profile
 from estimators.lifting import lift, plain
 from estimators.model import (
-    FilterModel,
     Unknown,
     augment,
     biases,
@@ -31,23 +31,6 @@ from estimators.model import (
 )
 from estimators.recording import Recording, record
 from estimators.transcription import Transcription, square_root
-
-
-def named(prefix, n):
-    return Signals([Signal(f"{prefix}{i}", "1", "") for i in range(n)])
-
-
-def model_of(f, g, p, *, nx=1, nu=0, nw=0, ny=1, walk=None):
-    theta = Signals([Signal(n, "1", "", 0.0) for n in p])
-    x, u, q = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", len(theta))
-    w, dt = ca.MX.sym("w", nw), ca.MX.sym("dt")
-    return FilterModel(
-        "toy", named("x", nx), named("u", nu), theta, named("w", nw), named("y", ny),
-        ca.Function("f", [x, u, q, w, dt], [f(x, u, q, w, dt), 0]),
-        ca.Function("g", [x, u, q, w], [g(x, u, q, w), 0]),
-        np.zeros(nx) if walk is None else np.array(walk, float),
-        np.full(nx, -np.inf), np.full(nx, np.inf),
-    )  # fmt: skip
 
 
 def static(g, p, ny=1):

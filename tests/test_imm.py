@@ -132,6 +132,19 @@ def test_against_the_recursion_by_hand():
     assert json.loads(json.dumps(r.to_dict()))["loglik"] == r.loglik
 
 
+@pytest.mark.parametrize("K", [60, 100, 120])
+def test_one_mode_is_its_filter_to_the_end(K):
+    """The belief after the last sample, not one that the padding of a block carried on: these
+    models go on by A x even in a step that lasts no time."""
+    data, model = _data(K), _models()["calm"]
+    r = interacting_multiple_models({"calm": model}, PRIOR, data, transition=np.eye(1),
+                                    backend="vm")  # fmt: skip
+    alone = multiple_models({"calm": model}, PRIOR, data, backend="vm").results[0]
+    assert_allclose(r.mean, alone.mean, atol=1e-12)
+    assert_allclose(r.final[0].mean, alone.final.mean, atol=1e-12)
+    assert_allclose(r.final[0].cov, alone.final.cov, atol=1e-12)
+
+
 def test_any_filter_will_do():
     """On linear modes a square-root unscented filter is the extended one: same mixture."""
     data = _data(20)

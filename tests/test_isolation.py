@@ -16,21 +16,25 @@ from apu_casadi.backend import use_backend
 from apu_casadi.errors import ParameterError
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.trimming import trim_gas_generator
-from scenarios.estimation import isolation_study as study
-from scenarios.estimation.isolation_study import (
+from scenarios.estimation.isolation import study
+from scenarios.estimation.isolation.classifiers import isolate, recording_of
+from scenarios.estimation.isolation.evidence import log_box
+from scenarios.estimation.isolation.limit import (
+    information_limit,
+    linear_problem,
+    white_signatures,
+)
+from scenarios.estimation.isolation.model import model_of
+from scenarios.estimation.isolation.problem import (
     CLASSES,
     DEFAULT,
     FAULTS,
     SNAPSHOT,
     Protocol,
-    cohen_kappa,
-    information_limit,
-    isolate,
-    isolation_study,
-    linear_problem,
-    log_box,
-    simulate_windows,
+    severity_of_loss,
 )
+from scenarios.estimation.isolation.scores import cohen_kappa, scores
+from scenarios.estimation.isolation.truth import simulate_windows, windows_of_engines
 
 SHORT = Protocol(before=0.4, after=0.8, spread=0.2)
 BY_NAME = {c.name: i for i, c in enumerate(CLASSES)}
@@ -106,7 +110,7 @@ def test_evidence_of_two_sizes_anywhere(mean, scale):
 def test_evidence_at_the_sharpness_of_the_study(gg):
     """Two sizes at the information that the best window holds: quadrature must not miss it."""
     f = linear_problem(3e5, 0.0, DEFAULT, gg)
-    G = study._white_signatures(f, np.array([DEFAULT.first]))[0]
+    G = white_signatures(f, np.array([DEFAULT.first]))[0]
     for name in ("compressor pair", "turbine pair"):
         c = CLASSES[BY_NAME[name]]
         i = [FAULTS.index(n) for n in c.faults]
@@ -172,12 +176,12 @@ def test_signatures_are_the_steady_sensitivities(gg):
         change = [(y[gg.Y.index(n)] - point[n]) / d for n in ("P3", "T3", "T5")]
         assert_allclose(first[1:4, i], change, rtol=2e-3, err_msg=name)
     loss = FAULTS.index("loss")
-    assert first[4, loss] == pytest.approx(study.severity_of_loss())
+    assert first[4, loss] == pytest.approx(severity_of_loss())
 
 
 def test_severity_of_a_loss_is_that_of_the_shunt(gg):
     """r_s/h from terminal to neutral at 230 V takes half of 0.9 times the shaft power lost."""
-    h = study.severity_of_loss()
+    h = severity_of_loss()
     assert 2 * h * 230.0**2 / 0.0044 / 0.9 == pytest.approx(500e3)
 
 
@@ -229,7 +233,7 @@ def test_a_window_is_its_seed(gg):
     both = simulate_windows([1, 8], [11, 12], p, gg)
     one = simulate_windows([8], [12], p, gg)
     assert_allclose(one.reading[:, 0], both.reading[:, 1], rtol=1e-12)
-    again = study._simulate(np.array([1, 8]), np.array([11, 12]), p, [gg, gg])
+    again = windows_of_engines(np.array([1, 8]), np.array([11, 12]), p, [gg, gg])
     assert_allclose(again.reading, both.reading, rtol=1e-12)
     assert again.sizes == both.sizes
 
@@ -239,7 +243,7 @@ def test_one_filter_tells_a_clear_fault(gg):
     p = dataclasses.replace(SHORT, noise=0.125)
     label = BY_NAME["T5 sensor"]
     w = simulate_windows([label], [5], p, gg)
-    v = isolate(study._recording(study._model(gg, p.N_walk), w, 0, p), p, gg, methods=["glr"])
+    v = isolate(recording_of(model_of(gg, p.N_walk), w, 0, p), p, gg, methods=["glr"])
     assert int(np.argmax(v.log_probability["glr"])) == label
     assert abs(v.onset - w.onset[0]) <= p.every
     assert np.exp(v.log_probability["glr"]).sum() == pytest.approx(1)
@@ -266,7 +270,7 @@ def test_refusals(call, words):
 
 def test_every_sweep_has_its_curve():
     """Figures of a result of the right form, whatever its numbers."""
-    s = study.scores(5 * np.eye(len(CLASSES), dtype=int))
+    s = scores(5 * np.eye(len(CLASSES), dtype=int))
     result = {
         "studies": {name: {"bank": s, "limit": s} for name in study.STUDIES},
         "sweeps": {
@@ -285,8 +289,8 @@ def test_every_sweep_has_its_curve():
 def test_the_study_on_a_few_windows():
     """Goal 6 of the estimation work on 22 windows: kappa 0.8 at least, near the limit."""
     with use_backend("c"):
-        r = isolation_study(2, 5000, limit_draws=20, limit_points=1)
-        lost = isolation_study(2, 5000, SNAPSHOT, limit_draws=20, limit_points=1)
+        r = study.isolation_study(2, 5000, limit_draws=20, limit_points=1)
+        lost = study.isolation_study(2, 5000, SNAPSHOT, limit_draws=20, limit_points=1)
     json.dumps([r, lost])
     for m in ("glr", "bank", "limit"):
         assert r[m]["kappa"] >= 0.8, m

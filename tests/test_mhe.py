@@ -7,6 +7,7 @@ against a Kalman filter written out by hand; with bounds, a quadratic program so
 import casadi as ca
 import numpy as np
 import pytest
+from estimation_models import model_of, named
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
@@ -20,26 +21,6 @@ from estimators.lifting import lift
 from estimators.mhe import HorizonEstimator, moving_horizon
 from estimators.model import FilterModel, Unknown, augment
 from estimators.recording import Recording, record
-
-
-def named(prefix, n):
-    return Signals([Signal(f"{prefix}{i}", "1", "") for i in range(n)])
-
-
-def model_of(f, g, *, nx, nu=0, nw=0, ny=1, walk=None, p=(), lower=None, upper=None):
-    """A model from Python functions f(x, u, p, w, dt) and g(x, u, p, w)."""
-    theta = Signals([Signal(n, "1", "", 0.0) for n in p])
-    x, u, q = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", len(theta))
-    w, dt = ca.MX.sym("w", nw), ca.MX.sym("dt")
-    return FilterModel(
-        "toy", named("x", nx), named("u", nu), theta, named("w", nw), named("y", ny),
-        ca.Function("f", [x, u, q, w, dt], [f(x, u, q, w, dt), 0]),
-        ca.Function("g", [x, u, q, w], [g(x, u, q, w), 0]),
-        np.zeros(nx) if walk is None else np.array(walk, float),
-        np.full(nx, -np.inf) if lower is None else np.array(lower, float),
-        np.full(nx, np.inf) if upper is None else np.array(upper, float),
-    )  # fmt: skip
-
 
 A = np.array([[0.9, 0.1, 0.0], [-0.2, 0.8, 0.3], [0.0, 0.0, 1.0]])
 B = np.array([[0.4], [-0.3], [0.0]])

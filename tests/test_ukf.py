@@ -1,7 +1,8 @@
-"""The square-root unscented filter against the Kalman filter by hand and the transform by hand.
+"""The square-root unscented filter against the transform by hand, and against the extended one.
 
 Julier (2002), scaled unscented transform; Arasaratnam and Haykin (2009), cubature; Schmidt's
-considered parameters.  1e-9 on linear models: rounding only.
+considered parameters.  1e-9 on linear models: rounding only.  What it shares with other filters is
+in ``test_filters.py``.
 """
 
 import dataclasses
@@ -10,19 +11,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from estimation_models import (
-    batch_by_hand,
     cv_model,
-    cv_parts,
     gappy,
-    kalman_by_hand,
     linear,
     pendulum,
     pendulum_data,
     random_belief,
     random_linear,
     signals,
-    stateless,
-    with_root_finder,
 )
 from numpy.testing import assert_allclose
 
@@ -49,30 +45,6 @@ def ukf(model, prior, data, **options):
     return unscented_kalman_filter(
         model, prior, data, **({"full": True, "backend": "vm"} | options)
     )
-
-
-@every_set
-@pytest.mark.parametrize("seed", [0, 1])
-def test_is_the_kalman_filter_on_linear_models(seed, points):
-    """Shared noise, gaps, a silent sensor; every set of points, negative weights included."""
-    model, parts = random_linear(seed)
-    prior = random_belief(seed, model)
-    data = gappy(seed, model, 40, silent=[1] if seed else [])
-    exact = kalman_by_hand(parts, model.walk, prior, data)
-    r = ukf(model, prior, data, **points)
-    for name in ("mean", "cov", "mean_pred", "cov_pred", "nis", "loglik"):
-        assert_allclose(getattr(r, name), getattr(exact, name), **EXACT, err_msg=name)
-
-
-@every_set
-def test_last_instant_is_the_batch_fit_at_irregular_instants(points):
-    """The discretised model with a noisy held input and a parameter as a state."""
-    model = cv_model()
-    prior, data = random_belief(5, model), gappy(5, model, 30)
-    mean, cov = batch_by_hand(cv_parts, model.walk, prior, data)
-    r = ukf(model, prior, data, **points)
-    assert_allclose(r.mean[:, -1], mean[:, -1], **EXACT)
-    assert_allclose(r.cov[-1], cov[-1], **EXACT)
 
 
 def transform(f, m, P, *, alpha=1.0, beta=0.0, kappa=0.0):
@@ -217,24 +189,6 @@ def test_considered_states_as_in_the_extended_filter(points):
     assert_allclose(b.variance[1], prior.cov[1, 1], rtol=1e-9)
 
 
-@every_set
-def test_singular_priors_give_no_nan(points):
-    """A state known exactly, a considered one of no variance, two that are one: as by hand."""
-    model = cv_model(walk=0.0)
-    data = gappy(9, model, 25)
-    known = Belief.of(model.x, {"s": 0, "v": 0, "c": 0.7}, {"s": 1, "v": 1, "c": 0})
-    alike = Belief(model.x, np.array([0, 0.5, 0.5]), np.array([[1.0, 0, 0], [0, 2, 2], [0, 2, 2]]))
-    nothing = Belief.of(model.x, {"s": 0, "v": 0, "c": 0.7}, {"s": 0, "v": 0, "c": 0})
-    for prior in (known, alike, nothing):
-        exact = kalman_by_hand(cv_parts, model.walk, prior, data)
-        r = ukf(model, prior, data, **points)
-        assert_allclose(r.mean, exact.mean, **EXACT)
-        assert_allclose(r.cov, exact.cov, **EXACT)
-    fixed = dataclasses.replace(model, consider=("c",))
-    r = ukf(fixed, known, data, **points)
-    assert_allclose(r.mean, kalman_by_hand(cv_parts, model.walk, known, data).mean, **EXACT)
-
-
 def test_bounds_as_in_the_extended_filter():
     """Projection of the mean along the covariance."""
     model = dataclasses.replace(cv_model(), lower=np.array([-np.inf, -0.1, -0.2]))
@@ -288,15 +242,6 @@ def test_bounded_severity_of_a_nonlinear_model_stays_inside():
         assert (r.mean[3] >= -1e-15).all() and (r.mean[3] < 1e-12).any()
 
 
-def test_models_in_matrix_operations_give_the_same():
-    """A root finder in the output (z + z^3 = a + a^3 has the root a): mapped as a call."""
-    model = with_root_finder(cv_model())
-    prior, data = random_belief(12, model), gappy(12, model, 20)
-    a, b = (ukf(m, prior, data) for m in (cv_model(), model))
-    for name in ("mean", "cov", "cross", "innovation_cov", "loglik"):
-        assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-8, atol=1e-8, err_msg=name)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -311,12 +256,6 @@ def test_impossible_points_are_refused(options, words):
     """Every message says which number."""
     with pytest.raises(ParameterError, match=words):
         ukf_step(cv_model(), **options)
-
-
-def test_a_model_without_states_is_refused():
-    """There is nothing to estimate."""
-    with pytest.raises(ParameterError, match="no states"):
-        ukf_step(stateless())
 
 
 def test_not_a_number_at_a_single_point_is_an_error():

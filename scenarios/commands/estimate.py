@@ -149,6 +149,9 @@ def _study(args: argparse.Namespace) -> int:
             record = studies.run(name, folder, n_seeds=n, again=args.again, progress=progress)
         found[name] = REPORTS[name].claims(studies.results(record))
         if not args.json:
+            remark = studies.other_code(studies.get(name), record)
+            if remark:
+                print(f"  {remark}", flush=True)
             for c in found[name]:
                 mark = "" if c.met is None else "  met   " if c.met else "  MISSED"
                 print(f"{mark}  {c.what}: {c.achieved} ({c.target}; {c.interval})", flush=True)
@@ -211,7 +214,7 @@ def _interruptible() -> Iterator[None]:
 def _page(args: argparse.Namespace) -> int:
     """Write the page and its figures from the kept studies."""
     from apu_casadi.errors import DataError
-    from scenarios.estimation import page
+    from scenarios.estimation import page, studies
     from scenarios.pages import write_text
 
     try:
@@ -224,6 +227,11 @@ def _page(args: argparse.Namespace) -> int:
     except OSError as e:
         raise DataError(f"{e.filename or args.write}: {e.strerror or e}") from None
     print("written:", *(f"  {p}" for p in made), sep="\n")
+    # not on the page, which is what the kept numbers say, whatever the code has become
+    for name, record in records.items():
+        remark = studies.other_code(studies.get(name), record)
+        if remark:
+            print(f"{name}: {remark}")
     return 0
 
 

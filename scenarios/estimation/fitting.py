@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,14 +22,15 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.control import GovernorParameters, governor
-from apu_casadi.errors import DataError, ParameterError, nearest
+from apu_casadi.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.simulation import stepper
 from apu_casadi.trimming import trim_gas_generator
-from estimators.fit import FitProblem, FitResult
+from estimators.fit import FitProblem, FitResult, quantile
 from estimators.lifting import Lifted, lift
 from estimators.model import FilterModel, biases, gains, measure, measured_inputs
 from estimators.recording import Recording, record
+from scenarios.estimation.intervals import share_interval
 from scenarios.estimation.sensors import GAS_PATH, SensorSet
 
 __all__ = [
@@ -440,12 +442,6 @@ def coverage(
     ------
     ParameterError : unknown kind.
     """
-    import time
-
-    from scipy.stats import beta
-
-    from apu_casadi.errors import EstimationError
-
     if kind not in KINDS:
         raise ParameterError(f"kind {kind!r} {nearest(kind, KINDS)}")
     began = time.perf_counter()
@@ -479,18 +475,17 @@ def coverage(
             freedom = r.freedom
         if progress is not None:
             progress(i + 1, n)
-    from estimators.fit import _quantile
-
-    inside = np.abs(error) <= _quantile(level) * sigma  # a failed fit covers nothing
+    inside = np.abs(error) <= quantile(level) * sigma  # a failed fit covers nothing
     rows = []
     for j, name in enumerate(HEALTH):
         k = int(inside[:, j].sum())
+        low, high = share_interval(k, n)
         rows.append(
             {
                 "name": name,
                 "covered": k / n,
-                "low": float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0,
-                "high": float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0,
+                "low": low,
+                "high": high,
                 "rms_error": float(np.sqrt(np.nanmean(error[:, j] ** 2))),
                 "mean_sigma": float(np.nanmean(sigma[:, j])),
                 "bias_over_its_error": float(

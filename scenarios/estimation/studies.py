@@ -2,6 +2,7 @@
 
 A study has parts.  Each part is written as soon as it is done, so that an interruption loses one
 part and no more; a part that was run with the same seeds and the same constants is not run again.
+Where its filters have changed since, :func:`other_code` says so.
 What is claimed of the results, figures and text are in :mod:`scenarios.estimation.reports`.
 
 >>> from scenarios.estimation import studies
@@ -16,17 +17,31 @@ import math
 import platform
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
 from apu_casadi.errors import DataError, ParameterError, nearest
+from scenarios.estimation.fingerprint import digest
+from scenarios.estimation.gaspath_study import FRESH, TUNED
 from scenarios.pages import write_text
 
-__all__ = ["STUDIES", "Part", "Study", "get", "pending", "read", "run"]
+__all__ = [
+    "STUDIES",
+    "Part",
+    "Results",
+    "Study",
+    "get",
+    "other_code",
+    "pending",
+    "read",
+    "results",
+    "run",
+]
 
 Tell = Callable[[int, int], None]
 """Called with what is done of a part, and its total, in any unit."""
@@ -70,7 +85,7 @@ class Study:
     title : heading of its section.
     goal : what is to be shown, with the number.
     parts : by name, in order.
-    modules : whose constants fix it: all numbers in capitals.
+    modules : whose constants fix it: all numbers in capitals; modules or packages.
     seeds, seed0 : default number of fresh seeds, and the first of them.
     tuned : on which seeds the filters and thresholds were tuned.
     """
@@ -97,23 +112,26 @@ class Study:
 
 
 def constants(module: str) -> dict[str, Any]:
-    """Return a module's constants in capitals that JSON can hold."""
-    found = {}
-    for name, value in vars(import_module(module)).items():
-        if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
-            try:
-                json.dumps(value, allow_nan=False)
-            except (TypeError, ValueError):
-                continue
-            found[name] = value
-    # what a test of jumps is made of, where there is one
-    for name in ("JUMP_TEST", "TEST", "DEFAULT", "SNAPSHOT"):
-        value = vars(import_module(module)).get(name)
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            found[name] = {
-                f.name: v for f in dataclasses.fields(value)
-                if isinstance(v := getattr(value, f.name), int | float | str | tuple)
-            }  # fmt: skip
+    """Return the constants in capitals that JSON can hold, of a module or a package's modules."""
+    top = import_module(module)
+    inner = [m.name for m in iter_modules(getattr(top, "__path__", []), f"{module}.")]
+    found: dict[str, Any] = {}
+    for space in (vars(import_module(name)) for name in (module, *inner)):
+        for name, value in space.items():
+            if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
+                try:
+                    json.dumps(value, allow_nan=False)
+                except (TypeError, ValueError):
+                    continue
+                found[name] = value
+        # what a test of jumps is made of, where there is one
+        for name in ("JUMP_TEST", "TEST", "DEFAULT", "SNAPSHOT"):
+            value = space.get(name)
+            if dataclasses.is_dataclass(value) and not isinstance(value, type):
+                found[name] = {
+                    f.name: v for f in dataclasses.fields(value)
+                    if isinstance(v := getattr(value, f.name), int | float | str | tuple)
+                }  # fmt: skip
     return found
 
 
@@ -248,7 +266,7 @@ WRONG_KEPT = 20  # wrong answers of the isolation that are kept
 def _isolation(name: str) -> Callable[[int, int, Tell], Any]:
     def run(n: int, seed0: int, tell: Tell) -> Any:
         from apu_casadi.gasgenerator import GasGenerator
-        from scenarios.estimation import isolation_study as study
+        from scenarios.estimation.isolation import study
 
         protocol, other = study.STUDIES[name]
         gg = GasGenerator()
@@ -261,7 +279,7 @@ def _isolation(name: str) -> Callable[[int, int, Tell], Any]:
 
 
 def _isolation_sweeps(n: int, seed0: int, tell: Tell) -> Any:
-    from scenarios.estimation import isolation_study as study
+    from scenarios.estimation.isolation import study
 
     return {
         name: study.sweep(changes, seed=seed0, protocol=protocol)
@@ -330,7 +348,10 @@ def _joint_time(n: int, seed0: int, tell: Tell) -> Any:
 _EL = ("electrical", "electrical_study")
 _GP = ("gaspath", "gaspath_study")
 _BELOW = "tuned on seeds below the first"
-GAS_PATH_SEED0 = 3001  # 1001 to 2500 were looked at while the number of iterations was chosen
+_GP_SEEDS: dict[str, Any] = {
+    "seeds": len(FRESH), "seed0": FRESH.start,
+    "tuned": f"tuned on seeds {TUNED.start} to {TUNED.stop - 1}",
+}  # fmt: skip
 
 _ALL = (
     Study(
@@ -377,7 +398,7 @@ _ALL = (
             "mismatched": Part(_gaspath(False), 40, 0.33),
             "filters": Part(_filters, 40, 0.18, share=0.1),
         },
-        _GP, seed0=GAS_PATH_SEED0, tuned="tuned on seeds 1 to 200",
+        _GP, **_GP_SEEDS,
     ),
     Study(
         "shaft-power", "What the shaft power is worth",
@@ -392,7 +413,7 @@ _ALL = (
             "filter, gain errors": Part(_power_filter(True, False), 5, 0.09),
             "filter, bias and gain errors": Part(_power_filter(True, True), 5, 0.09),
         },
-        (*_GP, "identify"), seed0=GAS_PATH_SEED0, tuned="tuned on seeds 1 to 200",
+        (*_GP, "identify"), **_GP_SEEDS,
     ),
     Study(
         "isolation", "Which fault is it?",
@@ -409,7 +430,7 @@ _ALL = (
             ),
             "sweeps": Part(_isolation_sweeps, 120, 0, share=None),
         },
-        ("isolation_study",), seed0=1000, tuned="chosen on seeds 1 to 99",
+        ("isolation",), seed0=1000, tuned="chosen on seeds 1 to 99",
     ),
     Study(
         "fitting", "Fitting health factors to recorded data",
@@ -500,9 +521,43 @@ def read(study: Study, folder: str | Path) -> dict[str, Any]:
     return record
 
 
-def results(record: Mapping[str, Any]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Results(Mapping[str, Any]):
+    """Results of a study by part, and the seeds that each was made with.
+
+    Parameters
+    ----------
+    parts : as they are kept in a record.
+    """
+
+    parts: Mapping[str, Mapping[str, Any]]
+
+    def __getitem__(self, part: str) -> Any:
+        """Return the result of a part."""
+        return self.parts[part]["result"]
+
+    def __iter__(self) -> Iterator[str]:
+        """Go through the names of the parts."""
+        return iter(self.parts)
+
+    def __len__(self) -> int:
+        """Return the number of parts."""
+        return len(self.parts)
+
+    def seeds_from(self, part: str) -> str:
+        """Return number and first of a part's seeds, in words."""
+        first, n = self.parts[part]["seeds"]
+        return f"{n} from {first}"
+
+    def seeds_to(self, part: str) -> str:
+        """Return first and last of a part's seeds, in words."""
+        first, n = self.parts[part]["seeds"]
+        return f"{first} to {first + n - 1}"
+
+
+def results(record: Mapping[str, Any]) -> Results:
     """Return the results of a record by part."""
-    return {name: part["result"] for name, part in record["parts"].items()}
+    return Results(record["parts"])
 
 
 def pending(study: Study, folder: str | Path, n_seeds: int) -> list[str]:
@@ -515,6 +570,31 @@ def pending(study: Study, folder: str | Path, n_seeds: int) -> list[str]:
         for name, part in study.parts.items()
         if record["parts"].get(name, {}).get("seeds") != _settings(study, part, n_seeds)
     ]
+
+
+def other_code(study: Study, record: Mapping[str, Any]) -> str:
+    """Say which parts of a record were made with other filters than the code makes now; or "".
+
+    A part with other seeds or constants is pending and run again; one made with other code is not,
+    since a change of the code may well leave the numbers as they are.  See
+    :mod:`scenarios.estimation.fingerprint`.
+    """
+    other, unknown = [], []
+    for name, part in record["parts"].items():
+        if "code" not in part or part["versions"].get("casadi") != versions().get("casadi"):
+            unknown.append(name)
+        elif part["code"] != digest(study.name):
+            other.append(name)
+
+    def named(parts: list[str]) -> str:
+        return "all parts" if len(parts) == len(record["parts"]) else ", ".join(parts)
+
+    said = []
+    if other:
+        said.append(f"made with other code: {named(other)} (--again makes it anew)")
+    if unknown:
+        said.append(f"not known whether made with this code: {named(unknown)}")
+    return "; ".join(said)
 
 
 def _settings(study: Study, part: Part, n_seeds: int) -> list[int]:
@@ -573,6 +653,7 @@ def run(
             "seeds": _settings(study, part, n),
             "seconds": round(time.perf_counter() - began, 1),
             "versions": versions(),
+            "code": digest(study.name),
             "result": result,
         }
         ordered = {k: record["parts"][k] for k in study.parts if k in record["parts"]}

@@ -1,7 +1,6 @@
-"""Detection: run lengths by three routes and by simulation, signatures against filters run twice.
+"""Likelihood ratio of jumps, and their signatures: against filters run twice and whole batches.
 
-Run lengths of Page's cumulative sum are those of Lucas and Crosier (1982), Technometrics 24,
-199-205, table 1 (two-sided, k = 0.5); the likelihood ratio is that of Willsky and Jones (1976).
+The test is that of Willsky and Jones (1976), IEEE Trans. Automatic Control 21, 108-112.
 """
 
 import json
@@ -14,154 +13,14 @@ from estimation_models import constant_velocity, oscillator
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from apu_casadi.errors import EstimationError, ParameterError, SignalError
+from apu_casadi.errors import ParameterError, SignalError
 from estimators.belief import Belief
-from estimators.detection import (
-    Jump,
-    cusum,
-    cusum_arl,
-    cusum_arl_markov,
-    cusum_arl_siegmund,
-    cusum_test,
-    cusum_threshold,
-    glr,
-    glr_stationary,
-    glr_statistic,
-    glr_test,
-    glr_threshold,
-    linear_filter,
-    linearised,
-    nis_test,
-    nis_threshold,
-    project,
-    upcrossing_rate,
-    windowed_nis,
-)
+from estimators.detection.alarms import HOUR
+from estimators.detection.glr import glr, glr_stationary, glr_statistic, glr_test, glr_threshold
+from estimators.detection.signatures import Jump, linear_filter, linearised, project
 from estimators.ekf import extended_kalman_filter
 from estimators.model import Unknown, augment, discretise, noisy_inputs
 from estimators.recording import Recording
-
-HOUR = 3600.0
-
-# ------------------------------------------------------------------------------ windowed NIS
-
-
-@pytest.mark.parametrize(("dof", "window"), [(1, 1), (1, 6), (4, 10), (3, 80)])
-def test_upcrossings_of_the_moving_sum_come_at_the_stated_rate(dof, window):
-    """2e6 samples at a rate of 1e-3: 2000 crossings, so 5 standard deviations are 11 %."""
-    K, rate = 2_000_000, 50.0
-    nis = np.random.default_rng(dof).chisquare(dof, K)
-    asked = 1e-3 * rate * HOUR
-    got = nis_test(
-        nis, np.full(K, dof), window=window, false_alarms_per_hour=asked, rate=rate
-    ).index.size
-    assert got == pytest.approx(1e-3 * K, rel=0.12)
-
-
-def test_a_window_of_one_is_the_chi_squared_test():
-    """F (1 - F) is the rate of 'not above, then above' of independent samples."""
-    c, p = nis_threshold(3, 1, 1.0, 50.0)
-    assert p == pytest.approx(stats.chi2.sf(c, 3), rel=1e-9)
-    assert p * (1 - p) * 50 * HOUR == pytest.approx(1.0, rel=1e-6)
-
-
-def test_the_rate_of_crossings_against_direct_integration():
-    """One term of two degrees of freedom is exponential: the integral by a fine sum."""
-    c, dof, n = 31.0, 2, 8
-    a = np.linspace(0, c, 400_001)
-    one = 1 - np.exp(-(c - a) / 2)
-    direct = np.trapezoid(stats.chi2.pdf(a, dof * (n - 1)) * one * (1 - one), a)
-    assert upcrossing_rate(c, dof, n) == pytest.approx(direct, rel=1e-7)
-
-
-def test_windowed_sums_with_gaps():
-    nis = np.array([1.0, 2.0, 0.0, 4.0])
-    total, dof = windowed_nis(nis, np.array([1, 2, 0, 2]), 2)
-    assert_allclose(total, [1, 3, 2, 4])
-    assert_allclose(dof, [1, 3, 2, 2])
-
-
-def test_a_shift_is_found_and_its_delay_told():
-    rng = np.random.default_rng(4)
-    z = rng.standard_normal((2000, 3))
-    z[1200:] += 1.2
-    found = nis_test(
-        (z**2).sum(1), np.full(2000, 3), window=25, false_alarms_per_hour=1, rate=50, start=10.0
-    )
-    assert found.before(10 + 24.0) == 0
-    assert 0 < found.delay(10 + 24.0) < 1.0
-    assert found.delay(1e6) == math.inf
-    told = json.loads(json.dumps(found.to_dict()))
-    assert told["alarms"] == found.index.size and told["false_alarms_per_hour"] == 1
-
-
-# ------------------------------------------------------------------------------ cumulative sum
-
-
-@pytest.mark.parametrize(
-    ("shift", "h", "run"), [(0, 4, 168), (0.5, 4, 26.6), (1, 4, 8.38), (2, 4, 3.34), (0, 5, 465)]
-)
-def test_run_lengths_of_the_literature(shift, h, run):
-    """Lucas and Crosier (1982), three digits as printed."""
-    assert cusum_arl(0.5, h, shift) == pytest.approx(run, rel=2e-3)
-
-
-@pytest.mark.parametrize(("k", "h", "shift"), [(0.5, 4, 0), (0.25, 8, 0), (0.5, 4, 1), (1, 2, 0.3)])
-def test_run_lengths_by_three_routes(k, h, shift):
-    """Integral equation, Markov chain (error with the square of the cells), Siegmund (some %)."""
-    exact = cusum_arl(k, h, shift, two_sided=False)
-    assert cusum_arl_markov(k, h, shift, two_sided=False) == pytest.approx(exact, rel=2e-4)
-    assert cusum_arl(k, h, shift, two_sided=False, nodes=200) == pytest.approx(exact, rel=1e-8)
-    assert cusum_arl_siegmund(k, h, shift, two_sided=False) == pytest.approx(exact, rel=0.04)
-
-
-def test_siegmund_without_drift():
-    """The limit of his formula: (h + 1.166)^2."""
-    near = cusum_arl_siegmund(1e-5, 3.0, two_sided=False)
-    assert cusum_arl_siegmund(0.0, 3.0, two_sided=False) == pytest.approx(near, rel=1e-3)
-
-
-def test_one_false_alarm_an_hour_at_ten_kilohertz():
-    h = cusum_threshold(0.25, 1.0, 1e4)
-    assert cusum_arl(0.25, h) == pytest.approx(3.6e7, rel=1e-6)
-    assert cusum_arl_siegmund(0.25, h) == pytest.approx(3.6e7, rel=0.01)
-
-
-def test_alarms_come_at_the_stated_rate():
-    """2e6 samples, 1000 alarms expected: 4 standard deviations are 13 %."""
-    z = np.random.default_rng(2).standard_normal(2_000_000)
-    asked = HOUR * 50 / 2000
-    found = cusum_test(z, drift=0.4, false_alarms_per_hour=asked, rate=50)
-    assert found.index.size == pytest.approx(1000, rel=0.13)
-
-
-def test_the_sum_is_the_recursion():
-    """Page (1954); with restarts, against a plain loop."""
-    z = np.random.default_rng(3).standard_normal(5000) + 0.3
-    S, expected, alarms = 0.0, [], []
-    for k, v in enumerate(z):
-        S = max(0.0, S + v - 0.5)
-        expected.append(S)
-        if S > 4:
-            alarms.append(k)
-            S = 0.0
-    got = cusum_test(z, drift=0.5, false_alarms_per_hour=1, rate=1, two_sided=False, threshold=4.0)
-    assert_allclose(got.statistic, expected, atol=1e-11)
-    assert got.index.tolist() == alarms and len(alarms) > 20
-    free, S = [], 0.7
-    for v in z[:200]:
-        S = max(0.0, S + v - 0.5)
-        free.append(S)
-    assert_allclose(cusum(z[:200], 0.5, 0.7), free, atol=1e-12)
-
-
-def test_a_gap_is_no_evidence():
-    z = np.array([2.0, np.nan, 2.0])
-    got = cusum_test(z, drift=0.5, false_alarms_per_hour=1, rate=1, threshold=9.0, two_sided=False)
-    assert_allclose(got.statistic, [1.5, 1.5, 3.0])
-
-
-# ------------------------------------------------------------------------------ likelihood ratio
 
 A = np.array([[0.95, 0.1], [0.0, 0.9]])
 H = np.array([[1.0, 0.0], [0.3, 1.0]])
@@ -391,22 +250,9 @@ def test_projection_is_white_and_shifts_as_said():
     assert np.isnan(z[1])
 
 
-# ------------------------------------------------------------------------------ refusals
-
-
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda: cusum_threshold(0.5, 0, 50), ParameterError, "must be finite and > 0"),
-        (lambda: cusum_threshold(0.5, 1e6, 50), ParameterError, "that is no test"),
-        (lambda: cusum_threshold(4.0, 50.0, 1.0), ParameterError, "take a smaller drift"),
-        (lambda: cusum_arl(-1, 4), ParameterError, "drift must be finite"),
-        (lambda: cusum_arl(0.5, 0), ParameterError, "threshold must be finite"),
-        (lambda: cusum_arl(1.0, 40.0), EstimationError, "too long"),
-        (lambda: nis_threshold(3, 100_000, 100.0, 1.0), ParameterError, "shorten the window"),
-        (lambda: windowed_nis(np.ones(3), np.ones(2), 1), SignalError, "one length"),
-        (lambda: windowed_nis(np.array([np.nan]), np.ones(1), 1), SignalError, "not finite"),
-        (lambda: windowed_nis(np.ones(3), np.ones(3), 0), ParameterError, "window"),
         (lambda: Jump("stat", "x"), ParameterError, "did you mean 'state'"),
         (lambda: glr(_filter(_data()), [70]), ParameterError, "within the samples"),
         (lambda: glr(_filter(_data()), [7]).part(["bia"]), SignalError, "did you mean 'bias'"),
