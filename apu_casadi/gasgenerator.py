@@ -182,24 +182,15 @@ class GasGenerator:
     def state_space(self) -> StateSpace:
         """The continuous model as :class:`StateSpace`; z is started by similarity."""
         x, z, u, theta = self.cycle.symbols()
-        args, names = [x, u, theta], ["x", "u", "theta"]
         ode, alg, _ = self.equations(x, z, u, theta)
         z_sol = self.solve(self.similar(x, u), x, u, theta)
         f, _, g = self.equations(x, z_sol, u, theta)
-        return StateSpace(
-            name="gas_generator",
-            x=self.X,
-            z=self.z,
-            u=self.U,
-            theta=self.THETA,
-            y=self.Y,
-            residual=ca.Function(
-                "residual", [x, z, u, theta], [ode, alg], ["x", "z", "u", "theta"], ["ode", "alg"]
-            ),
-            f=ca.Function("f", args, [f], names, ["xdot"]),
-            g=ca.Function("g", args, [g], names, ["y"]),
-            z_of=ca.Function("z_of", args, [z_sol], names, ["z"]),
-        )
+        return StateSpace.of(
+            "gas_generator",
+            (self.X, self.z, self.U, self.THETA, self.Y),
+            (x, z, u, theta),
+            dae=(ode, alg), f=f, g=g, z=z_sol,
+        )  # fmt: skip
 
     # ------------------------------------------------------------------ discrete model (eq. 12)
 

@@ -133,22 +133,13 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
     f, g = X.stack({n: rates[n] for n in X.names}), Y.stack(mean)
 
     name = f"averaged_generator_{load_kind}" + ("" if gen.neutral == "grounded" else "_isolated")
-    args, names = [xv, uv, tv], ["x", "u", "theta"]
     no_z = ca.SX.sym("z", 0)
-    return StateSpace(
-        name=name,
-        x=X,
-        z=Signals(),
-        u=U,
-        theta=TH,
-        y=Y,
-        residual=ca.Function(
-            f"{name}_residual", [xv, no_z, uv, tv], [f, ca.SX(0, 1)], ["x", "z", "u", "theta"],
-            ["ode", "alg"],
-        ),
-        f=ca.Function(f"{name}_f", args, [f], names, ["xdot"], {"cse": True}),
-        g=ca.Function(f"{name}_g", args, [g], names, ["y"], {"cse": True}),
-        z_of=ca.Function(f"{name}_z", args, [ca.SX(0, 1)], names, ["z"]),
+    none = ca.SX(0, 1)
+    return StateSpace.of(
+        name,
+        (X, Signals(), U, TH, Y),
+        (xv, no_z, uv, tv),
+        dae=(f, none), f=f, g=g, z=none, cse=True,
     )  # fmt: skip
 
 

@@ -87,14 +87,15 @@ def ramped(ss: StateSpace) -> StateSpace:
     x_sg, rate = x[: len(ss.x)], u[at]
     u_sg = ca.vertcat(u[:at], x[len(ss.x)], u[at + 1 :])
     ode, alg = ss.residual(x_sg, z, u_sg, theta)
-    name, args = f"{ss.name}_ramped", [x, u, theta]
-    return StateSpace(
-        name=name, x=X, z=ss.z, u=U, theta=ss.theta, y=ss.y,
-        residual=ca.Function(f"{name}_residual", [x, z, u, theta], [ca.vertcat(ode, rate), alg]),
-        f=ca.Function(f"{name}_f", args, [ca.vertcat(ss.f(x_sg, u_sg, theta), rate)]),
-        g=ca.Function(f"{name}_g", args, [ss.g(x_sg, u_sg, theta)]),
-        z_of=ca.Function(f"{name}_z", args, [ss.z_of(x_sg, u_sg, theta)]),
-    )  # fmt: skip
+    return StateSpace.of(
+        f"{ss.name}_ramped",
+        (X, ss.z, U, ss.theta, ss.y),
+        (x, z, u, theta),
+        dae=(ca.vertcat(ode, rate), alg),
+        f=ca.vertcat(ss.f(x_sg, u_sg, theta), rate),
+        g=ss.g(x_sg, u_sg, theta),
+        z=ss.z_of(x_sg, u_sg, theta),
+    )
 
 
 @lru_cache(maxsize=64)
