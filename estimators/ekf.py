@@ -7,6 +7,14 @@ Cathey 1993): the prior is never replaced by the posterior, which would count th
 
 State and noise w are corrected together, since w acts on the output and on the transition that
 follows; with w absent from the output this is the usual filter.
+
+What to linearise anew.  The score of a sample is unbiased where its derivative H does not hang on
+the error of the same sample.  A predicted state does not; the corrected one does, and iterating it
+leaves out the derivative of log det S that would make up for it: small, but the same in each
+sample, so that it adds up along a recording.  The error w of a *measured input* is the other way
+round: the prediction is made at the reading, error and all, and the corrected w takes a part of it
+out again.  Hence ``iterated="noise"``, which moves w alone; ``"all"`` is for states that are far
+from known, where one sample moves them further than the model is straight.
 """
 
 from __future__ import annotations
@@ -19,14 +27,16 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.errors import ParameterError
+from apu_casadi.errors import ParameterError, nearest
 from estimators.algebra import backward, cholesky, forward, symmetric
 from estimators.belief import Belief
 from estimators.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
 from estimators.model import FilterModel
 from estimators.recording import Recording
 
-__all__ = ["Corrected", "correct", "ekf_step", "extended_kalman_filter", "projected"]
+__all__ = ["ITERATED", "Corrected", "correct", "ekf_step", "extended_kalman_filter", "projected"]
+
+ITERATED = ("all", "noise")
 
 
 class Corrected(NamedTuple):
@@ -150,18 +160,23 @@ def step_symbols(model: FilterModel, kind: Any) -> list[Any]:
 
 
 @lru_cache(maxsize=64)
-def ekf_step(model: FilterModel, iterations: int = 1) -> FilterStep:
+def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
     """Build the filter's step for a model.
 
     Parameters
     ----------
     model : the model.
     iterations : Gauss-Newton iterations of the update; 1 is the plain filter.
+    iterated : what the output is linearised anew at: ``"all"``, state and noise w as corrected, or
+        ``"noise"``, the corrected w and the predicted state; see the module's text.
 
     Raises
     ------
-    ParameterError : iterations not a whole number from 1 to 10; a model without states.
+    ParameterError : iterations not a whole number from 1 to 10; unknown ``iterated``; a model
+        without states.
     """
+    if iterated not in ITERATED:
+        raise ParameterError(f"iterated {iterated!r} {nearest(iterated, ITERATED)}")
     if not (isinstance(iterations, int) and 1 <= iterations <= 10):
         raise ParameterError(f"iterations must be a whole number from 1 to 10, got {iterations!r}")
     if not len(model.x):
@@ -181,16 +196,17 @@ def ekf_step(model: FilterModel, iterations: int = 1) -> FilterStep:
     forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_f])
 
     at, check, first = prior, kind(0), None
-    done = None
+    done = moved = None
     for _ in range(iterations):
         h, H, c = outputs(at, u, p)
         # linearised at the iterate, but always an update of the prior
         done = correct(Pa, H, y - h + H @ (at - prior), R, fixed)
         if first is None:
             first = done, y - h
-        at, check = prior + done.d, check + c
+        moved, check = prior + done.d, check + c
+        at = moved if iterated == "all" else ca.vertcat(m, moved[nx:])
     assert done is not None and first is not None
-    at = projected(at, done.P, model.lower, model.upper, fixed)
+    at = projected(moved, done.P, model.lower, model.upper, fixed)
     x1, F, c = forecast(at, u, p, dt)
     C = done.P[:nx, :] @ F.T
     P1 = ca.mtimes(F, done.P @ F.T) + ca.diag(ca.DM(model.walk**2)) * dt
@@ -199,7 +215,8 @@ def ekf_step(model: FilterModel, iterations: int = 1) -> FilterStep:
     stats = ca.vertcat(check + c, first[0].nis, first[0].loglik, first[0].measured)
     out = [x1, P1, at[:nx], done.P[:nx, :nx], C, nu, first[0].S, stats]
     out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
-    name = f"ekf{'' if iterations == 1 else iterations}_{model.name}"
+    kept = "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"
+    name = f"ekf{kept}_{model.name}"
     return FilterStep(model, ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT))
 
 
@@ -209,6 +226,7 @@ def extended_kalman_filter(
     data: Recording,
     *,
     iterations: int = 1,
+    iterated: str = "all",
     full: bool = False,
     backend: str | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -221,12 +239,12 @@ def extended_kalman_filter(
     prior : belief at the first instant, before its sample.
     data : the recording.
     iterations : Gauss-Newton iterations of each update; 1 is the plain filter.
+    iterated : ``"all"`` or ``"noise"``; see :func:`ekf_step`.
     full, backend, progress : see :func:`estimators.filtering.run`.
 
     Raises
     ------
     DataError, SignalError, EstimationError : see :func:`estimators.filtering.run`.
     """
-    return run(
-        ekf_step(model, iterations), prior, data, full=full, backend=backend, progress=progress
-    )
+    step = ekf_step(model, iterations, iterated)
+    return run(step, prior, data, full=full, backend=backend, progress=progress)

@@ -225,6 +225,51 @@ def test_long_runs_keep_covariances_symmetric_and_positive():
         assert np.linalg.eigvalsh(P / s[:, :, None] / s[:, None, :]).min() > 0
 
 
+def test_iterating_the_error_of_an_input_removes_its_attenuation():
+    """y = k (u - 0.2 w) + v with readings u of the constant 1: errors in variables.
+
+    Fuller (1987), Measurement Error Models, section 1.1: least squares on the readings shrinks k by
+    1/(1 + 0.2^2) = 0.962; orthogonal regression, which takes from each reading its most probable
+    error, does not.  Ten runs of 500 samples give the mean to 0.28/sqrt(5000) = 0.004.
+    """
+    x, u, p, w, dt = (ca.SX.sym(n, k) for n, k in zip("xupwd", (1, 1, 0, 1, 1), strict=True))
+    spread, K = 0.2, 500
+    model = FilterModel(
+        "reading", signals("k"), signals("u"), Signals(), signals("w"), signals("y"),
+        ca.Function("f", [x, u, p, w, dt], [x, ca.SX(0)]),
+        ca.Function("g", [x, u, p, w], [x * (u - spread * w), ca.SX(0)]),
+        np.zeros(1), np.full(1, -np.inf), np.full(1, np.inf),
+    )  # fmt: skip
+    rng, prior = np.random.default_rng(2), Belief(model.x, np.ones(1), np.eye(1))
+    found = {n: [] for n in (1, 2)}
+    for _ in range(10):
+        e, v = spread * rng.standard_normal((2, K))
+        data = Recording(
+            np.arange(float(K)), 1 + e[None], 1 + v[None], np.full((1, K), spread**2), np.zeros(0)
+        )
+        for n in found:
+            found[n].append(ekf(model, prior, data, iterations=n, iterated="noise").mean[0, -1])
+    assert_allclose(np.mean(found[1]), 1 / (1 + spread**2), atol=3 * 0.004)
+    assert_allclose(np.mean(found[2]), 1.0, atol=3 * 0.004)
+
+
+def test_iterating_the_noise_alone_keeps_the_state_where_it_was_predicted():
+    """The pendulum's noise adds to its output, whose derivatives do not hang on it: the plain
+    filter again, to rounding, where iterating the state is another."""
+    model = pendulum()
+    data = pendulum_data(model, K=3)
+    prior = Belief.of(model.x, {"q": 0.2, "r": 0, "k": 4}, {"q": 0.8, "r": 1, "k": 2})
+    plain, every = (ekf(model, prior, data, iterations=n).mean for n in (1, 2))
+    noise = ekf(model, prior, data, iterations=2, iterated="noise").mean
+    assert_allclose(noise, plain, rtol=1e-12)
+    assert np.abs(every - plain).max() > 1e-3
+
+
+def test_unknown_iterated_is_refused():
+    with pytest.raises(ParameterError, match="did you mean 'noise'"):
+        ekf_step(cv_model(), 2, "noises")
+
+
 @pytest.mark.parametrize("iterations", [0, 11, 1.0, "2"])
 def test_impossible_numbers_of_iterations_are_refused(iterations):
     """Whole numbers from 1 to 10."""

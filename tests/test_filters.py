@@ -35,6 +35,7 @@ FILTERS = {
     "ekf": (ekf_step, {}),
     "ekf, two iterations": (ekf_step, {"iterations": 2}),
     "ekf, three iterations": (ekf_step, {"iterations": 3}),
+    "ekf, noise iterated": (ekf_step, {"iterations": 2, "iterated": "noise"}),
     "cubature": (ukf_step, {"points": "cubature"}),
     "scaled": (ukf_step, {"points": "scaled"}),
     "close": (ukf_step, {"points": "scaled", "alpha": 0.05}),

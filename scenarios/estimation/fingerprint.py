@@ -33,11 +33,11 @@ def _electrical() -> list[ca.Function]:
 
 def _gas_path() -> list[ca.Function]:
     from estimators.ekf import ekf_step
-    from scenarios.estimation.gaspath import ITERATIONS, gas_path_filter
+    from scenarios.estimation.gaspath import ITERATED, ITERATIONS, gas_path_filter
     from scenarios.estimation.gaspath_study import ETA_SIGMA
 
     filters = (gas_path_filter(), gas_path_filter(eta=ETA_SIGMA, consider_eta=False))
-    return [ekf_step(f.model, ITERATIONS).function for f in filters]
+    return [ekf_step(f.model, ITERATIONS, ITERATED).function for f in filters]
 
 
 def _both() -> list[ca.Function]:

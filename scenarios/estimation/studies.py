@@ -27,7 +27,7 @@ from typing import Any
 
 from apu_casadi.errors import DataError, ParameterError, nearest
 from scenarios.estimation.fingerprint import digest
-from scenarios.estimation.gaspath_study import FRESH, TUNED
+from scenarios.estimation.gaspath_study import FRESH, TUNED, TUNED_LONG
 from scenarios.pages import write_text
 
 __all__ = [
@@ -350,7 +350,8 @@ _GP = ("gaspath", "gaspath_study")
 _BELOW = "tuned on seeds below the first"
 _GP_SEEDS: dict[str, Any] = {
     "seeds": len(FRESH), "seed0": FRESH.start,
-    "tuned": f"tuned on seeds {TUNED.start} to {TUNED.stop - 1}",
+    "tuned": f"tuned on seeds {TUNED.start} to {TUNED.stop - 1}, the iteration on "
+    f"{TUNED_LONG.start} to {TUNED_LONG.stop - 1}",
 }  # fmt: skip
 
 _ALL = (
