@@ -18,7 +18,13 @@ __all__ = ["REPORT"]
 _CASES = {
     "matched": ("matched", "matched model"),
     "fault": ("fault, unbalance", "fault and unbalance"),
+    "constant": ("the same, h told to be constant", "fault and unbalance, h told to be constant"),
     "gains": ("gain errors estimated", "fault, unbalance and gain errors"),
+    "gains, two passes": (
+        "gain errors estimated, two passes",
+        "fault, unbalance and gain errors, two passes",
+    ),
+    "gains considered": ("gain errors considered", "fault, unbalance and gain errors considered"),
     "gains ignored": ("gain errors ignored", "the same, filter without gains"),
 }
 
@@ -27,21 +33,36 @@ def _ignored(case: str) -> bool:
     return case == "gains ignored"
 
 
-def _off(v: Mapping[str, Any]) -> str:
-    """Say by how much a mean is off what is expected, and what its band asks for."""
+#: In the figure, which holds four.
+_DRAWN = ("matched", "fault", "gains", "gains, two passes")
+
+#: Why a mean is off, by case; elsewhere the seeds themselves.
+_WHY = {
+    "fault": "the filter allows for severities and fluxes that walk, and here they do not",
+    "constant": "the filter takes the start for worse known than it is, for the sake of unbalance "
+    "and transients, and without a walk it is long in forgetting that",
+    "gains": "the angle's error turns the derivatives and is in the innovations as well, so that "
+    "what is seen weakly, gains and h together, gathers a bias; a second pass, linearised about "
+    "the smoothed estimates, halves it",
+    "gains considered": "the filter allows for severities, an angle and fluxes that walk, and here "
+    "they do not",
+}
+
+
+def _off(case: str, v: Mapping[str, Any]) -> str:
+    """Say by how much a mean is off what is expected, what its band asks for, and why."""
     dof, mean = v["dof"], v["mean"]
-    asked = percent((v["band"][1] / dof) ** 0.5 - 1)
+    known = f" +- {v['mean_error']:.2f}" if "mean_error" in v else ""
     low, high = ((x / dof) ** 0.5 - 1 for x in v["range"])
-    said = f"the mean over all is {mean:.2f} instead of {dof:g}"
+    said = f"the mean over all is {mean:.2f}{known} instead of {dof:g}: at some checkpoint the "
     if mean > dof:
-        return (
-            f"{said}; at some checkpoint the errors are {percent(high)} larger than claimed, where "
-            f"the band of so many seeds allows {asked}"
-        )
-    return (
-        f"{said}: the errors are up to {percent(-low)} smaller than claimed, since the filter "
-        "allows for severities and fluxes that walk, and here they do not"
-    )
+        asked = percent((v["band"][1] / dof) ** 0.5 - 1)
+        said += f"errors are {percent(high)} larger than claimed, where the band of so many seeds "
+        said += f"allows {asked}"
+    else:
+        said += f"errors are {percent(-low)} smaller than claimed"
+    why = _WHY.get(case)
+    return f"{said}. {why[0].upper()}{why[1:]}" if why else said
 
 
 def claims(r: Results) -> list[Claim]:
@@ -60,8 +81,10 @@ def claims(r: Results) -> list[Claim]:
         checks = {"NEES of h": c["nees_h"], "NIS": c["nis"]}
         if "nees" in c:
             checks = {"NEES of all states": c["nees"], **checks}
+        if case == "gains considered":
+            del checks["NIS"]  # it holds constant offsets, and is no test
         for name, v in checks.items():
-            wide = "" if v["share"] >= SHARE else _off(v)
+            wide = "" if v["share"] >= SHARE else _off(case, v)
             out.append(Claim(
                 3, f"h, {words}: {name} in its band", f">= {percent(SHARE, 0)} of checkpoints",
                 percent(v["share"], 0), f"mean {v['mean']:.2f}, expected {v['dof']:g}", seeds,
@@ -81,8 +104,9 @@ def section(r: Results) -> list[str]:
                 words, f"{end:.1e}",
                 f"{c['ratio_end']:.2f} ({between(c['ratio_end_interval'], '.2f')})",
                 f"{c['ratio_worst']:.2f}", f"{c['nees_h']['mean']:.2f} of 3",
-                percent(c["nees_h"]["share"], 0), f"{c['nis']['mean']:.2f} of 4",
-                percent(c["nis"]["share"], 0),
+                percent(c["nees_h"]["share"], 0),
+                *(("no test", "-") if case == "gains considered" else
+                  (f"{c['nis']['mean']:.2f} of 4", percent(c["nis"]["share"], 0))),
             ])  # fmt: skip
     out = []
     if rows:
@@ -131,13 +155,15 @@ def _leaky(c: Mapping[str, Any]) -> list[str]:
         table(["true mu, k_rf, kappa", "h", "mu found", "1 sigma", "k_rf found", "1 sigma",
                 "error over sigma", "NIS"], rows),
     ]  # fmt: skip
-    if off > 3:
-        out.append(
-            f"The errors reach {off:.0f} claimed sigmas, and NIS shows it: started far away "
-            "(k_rf = 10 is three sigmas from the prior's mean), the extended filter is sure before "
-            "it has arrived, and creeps on along a curved valley. That is linearisation: three "
-            "iterations of each update about halve the error."
-        )
+    out.append(
+        f"The largest error is {off:.1f} claimed sigmas; below 1 since the filter allows for a "
+        "branch that changes slowly. It estimates the branch's conductance and susceptance at "
+        "rated frequency, of which the currents are nearly linear, and tells mu and k_rf from "
+        "them: written in mu and k_rf it was up to 47 sigmas off, sure before it had arrived. The "
+        "current of a branch decays within 80 us (the last row) to 2 ms, so it has an exact step "
+        "of its own. A branch whose susceptance is not above three sigmas shows no inductance, "
+        "and the filter refuses to tell mu from k_rf."
+    )
     return [
         *out,
         "What a wrong kappa does (truth: kappa = 1, the filter assumes 0.5): another pair (mu, "
@@ -170,9 +196,10 @@ def figures(r: Results) -> Pictures:
     from apu_casadi.studyplot import plot_consistency
 
     panels: list[Any] = []
-    for case, (words, _) in _CASES.items():
+    for case in _DRAWN:
         if case not in r:
             continue
+        words, _ = _CASES[case]
         c = r[case]
         ratios = {f"h_{k}": series(c["rmse_h"][k]) / series(c["bound_h"][k]) for k in "abc"}
         checks = {}
