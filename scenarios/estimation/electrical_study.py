@@ -54,6 +54,7 @@ from scenarios.estimation.electrical import (
     shunt_of,
     track,
 )
+from scenarios.estimation.intervals import share_interval
 from scenarios.estimation.sensors import ELECTRICAL, SensorSet
 
 __all__ = [
@@ -358,15 +359,6 @@ def _rmse_interval(ratio: float, n: int) -> list[float]:
     return [ratio * math.sqrt(n / b), ratio * math.sqrt(n / a)]
 
 
-def share_interval(k: int, n: int) -> list[float]:
-    """95 % interval of a share k of n (Clopper and Pearson)."""
-    if n == 0:
-        return [0.0, 1.0]
-    low = 0.0 if k == 0 else float(scipy.stats.beta.ppf(0.025, k, n - k + 1))
-    high = 1.0 if k == n else float(scipy.stats.beta.ppf(0.975, k + 1, n - k))
-    return [low, high]
-
-
 def _h_cov(result: FilterResult) -> np.ndarray:
     i = result.x.indices([f"h_{k}" for k in PHASES])
     assert result.cov is not None
@@ -645,14 +637,14 @@ def detection(
             "n_seeds": n_seeds,
             "seeds": [seed0, seed0 + n_seeds - 1],
             "found": found / n_seeds,
-            "found_interval": share_interval(found, n_seeds),
+            "found_interval": list(share_interval(found, n_seeds)),
             "delay_periods": {
                 "median": float(np.median(d)),
                 "p95": _finite(np.quantile(d, 0.95, method="higher")),
                 "max": _finite(d.max()),
             },
             "right_phase": right / n_seeds,
-            "right_phase_interval": share_interval(right, n_seeds),
+            "right_phase_interval": list(share_interval(right, n_seeds)),
             "false_alarms_before": before,
             "sigma_h": float(1 / math.sqrt(np.linalg.inv(cov[-1])[0, 0])),
             "seconds": time.perf_counter() - begun,
