@@ -389,7 +389,7 @@ _ALL = (
             "quiet": Part(_quiet, 15, 2.4),
             "false alarms": Part(_false_alarms, 2, 0.6),
         },
-        _EL, seed0=10_000, tuned=_BELOW,
+        _EL, seed0=12_000, tuned="tuned on seeds below 10000; 10000 to 10499 were looked at before",
     ),
     Study(
         "gaspath", "The gas-path filter at 20 ms",
