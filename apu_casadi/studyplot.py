@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -61,9 +62,11 @@ def plot_consistency(
     with mpl.rc_context(STYLE):
         fig = new_figure(5.2)
         grid = fig.subplots(2, len(panels), squeeze=False, sharex="col")
+        heads = [textwrap.fill(head, 88 // len(panels)) for head, *_ in panels]
         fig.subplots_adjust(
-            left=0.065, right=0.985, top=0.925, bottom=0.185, wspace=0.2, hspace=0.12
-        )
+            left=0.065, right=0.985, top=0.88 if any("\n" in h for h in heads) else 0.925,
+            bottom=0.185, wspace=0.2, hspace=0.12,
+        )  # fmt: skip
         for k, (head, t, ratios, limit, checks) in enumerate(panels):
             at = _same_length(head, t, {**ratios, **{n: v for n, (v, _) in checks.items()}})
             top, low = grid[:, k]
@@ -80,7 +83,7 @@ def plot_consistency(
                 top.set_yscale("log")
             else:
                 top.set_ylim(0, 1.25 * max(reach, limit or 1.0))
-            title(top, head)
+            title(top, heads[k])
             for (name, (v, band)), ink, mark in zip(checks.items(), LINE_INK, _MARKS, strict=False):
                 low.axhspan(*band, color=ink, alpha=0.07, lw=0)
                 for edge in band:
@@ -95,7 +98,7 @@ def plot_consistency(
                 low.set_ylabel("mean over expected")
                 top.legend(frameon=False, fontsize=8, ncols=2, loc="lower left")
                 if checks:
-                    low.legend(frameon=False, fontsize=8, ncols=2, loc="best")
+                    low.legend(frameon=True, edgecolor="none", fontsize=8, ncols=2, loc="best")
         caption(fig, note)
     return fig
 

@@ -728,14 +728,16 @@ def estimation(size: Size) -> list[Row]:
     """
     from estimators.ekf import extended_kalman_filter
     from estimators.ukf import unscented_kalman_filter
-    from scenarios.estimation import electrical_study as study
     from scenarios.estimation import jointrun, timing
-    from scenarios.estimation.electrical import electrical_filter
+    from scenarios.estimation.electrical.filter import electrical_filter
+    from scenarios.estimation.electrical_study.protocol import FULL
+    from scenarios.estimation.electrical_study.speed import speed
+    from scenarios.estimation.electrical_study.truth import generator_truth, samples_of
 
-    steps = study.speed(repeat=size.repeats)
+    steps = speed(repeat=size.repeats)
     name, fastest = next(iter(steps["rows"].items()))
     peer = timing.filterpy_step_us(repeat=max(1, size.repeats // 2))
-    samples = study.samples_of(study.generator_truth(study.FULL, 0.05), np.random.default_rng(0))
+    samples = samples_of(generator_truth(FULL, 0.05), np.random.default_rng(0))
     filt = electrical_filter()
     data, prior = filt.recording(samples), filt.prior(samples)
     rows = []

@@ -20,9 +20,39 @@ from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.terminalmodel import FLUXES, shunt_parameters
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter
-from scenarios.estimation import electrical as el
-from scenarios.estimation import electrical_study as study
-from scenarios.estimation.electrical import electrical_filter, faulty_phase, track, window_power
+from scenarios.estimation.electrical.faults import (
+    describe,
+    faulty_phase,
+    leaky_fault,
+    ridge,
+    shunt_of,
+)
+from scenarios.estimation.electrical.filter import electrical_filter
+from scenarios.estimation.electrical.model import _exponential, leaky_pair
+from scenarios.estimation.electrical.signals import GAIN_SENSORS
+from scenarios.estimation.electrical.tracking import track, window_power
+from scenarios.estimation.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
+from scenarios.estimation.electrical_study.detection import detection
+from scenarios.estimation.electrical_study.efficiency import efficiency
+from scenarios.estimation.electrical_study.false_alarms import _chance
+from scenarios.estimation.electrical_study.leaky import shunt_information
+from scenarios.estimation.electrical_study.protocol import (
+    DETECT,
+    DT,
+    EFFICIENCY,
+    FULL,
+    FULL_UNBALANCED,
+    PART,
+)
+from scenarios.estimation.electrical_study.run import run
+from scenarios.estimation.electrical_study.scores import nees
+from scenarios.estimation.electrical_study.truth import (
+    chances,
+    drawn_gains,
+    generator_truth,
+    samples_of,
+    unit_truth,
+)
 from scenarios.estimation.sensors import ELECTRICAL
 
 FILT = electrical_filter()
@@ -39,18 +69,18 @@ def _vm():
 
 
 def healthy():
-    return study.generator_truth(study.FULL, 0.15)
+    return generator_truth(FULL, 0.15)
 
 
 def faulted():
     """h = 1e-3 in phase b at 50 ms."""
-    return study.generator_truth(study.FULL, 0.15, ((0.05, FAULT_B),))
+    return generator_truth(FULL, 0.15, ((0.05, FAULT_B),))
 
 
 def test_without_noise_it_says_the_truth():
     """CVODES against one Runge-Kutta step of 100 us: h within 1e-9, currents within 1e-6 A."""
     truth = healthy().part(0, 600)
-    samples = study.samples_of(truth, None)
+    samples = samples_of(truth, None)
     r = extended_kalman_filter(FILT.model, FILT.prior(samples), FILT.recording(samples))
     assert np.abs(r.mean[r.x.indices(H)]).max() < 1e-9
     assert np.abs(r.innovation).max() < 1e-5
@@ -60,7 +90,7 @@ def test_without_noise_it_says_the_truth():
 def test_noise_is_what_the_filter_takes_it_for():
     """NIS of 1500 samples with four outputs: 4 within five standard deviations; states too."""
     truth = healthy()
-    samples = study.samples_of(truth, np.random.default_rng(5))
+    samples = samples_of(truth, np.random.default_rng(5))
     r = extended_kalman_filter(FILT.model, FILT.prior(samples), FILT.recording(samples))
     assert r.nis[20:].mean() == pytest.approx(4.0, abs=5 * math.sqrt(8 / 1480))
     error = r.mean - truth.state(FILT)
@@ -71,16 +101,16 @@ def test_shared_noise_of_a_voltage_is_that_of_the_step():
     """x(k) = s(k) - G e(k): G against the derivative of the step before to its last voltage."""
     m = FILT.model
     truth = healthy()
-    data = FILT.recording(study.samples_of(truth, None))
+    data = FILT.recording(samples_of(truth, None))
     k, e = 40, 1e-3
     x = truth.state(FILT)[:, k - 1]
     u0 = data.u[:, k - 1].copy()
     u1 = u0.copy()
-    half = 0.5 / math.cos(u0[0] * study.DT / 2)
+    half = 0.5 / math.cos(u0[0] * DT / 2)
     for name, size in (("v_b_next", e), ("v_b_mid", half * e)):
         u1[m.u.index(name)] += size
     w = np.zeros(len(m.w))
-    by_step = [m.transition(x, u, data.p, w, study.DT)[0].full().ravel() for u in (u0, u1)]
+    by_step = [m.transition(x, u, data.p, w, DT)[0].full().ravel() for u in (u0, u1)]
     moved = (by_step[1] - by_step[0]) / e
     # the filter's G: what w_v_b does to the fluxes at the sample, seen by a step of no length
     w[m.w.index("w_v_b")] = 1.0
@@ -89,15 +119,15 @@ def test_shared_noise_of_a_voltage_is_that_of_the_step():
     G = -shifted / ELECTRICAL.sigma("v_b", 0.0)
     fluxes = m.x.indices(FLUXES.names)
     # terms of the third order in the step are left out
-    assert_allclose(G[fluxes], moved[fluxes], atol=1e-3 * study.DT / 2)
+    assert_allclose(G[fluxes], moved[fluxes], atol=1e-3 * DT / 2)
     # the dampers hold a share of it, as the resistances took it
-    assert np.abs(G[m.x.index("lam_kd")]) > 3e-3 * study.DT / 2
+    assert np.abs(G[m.x.index("lam_kd")]) > 3e-3 * DT / 2
 
 
 def test_a_fault_is_found_at_once_with_its_phase():
     """h = 1e-3 in phase b: one reset, the right phase, five standard deviations."""
     truth = faulted()
-    samples = study.samples_of(truth, np.random.default_rng(2))
+    samples = samples_of(truth, np.random.default_rng(2))
     data = POWER.recording(samples)
     r, resets = track(POWER, POWER.prior(samples), data)
     assert resets == [pytest.approx(0.05, abs=5.1e-3)]
@@ -110,7 +140,7 @@ def test_a_fault_is_found_at_once_with_its_phase():
     assert v.sigma < 1e-5
     before = faulty_phase(Belief(r.x, r.mean[:, 400], np.diag(r.variance[:, 400])))
     assert before.phase is None
-    text = el.describe(POWER, r)
+    text = describe(POWER, r)
     assert "phase b" in text
     assert "not told apart" in text
 
@@ -118,7 +148,7 @@ def test_a_fault_is_found_at_once_with_its_phase():
 def test_window_power_is_the_mean_power_of_eq_8():
     """Energy by the filter over windows of 20 ms against the truth; the fault's loss is in it."""
     truth = faulted()
-    samples = study.samples_of(truth, np.random.default_rng(3))
+    samples = samples_of(truth, np.random.default_rng(3))
     data = POWER.recording(samples)
     r, _ = track(POWER, POWER.prior(samples), data)
     t, P, var = window_power(POWER, r, data)
@@ -131,8 +161,8 @@ def test_window_power_is_the_mean_power_of_eq_8():
 
 def test_a_load_step_is_no_fault():
     """225 to 100 kW between two samples: no reset, no alarm, consistent innovations throughout."""
-    truth = study.generator_truth(study.FULL, 0.1, ((0.05003, study.PART),))
-    samples = study.samples_of(truth, np.random.default_rng(4))
+    truth = generator_truth(FULL, 0.1, ((0.05003, PART),))
+    samples = samples_of(truth, np.random.default_rng(4))
     data = FILT.recording(samples)
     assert data.u[FILT.model.u.index("jump_qd")].max() > 50.0
     r, resets = track(FILT, FILT.prior(samples), data)
@@ -143,7 +173,7 @@ def test_a_load_step_is_no_fault():
 
 def test_gaps_and_missing_currents():
     """Instants without voltages are stepped over, missing currents are not used."""
-    samples = study.samples_of(healthy().part(0, 600), np.random.default_rng(6))
+    samples = samples_of(healthy().part(0, 600), np.random.default_rng(6))
     samples["v_a"][200:203] = np.nan
     samples["i_b"][300:320] = np.nan
     data = FILT.recording(samples)
@@ -162,20 +192,20 @@ def test_gaps_and_missing_currents():
 def test_start_from_a_period_is_within_its_spread():
     """A balanced machine at rest, an unbalanced one, and faults, whose h goes with the start."""
     filt = FILT
-    names = [*el.START_SIGMA, *H]
+    names = [*START_SIGMA, *H]
     i = filt.model.x.indices(names)
     for truth, h in (
         (healthy(), 0.0),
-        (study.generator_truth(study.FULL, 0.02, ((-0.1, study.FULL_UNBALANCED),), start=0.2), 0.0),
+        (generator_truth(FULL, 0.02, ((-0.1, FULL_UNBALANCED),), start=0.2), 0.0),
         (faulted().part(1000), FAULT_B.h),
     ):
-        prior = filt.prior(study.samples_of(truth, np.random.default_rng(7)))
+        prior = filt.prior(samples_of(truth, np.random.default_rng(7)))
         error = (prior.mean - truth.state(filt, h_b=h)[:, 0])[i]
         error[names.index("theta_e")] = math.remainder(error[names.index("theta_e")], 2 * math.pi)
         # chi-squared with ten degrees of freedom, 99.9 %
-        assert study._nees(error[None], prior.cov[np.ix_(i, i)][None])[0] < 29.6
+        assert nees(error[None], prior.cov[np.ix_(i, i)][None])[0] < 29.6
     # without the correlation the field flux would be three of its standard deviations off
-    assert abs(error[names.index("lam_fd")]) > 3 * el.START_SIGMA["lam_fd"]
+    assert abs(error[names.index("lam_fd")]) > 3 * START_SIGMA["lam_fd"]
 
 
 def test_gains_are_told_from_a_fault():
@@ -183,12 +213,12 @@ def test_gains_are_told_from_a_fault():
     filt = electrical_filter(gains="estimate")
     rng = np.random.default_rng(8)
     truth = faulted().part(500)
-    gains = study.drawn_gains(rng)
-    samples = study.samples_of(truth, rng, gains=gains)
+    gains = drawn_gains(rng)
+    samples = samples_of(truth, rng, gains=gains)
     r = extended_kalman_filter(filt.model, filt.prior(samples), filt.recording(samples))
     true = truth.state(filt, h_b=FAULT_B.h, **{f"gain_{n}": g for n, g in gains.items()})
     error = (r.mean - true)[:, -1] / np.sqrt(r.variance[:, -1])
-    rows = r.x.indices([*H, *(f"gain_{n}" for n in el.GAIN_SENSORS)])
+    rows = r.x.indices([*H, *(f"gain_{n}" for n in GAIN_SENSORS)])
     assert (np.abs(error[rows]) < 5).all()
     assert 1e-5 < r["h_a"][1][-1] < 1e-4  # sensors, not noise, limit it
     assert faulty_phase(r).phase == "b"
@@ -202,45 +232,45 @@ def test_considered_gains_leave_the_angle_free():
     """
     filt = electrical_filter(gains="consider")
     i = filt.model.x.index("theta_e")
-    assert filt.model.walk[i] == el.ANGLE_WALK_CONSIDERED
+    assert filt.model.walk[i] == ANGLE_WALK_CONSIDERED
     assert FILT.model.walk[i] == electrical_filter(gains="estimate").model.walk[i] == 0.0
-    samples = study.samples_of(healthy().part(0, 500), None)
+    samples = samples_of(healthy().part(0, 500), None)
     samples["w_r"] = samples["w_r"] * (1 + 1e-4)
     data, prior = filt.recording(samples), filt.prior(samples)
     h, sigma = {}, {}
-    for walk in (0.0, el.ANGLE_WALK_CONSIDERED):
+    for walk in (0.0, ANGLE_WALK_CONSIDERED):
         r = extended_kalman_filter(filt.model.with_walk({"theta_e": walk}), prior, data)
         h[walk] = np.abs(r.mean[r.x.indices(H), -1]).max()
         sigma[walk] = faulty_phase(r).sigma
     assert h[0.0] > 1e-5
-    assert h[el.ANGLE_WALK_CONSIDERED] < 0.1 * h[0.0]
-    assert sigma[el.ANGLE_WALK_CONSIDERED] == pytest.approx(sigma[0.0], rel=0.01)
+    assert h[ANGLE_WALK_CONSIDERED] < 0.1 * h[0.0]
+    assert sigma[ANGLE_WALK_CONSIDERED] == pytest.approx(sigma[0.0], rel=0.01)
 
 
 def test_leaky_fault_and_what_kappa_does():
     """kappa = 1 known: mu and k_rf; another kappa gives another pair for the same shunt."""
     fault = Ttsc(0.01, 1.0, kappa=1.0)
-    truth = study.generator_truth(study.FULL, 0.1, ((-0.1, fault),), start=0.2)
-    samples = study.samples_of(truth, np.random.default_rng(9))
+    truth = generator_truth(FULL, 0.1, ((-0.1, fault),), start=0.2)
+    samples = samples_of(truth, np.random.default_rng(9))
     got = {}
     for kappa in (1.0, 0.5):
         filt = electrical_filter(kappa=kappa, phase="a")
         r = extended_kalman_filter(filt.model, filt.prior(samples), filt.recording(samples))
         got[kappa] = filt, r
     filt, r = got[1.0]
-    found = el.leaky_fault(filt, r)
+    found = leaky_fault(filt, r)
     for name, true in (("mu", 0.01), ("k_rf", 1.0)):
         m, s = found[name]
         assert m == pytest.approx(true, abs=5 * s)
-    assert "another kappa would give another pair" in el.describe(filt, r)
+    assert "another kappa would give another pair" in describe(filt, r)
     half, r2 = got[0.5]
-    assert el.leaky_fault(half, r2)["mu"][0] < 0.007
-    put_right = el.shunt_of(half, r2, 1.0)
+    assert leaky_fault(half, r2)["mu"][0] < 0.007
+    put_right = shunt_of(half, r2, 1.0)
     assert put_right["mu"] == pytest.approx(0.01, rel=0.05)
     with pytest.raises(EstimationError, match="no shunt inductance"):
-        el.shunt_of(FILT, r, 1.0)
+        shunt_of(FILT, r, 1.0)
     with pytest.raises(EstimationError, match="no mu and k_rf"):
-        el.leaky_fault(FILT, r)
+        leaky_fault(FILT, r)
     # a filter of full coupling sees something else, and says that it does not fit
     plain = extended_kalman_filter(FILT.model, FILT.prior(samples), FILT.recording(samples))
     assert plain.nis[200:].mean() > 6
@@ -253,11 +283,11 @@ def test_a_leaky_fault_faster_than_the_samples():
     give the current's decay as 0.300 instead of 0.277.
     """
     fault = Ttsc(0.01, 10.0, kappa=0.2)
-    truth = study.generator_truth(study.FULL, 0.1, ((-0.1, fault),), start=0.2)
-    samples = study.samples_of(truth, np.random.default_rng(10))
+    truth = generator_truth(FULL, 0.1, ((-0.1, fault),), start=0.2)
+    samples = samples_of(truth, np.random.default_rng(10))
     filt = electrical_filter(kappa=0.2, phase="a")
     r = extended_kalman_filter(filt.model, filt.prior(samples), filt.recording(samples))
-    found = el.leaky_fault(filt, r)
+    found = leaky_fault(filt, r)
     for name, true in (("mu", fault.mu), ("k_rf", fault.k_rf)):
         m, s = found[name]
         assert m == pytest.approx(true, abs=5 * s)
@@ -268,21 +298,21 @@ def test_a_leaky_fault_faster_than_the_samples():
 def test_a_branch_without_inductance_has_no_mu_and_k_rf():
     """kappa hardly above mu: the error says what is left, h."""
     fault = Ttsc(0.01, 10.0, kappa=0.0101)
-    truth = study.generator_truth(study.FULL, 0.05, ((-0.1, fault),), start=0.15)
-    samples = study.samples_of(truth, np.random.default_rng(11))
+    truth = generator_truth(FULL, 0.05, ((-0.1, fault),), start=0.15)
+    samples = samples_of(truth, np.random.default_rng(11))
     filt = electrical_filter(kappa=0.5, phase="a")
     r = extended_kalman_filter(filt.model, filt.prior(samples), filt.recording(samples))
     assert r["g_shunt"][0][-1] == pytest.approx(fault.h, abs=5 * r["g_shunt"][1][-1])
     with pytest.raises(EstimationError, match=r"shows no inductance: b_shunt = .* use full coup"):
-        el.leaky_fault(filt, r)
-    assert "no inductance" in el.describe(filt, r)
+        leaky_fault(filt, r)
+    assert "no inductance" in describe(filt, r)
 
 
 @pytest.mark.parametrize("z", [-1285.0, -1.285, -0.6, -0.4, -1e-3, 0.0, 0.3])
 def test_exponential_step(z):
     """Exact for a parabola: dx/dt = z x + v over [0, 1] against the integral by Gauss's rule."""
     v = np.array([0.3, -1.1, 0.8])
-    decay, *weights = (float(w) for w in el._exponential(ca.SX(z)))
+    decay, *weights = (float(w) for w in _exponential(ca.SX(z)))
     # graded towards the end, where a fast decay leaves its weight
     edges = 1.0 - np.append(np.logspace(0, -6, 60), 0.0)
     node, gauss = np.polynomial.legendre.leggauss(12)
@@ -298,7 +328,7 @@ def test_admittance_of_a_leaky_fault():
     p = FILT.machine
     fault = Ttsc(0.02, 3.0, kappa=0.6)
     Y = p.r_s / complex(fault.R_shunt(p), p.w_rated * fault.L_shunt(p))
-    pair = el._pair(p, 0.6, Y.real, -Y.imag)
+    pair = leaky_pair(p, 0.6, Y.real, -Y.imag)
     assert pair == pytest.approx((0.02, 3.0), rel=1e-9)
     other = shunt_parameters(p, R=fault.R_shunt(p), L=fault.L_shunt(p), kappa=0.6)
     assert pair == pytest.approx((other["mu"], other["k_rf"]), rel=1e-9)
@@ -306,18 +336,18 @@ def test_admittance_of_a_leaky_fault():
 
 def test_information_of_the_admittance():
     """kappa = mu: one number only; kappa = 1: two, k_rf the worse the smaller mu."""
-    assert study.shunt_information(0.05, 1.0, 0.05, 1e-6)["singular_ratio"] == 0.0
-    small, large = (study.shunt_information(m, 1.0, 1.0, 1e-6) for m in (0.002, 0.05))
+    assert shunt_information(0.05, 1.0, 0.05, 1e-6)["singular_ratio"] == 0.0
+    small, large = (shunt_information(m, 1.0, 1.0, 1e-6) for m in (0.002, 0.05))
     assert small["sigma_k_rf"] > 20 * large["sigma_k_rf"]
     assert large["sigma_mu"] == pytest.approx(small["sigma_mu"], rel=0.2)
 
 
 def test_ridge():
     """Every pair on it has the same h; the paper's 5 % with k_rf = 1 among them."""
-    for row in el.ridge(Ttsc(0.05, 1.0).h, k_rf=(0.0, 1.0, 10.0)):
+    for row in ridge(Ttsc(0.05, 1.0).h, k_rf=(0.0, 1.0, 10.0)):
         assert Ttsc(row["mu"], row["k_rf"]).h == pytest.approx(Ttsc(0.05, 1.0).h)
-    assert el.ridge(Ttsc(0.05, 1.0).h, k_rf=(1.0,))[0]["mu"] == pytest.approx(0.05)
-    assert el.ridge(0.5, k_rf=(100.0,)) == []
+    assert ridge(Ttsc(0.05, 1.0).h, k_rf=(1.0,))[0]["mu"] == pytest.approx(0.05)
+    assert ridge(0.5, k_rf=(100.0,)) == []
 
 
 def test_verdict_of_three_severities():
@@ -348,7 +378,7 @@ def test_choices_are_checked():
             electrical_filter(**kwargs)
     r = extended_kalman_filter(
         FILT.model,
-        FILT.prior(s := study.samples_of(healthy().part(0, 60), None)),
+        FILT.prior(s := samples_of(healthy().part(0, 60), None)),
         d := FILT.recording(s),
     )
     with pytest.raises(EstimationError, match="power=True"):
@@ -357,11 +387,11 @@ def test_choices_are_checked():
 
 def test_superposition_is_the_simulated_fault():
     """h v/r_s added to a healthy truth: a filter finds that h, which the simulation had not."""
-    truth = study.chances(
+    truth = chances(
         healthy().part(0, 800), np.random.default_rng(1), h=np.array([[0.0], [0.0], [5e-4]]),
         flux_sigma={"lam_fd": 1e-3}, flux_walk=1e-4,
     )  # fmt: skip
-    samples = study.samples_of(truth, np.random.default_rng(2))
+    samples = samples_of(truth, np.random.default_rng(2))
     r = extended_kalman_filter(FILT.model, FILT.prior(samples), FILT.recording(samples))
     v = faulty_phase(r)
     assert v.phase == "c"
@@ -376,9 +406,9 @@ def test_speed_of_the_units_truth_is_the_machines():
     Without noise, after a load step: innovations below 0.2 A, statistics of h below one; with an
     exchange step of 20 ms, computed once, the speed recorded is up to 2.7 rad/s off: 2 A.
     """
-    truth = study.unit_truth(0.1, (LoadChange(0.01, study.PART),))
+    truth = unit_truth(0.1, (LoadChange(0.01, PART),))
     assert truth.values["w_r"][-1] > truth.values["w_r"][0] + 30.0
-    samples = study.samples_of(truth, None)
+    samples = samples_of(truth, None)
     r = extended_kalman_filter(FILT.model, FILT.prior(samples), FILT.recording(samples))
     assert np.abs(r.innovation[:, 300:]).max() < 0.2
     assert np.abs(r.mean[r.x.indices(H), 300:]).max() < 3e-6
@@ -388,12 +418,12 @@ def test_chance_of_an_alarm_by_the_tail():
     """Maxima with P(> z) = exp(-(z^2 - 2.5^2)/2) from 2.5 on: the chance is that, the shape 1."""
     n = 4000
     tops = np.sqrt(2.5**2 - 2 * np.log((np.arange(n) + 0.5) / n))
-    tail = study._chance(tops, 25.0)
+    tail = _chance(tops, 25.0)
     assert tail["runs_beyond"] == n
     assert tail["chance_per_run"] == pytest.approx(math.exp(-(25 - 2.5**2) / 2))
     # quantiles at mid-points: the mean of -log over n of them is 1 within log(2)/(2 n)
     assert tail["shape"] == pytest.approx(1.0, abs=1e-3)
-    none = study._chance(np.array([1.0, 2.0]), 25.0)
+    none = _chance(np.array([1.0, 2.0]), 25.0)
     assert none["chance_per_run"] == 0.0
     assert none["shape"] is None
     json.dumps(none, allow_nan=False)
@@ -401,25 +431,25 @@ def test_chance_of_an_alarm_by_the_tail():
 
 def test_studies_give_json(monkeypatch):
     """Studies at their smallest; numbers are judged elsewhere."""
-    monkeypatch.setitem(study.EFFICIENCY, "duration", 0.02)
-    monkeypatch.setitem(study.DETECT, "matched", (1e-4, 4))
-    monkeypatch.setattr(study, "WAIT", 0.02)
-    one = study.efficiency(2, 0, cases=["matched"])
-    two = study.detection(2, 0, cases=["matched"])
+    monkeypatch.setitem(EFFICIENCY, "duration", 0.02)
+    monkeypatch.setitem(DETECT, "matched", (1e-4, 4))
+    monkeypatch.setattr("scenarios.estimation.electrical_study.detection.WAIT", 0.02)
+    one = efficiency(2, 0, cases=["matched"])
+    two = detection(2, 0, cases=["matched"])
     assert "nees_h" in json.dumps(one)
     assert json.loads(json.dumps(two))["matched"]["n_seeds"] == 2
     with pytest.raises(ParameterError, match="did you mean 'leaky'"):
-        study.run(2, studies=["leak"])
+        run(2, studies=["leak"])
     with pytest.raises(EstimationError, match="2 at least"):
-        study.run(1)
+        run(1)
 
 
 @pytest.mark.slow
 def test_goals_on_few_seeds():
     """Issue's goals 2, 3 and 5 for h, on 40 seeds other than those of the study."""
     with use_backend(None):
-        e = study.efficiency(40, 500, cases=["matched", "gains"])
-        d = study.detection(40, 500)
+        e = efficiency(40, 500, cases=["matched", "gains"])
+        d = detection(40, 500)
     assert e["matched"]["passed"]
     assert e["gains"]["passed"]
     assert all(d[c]["found"] == 1.0 and d[c]["false_alarms_before"] == 0 for c in d)

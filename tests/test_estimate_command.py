@@ -21,7 +21,7 @@ from scenarios import cli
 from scenarios.commands import estimate as command
 from scenarios.estimation import fingerprint, jointrun, studies
 from scenarios.estimation.correctness import correctness
-from scenarios.estimation.electrical import FAULT_LEVEL
+from scenarios.estimation.electrical.tuning import FAULT_LEVEL
 from scenarios.estimation.gaspath_study import FRESH
 from scenarios.estimation.joint import GAIN_SHARE
 from scenarios.estimation.reports import REPORTS

@@ -26,9 +26,9 @@ def _linear() -> list[ca.Function]:
 
 def _electrical() -> list[ca.Function]:
     from estimators.ekf import ekf_step
-    from scenarios.estimation.electrical import electrical_filter
+    from scenarios.estimation.electrical.filter import GAINS, electrical_filter
 
-    return [ekf_step(electrical_filter(gains=g).model).function for g in ("none", "consider")]
+    return [ekf_step(electrical_filter(gains=g).model).function for g in GAINS]
 
 
 def _gas_path() -> list[ca.Function]:

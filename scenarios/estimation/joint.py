@@ -38,16 +38,10 @@ from apu_casadi.signals import Signal
 from estimators.ekf import extended_kalman_filter
 from estimators.filtering import FilterResult
 from estimators.recording import Recording
-from scenarios.estimation.electrical import (
-    FAULT_LEVEL,
-    MEASURED,
-    PHASES,
-    VOLTAGES,
-    ElectricalFilter,
-    electrical_filter,
-    track,
-    window_power,
-)
+from scenarios.estimation.electrical.filter import ElectricalFilter, electrical_filter
+from scenarios.estimation.electrical.signals import MEASURED, PHASES, VOLTAGES
+from scenarios.estimation.electrical.tracking import track, window_power
+from scenarios.estimation.electrical.tuning import FAULT_LEVEL
 from scenarios.estimation.gaspath import (
     DT,
     HEALTH,

@@ -18,7 +18,8 @@ import numpy as np
 
 from apu_casadi.errors import ScenarioError
 from scenarios import registry
-from scenarios.estimation.electrical import PHASES, ridge
+from scenarios.estimation.electrical.faults import ridge
+from scenarios.estimation.electrical.signals import PHASES
 from scenarios.estimation.gaspath import DT, HEALTH
 from scenarios.estimation.joint import GAIN_SHARE, estimate_joint, joint_case
 

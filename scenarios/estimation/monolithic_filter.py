@@ -26,7 +26,8 @@ from estimators.ekf import extended_kalman_filter
 from estimators.filtering import FilterResult
 from estimators.model import FilterModel
 from estimators.recording import Recording
-from scenarios.estimation.electrical import ElectricalFilter, electrical_filter, window_power
+from scenarios.estimation.electrical.filter import ElectricalFilter, electrical_filter
+from scenarios.estimation.electrical.tracking import window_power
 from scenarios.estimation.gaspath import (
     AMBIENT,
     DT,

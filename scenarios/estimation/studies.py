@@ -159,20 +159,28 @@ def _correctness(n: int, seed0: int, tell: Tell) -> Any:
     return correctness(n, seed0, progress=tell)
 
 
-def _electrical(name: str, case: str) -> Callable[[int, int, Tell], Any]:
+def _efficiency(case: str) -> Callable[[int, int, Tell], Any]:
     def run(n: int, seed0: int, tell: Tell) -> Any:
-        from scenarios.estimation import electrical_study as study
+        from scenarios.estimation.electrical_study.efficiency import efficiency
 
-        found: dict[str, Any] = getattr(study, name)(n, seed0, cases=[case])[case]
-        return found
+        return efficiency(n, seed0, cases=[case])[case]
+
+    return run
+
+
+def _detection(case: str) -> Callable[[int, int, Tell], Any]:
+    def run(n: int, seed0: int, tell: Tell) -> Any:
+        from scenarios.estimation.electrical_study.detection import detection
+
+        return detection(n, seed0, cases=[case])[case]
 
     return run
 
 
 def _leaky(n: int, seed0: int, tell: Tell) -> Any:
-    from scenarios.estimation import electrical_study as study
+    from scenarios.estimation.electrical_study.leaky import leaky
 
-    return study.leaky(n, seed0)
+    return leaky(n, seed0)
 
 
 def _ridge(n: int, seed0: int, tell: Tell) -> Any:
@@ -187,9 +195,9 @@ def _ridge(n: int, seed0: int, tell: Tell) -> Any:
 
 
 def _quiet(n: int, seed0: int, tell: Tell) -> Any:
-    from scenarios.estimation import electrical_study as study
+    from scenarios.estimation.electrical_study.false_alarms import quiet
 
-    return study.quiet(n, seed0)
+    return quiet(n, seed0)
 
 
 HOURS_PER_SEED = 0.002  # an hour for 500
@@ -197,9 +205,9 @@ MONOLITHIC = 0.4  # s
 
 
 def _false_alarms(n: int, seed0: int, tell: Tell) -> Any:
-    from scenarios.estimation import electrical_study as study
+    from scenarios.estimation.electrical_study.false_alarms import false_alarms
 
-    return study.false_alarms(HOURS_PER_SEED * n, seed0)
+    return false_alarms(HOURS_PER_SEED * n, seed0)
 
 
 def _gaspath(matched: bool) -> Callable[[int, int, Tell], Any]:
@@ -327,11 +335,11 @@ def _joint_monolithic(n: int, seed0: int, tell: Tell) -> Any:
 
 def _step_times(n: int, seed0: int, tell: Tell) -> Any:
     from scenarios.bench import machine
-    from scenarios.estimation import electrical_study as study
+    from scenarios.estimation.electrical_study.speed import speed
     from scenarios.estimation.timing import filterpy_step_us
 
     where = machine()
-    out = study.speed()
+    out = speed()
     out["filterpy_ukf_us"] = filterpy_step_us()
     out["machine"] = {k: where[k] for k in ("processor", "cores", "system", "load_before")}
     return out
@@ -367,13 +375,13 @@ _ALL = (
         "times with the mismatched one; mean NEES and NIS in their 95 % bands at 90 % or more of "
         "the checkpoints.",
         {
-            "matched": Part(_electrical("efficiency", "matched"), 10, 0.035),
-            "fault": Part(_electrical("efficiency", "fault"), 10, 0.03),
-            "constant": Part(_electrical("efficiency", "constant"), 10, 0.03),
-            "gains": Part(_electrical("efficiency", "gains"), 15, 0.065),
-            "gains, two passes": Part(_electrical("efficiency", "gains, two passes"), 20, 0.5),
-            "gains considered": Part(_electrical("efficiency", "gains considered"), 15, 0.065),
-            "gains ignored": Part(_electrical("efficiency", "gains ignored"), 1, 0.03),
+            "matched": Part(_efficiency("matched"), 10, 0.035),
+            "fault": Part(_efficiency("fault"), 10, 0.03),
+            "constant": Part(_efficiency("constant"), 10, 0.03),
+            "gains": Part(_efficiency("gains"), 15, 0.065),
+            "gains, two passes": Part(_efficiency("gains, two passes"), 20, 0.5),
+            "gains considered": Part(_efficiency("gains considered"), 15, 0.065),
+            "gains ignored": Part(_efficiency("gains ignored"), 1, 0.03),
             "leaky": Part(_leaky, 20, 0.07, share=0.1),
             "ridge": Part(_ridge, 2, 0, share=None),
         },
@@ -384,8 +392,8 @@ _ALL = (
         "h = 1e-4 found within 20 electrical periods, h = 3e-4 within 50 with gain errors and "
         "unbalance; at most one false alarm an hour; load steps and gas faults raise none.",
         {
-            "matched": Part(_electrical("detection", "matched"), 5, 0.02),
-            "mismatched": Part(_electrical("detection", "mismatched"), 15, 0.075),
+            "matched": Part(_detection("matched"), 5, 0.02),
+            "mismatched": Part(_detection("mismatched"), 15, 0.075),
             "quiet": Part(_quiet, 15, 2.4),
             "false alarms": Part(_false_alarms, 2, 0.6),
         },

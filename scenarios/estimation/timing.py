@@ -47,10 +47,11 @@ def filterpy_step_us(repeat: int = 3) -> float | None:
     if find_spec("filterpy") is None:
         return None
     from estimators.filterpy_adapter import filterpy_ukf
-    from scenarios.estimation import electrical_study as study
-    from scenarios.estimation.electrical import electrical_filter
+    from scenarios.estimation.electrical.filter import electrical_filter
+    from scenarios.estimation.electrical_study.protocol import FULL
+    from scenarios.estimation.electrical_study.truth import generator_truth, samples_of
 
-    samples = study.samples_of(study.generator_truth(study.FULL, 0.1), np.random.default_rng(0))
+    samples = samples_of(generator_truth(FULL, 0.1), np.random.default_rng(0))
     filt = electrical_filter()
     data, prior = filt.recording(samples), filt.prior(samples)
     quiet = _without_noise(filt.model)
