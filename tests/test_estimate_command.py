@@ -132,12 +132,22 @@ def test_other_ambient_conditions_are_refused():
 @pytest.mark.slow
 def test_joint_command(tmp_path, capsys):
     """The quiet scenario of the library, end to end."""
-    args = ["estimate", "joint", "--scenario", "ttsc_leaky", "--out", str(tmp_path), "--json"]
+    args = ["estimate", "joint", "--scenario", "quiet", "--out", str(tmp_path), "--json"]
     assert cli.main(args) == 0
     r = json.loads(capsys.readouterr().out)
-    assert r["scenario"] == "ttsc_leaky"
+    assert r["scenario"] == "quiet"
     names = {p.name for p in tmp_path.iterdir()}
-    assert names >= {"estimate.json", "estimate_ttsc_leaky.nc", "estimate_ttsc_leaky.png"}
+    assert names >= {"estimate.json", "estimate_quiet.nc", "estimate_quiet.png"}
+
+
+@pytest.mark.slow
+def test_a_fault_that_the_filter_cannot_have_is_refused(tmp_path, capsys):
+    """A branch with leakage of its own is no shunt resistance; the message says what knows it."""
+    args = ["estimate", "joint", "--scenario", "ttsc_leaky", "--out", str(tmp_path), "--quiet"]
+    assert cli.main(args) == 1
+    said = capsys.readouterr().err
+    assert "the model does not fit these data" in said
+    assert "electrical_filter(kappa=..., phase=...)" in said
 
 
 # ------------------------------------------------------------------------------ studies

@@ -75,7 +75,8 @@ def track(
             raise EstimationError(
                 f"{filt.model.name}: {max_resets} resets up to t = {resets[-1]:.6g} s and still "
                 f"the innovations are {share[bad[0]]:.3g} times what they should be: the model "
-                "does not fit these data (another kappa, other parameters, sensor faults)"
+                "does not fit these data: a fault branch with leakage of its own, which "
+                "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults"
             )
         cut = int(bad[0]) * RESET_WINDOW
         # once more up to the cut, whose sample is left to the next piece: a belief of s(cut)
