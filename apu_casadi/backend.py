@@ -527,6 +527,8 @@ class Caller:
     def __call__(self, *arrays: np.ndarray | float) -> tuple[np.ndarray, ...]:
         """Evaluate; column vectors come back with shape (n,), matrices with shape (n, m).
 
+        An argument that is the input buffer itself, filled in place, is not copied.
+
         Raises
         ------
         BackendError : wrong number or size of arguments (nothing is spread), or a failure.
@@ -537,6 +539,8 @@ class Caller:
                 f"({', '.join(self.fun.name_in())}), got {len(arrays)}"
             )
         for i, (view, a) in enumerate(zip(self._in, arrays, strict=True)):
+            if a is view:
+                continue
             value = np.asarray(a, dtype=float)
             if value.shape != view.shape:
                 if value.size != view.size or value.ndim > 2 or min(self._shape_in[i]) > 1:

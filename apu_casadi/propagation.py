@@ -735,15 +735,10 @@ class Propagator:
                 known *= 2
             np.multiply(E[:, : O.shape[1]], z[:, None], out=O)
             # one row for each step of the exciter is one column of the compiled function's input
-            buffers = self._compiled.inputs
-            np.matmul(E.view(float), even, out=buffers[1].T)
-            np.matmul(O.view(float), odd, out=buffers[2].T)
-            for buffer, value in zip(
-                (buffers[0], *buffers[3:]), (x0, u, self.theta, self.h), strict=True
-            ):
-                buffer[...] = value
-            self._compiled.evaluate()
-            x, y, mean, miss = self._compiled.outputs
+            _, P, Q, *_ = self._compiled.inputs
+            np.matmul(E.view(float), even, out=P.T)
+            np.matmul(O.view(float), odd, out=Q.T)
+            x, y, mean, miss = self._compiled(x0, P, Q, u, self.theta, self.h)
         if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
             raise SimulationError(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import least_squares
 
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
@@ -277,3 +278,33 @@ def stateless():
         lower=np.zeros(0),
         upper=np.zeros(0),
     )
+
+
+def most_probable_path(model, prior, data, **options):
+    """States (nx, K) that SciPy's least_squares finds from all samples and noises at once.
+
+    The unknowns are errors of the start and noises of every step, in standard deviations; the
+    model's only noise w and the walks of its states.  ``options`` go to ``least_squares``.
+    """
+    nx, K = len(model.x), data.size
+    n = nx + len(model.w)
+
+    def path(z):
+        x, xs = prior.mean + prior.sigma * z[:nx], []
+        noises = z[nx:].reshape(K, n)
+        for k in range(K):
+            xs.append(x)
+            x1 = model.transition(x, data.u[:, k], data.p, noises[k, nx:], data.dt[k])[0]
+            x = np.array(x1).ravel() + np.sqrt(data.dt[k]) * model.walk * noises[k, :nx]
+        return np.array(xs), noises
+
+    def residual(z):
+        xs, noises = path(z)
+        r = [z]
+        for k in range(K):
+            y = np.array(model.output(xs[k], data.u[:, k], data.p, noises[k, nx:])[0]).ravel()
+            e = (data.y[:, k] - y) / np.sqrt(data.variance[:, k])
+            r.append(e[~np.isnan(data.y[:, k])])
+        return np.concatenate(r)
+
+    return path(least_squares(residual, np.zeros(nx + n * K), **options).x)[0].T

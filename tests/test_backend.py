@@ -359,3 +359,15 @@ def test_level_is_part_of_the_name(monkeypatch):
     )
     with pytest.raises(BackendError, match=r"level must be one of \(1, 2, 3\), got 4"):
         backend.compiled(f, level=4)
+
+
+def test_an_input_buffer_filled_in_place_is_taken_as_it_is():
+    """The same values as an argument that is copied; other arguments are still checked."""
+    f = pendulum()
+    call = backend.Caller(f)
+    want = backend.Caller(f)(X, P)[0]
+    buffer = call.inputs[0]
+    buffer[:] = X
+    np.testing.assert_array_equal(call(buffer, P)[0], want)
+    with pytest.raises(BackendError, match="p has shape"):
+        call(buffer, np.zeros(2))

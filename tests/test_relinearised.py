@@ -6,9 +6,15 @@ least squares of all samples at once finds.
 
 import numpy as np
 import pytest
-from estimation_models import gappy, pendulum, pendulum_data, random_belief, random_linear
+from estimation_models import (
+    gappy,
+    most_probable_path,
+    pendulum,
+    pendulum_data,
+    random_belief,
+    random_linear,
+)
 from numpy.testing import assert_allclose
-from scipy.optimize import least_squares
 
 from apu_casadi.errors import ParameterError
 from estimators.belief import Belief
@@ -69,27 +75,7 @@ def test_passes_lead_to_the_most_probable_path():
     The last 4e-7 are what the torque's noise leaves, which is linearised at zero.
     """
     model, prior, data = swinging(12)
-    K, g, f = data.size, model.output, model.transition
-
-    def path(z):
-        x, xs = prior.mean + prior.sigma * z[:3], []
-        noises = z[3:].reshape(K, 4)
-        for k in range(K):
-            xs.append(x)
-            x1 = f(x, data.u[:, k], data.p, noises[k, 3:], data.dt[k])[0]
-            x = np.array(x1).ravel() + np.sqrt(data.dt[k]) * model.walk * noises[k, :3]
-        return np.array(xs), noises
-
-    def residual(z):
-        xs, noises = path(z)
-        r = [z]
-        for k in range(K):
-            y = np.array(g(xs[k], data.u[:, k], data.p, noises[k, 3:])[0]).ravel()
-            e = (data.y[:, k] - y) / np.sqrt(data.variance[:, k])
-            r.append(e[~np.isnan(data.y[:, k])])
-        return np.concatenate(r)
-
-    best = path(least_squares(residual, np.zeros(3 + 4 * K), xtol=1e-12).x)[0].T
+    best = most_probable_path(model, prior, data, xtol=1e-12)
     off = []
     for passes in (1, 2, 8):
         r = relinearised_filter(model, prior, data, passes=passes, full=True, backend="vm")

@@ -13,13 +13,13 @@ from estimation_models import (
     cv_parts,
     gappy,
     linear,
+    most_probable_path,
     pendulum,
     pendulum_data,
     random_belief,
     random_linear,
 )
 from numpy.testing import assert_allclose
-from scipy.optimize import least_squares
 
 from apu_casadi.errors import EstimationError
 from estimators.belief import Belief
@@ -116,29 +116,7 @@ def test_nonlinear_smoothers_are_near_the_most_probable_path():
     model = pendulum()
     data = pendulum_data(model, K=10)
     prior = Belief.of(model.x, {"q": 1, "r": 0, "k": 5}, {"q": 0.3, "r": 1, "k": 0.5})
-    K, L = data.size, 1 / prior.sigma
-    g, f = model.output, model.transition
-
-    def path(z):
-        x, xs = z[:3], []
-        noises = z[3:].reshape(K, 4)
-        for k in range(K):
-            xs.append(x)
-            x1 = f(x, data.u[:, k], data.p, noises[k, 3:], data.dt[k])[0]
-            x = np.array(x1).ravel() + np.sqrt(data.dt[k]) * model.walk * noises[k, :3]
-        return np.array(xs), noises
-
-    def residual(z):
-        xs, noises = path(z)
-        r = [L * (z[:3] - prior.mean), noises.ravel()]
-        for k in range(K):
-            y = np.array(g(xs[k], data.u[:, k], data.p, noises[k, 3:])[0]).ravel()
-            e = (data.y[:, k] - y) / np.sqrt(data.variance[:, k])
-            r.append(e[~np.isnan(data.y[:, k])])
-        return np.concatenate(r)
-
-    start = np.concatenate([prior.mean, np.zeros(4 * K)])
-    best = path(least_squares(residual, start, max_nfev=15).x)[0].T
+    best = most_probable_path(model, prior, data, max_nfev=15)
     for name in ("iekf", "scaled"):
         s = smoothed(name, model, prior, data)
         assert (np.abs(s.mean - best) / np.sqrt(s.variance)).max() < 0.2

@@ -28,10 +28,8 @@ _CASES = {
     "gains ignored": ("gain errors ignored", "the same, filter without gains"),
 }
 
-
-def _ignored(case: str) -> bool:
-    return case == "gains ignored"
-
+_NO_GOAL = "gains ignored"  # it shows what a filter loses that does not know of gain errors
+_NO_NIS = "gains considered"  # the NIS holds constant offsets, and is no test
 
 #: In the figure, which holds four.
 _DRAWN = ("matched", "fault", "gains", "gains, two passes")
@@ -69,7 +67,7 @@ def claims(r: Results) -> list[Claim]:
     """Return what is claimed, goal by goal."""
     out = []
     for case, (_, words) in _CASES.items():
-        if case not in r or _ignored(case):
+        if case not in r or case == _NO_GOAL:
             continue
         c = r[case]
         seeds = seeds_of(c["seeds"])
@@ -81,8 +79,8 @@ def claims(r: Results) -> list[Claim]:
         checks = {"NEES of h": c["nees_h"], "NIS": c["nis"]}
         if "nees" in c:
             checks = {"NEES of all states": c["nees"], **checks}
-        if case == "gains considered":
-            del checks["NIS"]  # it holds constant offsets, and is no test
+        if case == _NO_NIS:
+            del checks["NIS"]
         for name, v in checks.items():
             wide = "" if v["share"] >= SHARE else _off(case, v)
             out.append(Claim(
@@ -105,7 +103,7 @@ def section(r: Results) -> list[str]:
                 f"{c['ratio_end']:.2f} ({between(c['ratio_end_interval'], '.2f')})",
                 f"{c['ratio_worst']:.2f}", f"{c['nees_h']['mean']:.2f} of 3",
                 percent(c["nees_h"]["share"], 0),
-                *(("no test", "-") if case == "gains considered" else
+                *(("no test", "-") if case == _NO_NIS else
                   (f"{c['nis']['mean']:.2f} of 4", percent(c["nis"]["share"], 0))),
             ])  # fmt: skip
     out = []
@@ -114,8 +112,8 @@ def section(r: Results) -> list[str]:
             ["case", "RMSE of h after 0.3 s", "over bound, at the end", "worst", "mean NEES of h",
              "in band", "mean NIS", "in band"], rows,
         ))  # fmt: skip
-    if "gains ignored" in r:
-        c = r["gains ignored"]
+    if _NO_GOAL in r:
+        c = r[_NO_GOAL]
         out.append(
             "Nothing is asked of the last case; it shows what gain errors of 0.5 % do to a filter "
             f"that does not know of them: it errs by {c['ratio_end']:.0f} times what it believes, "
@@ -159,7 +157,7 @@ def _leaky(c: Mapping[str, Any]) -> list[str]:
         f"The largest error is {off:.1f} claimed sigmas; below 1 since the filter allows for a "
         "branch that changes slowly. It estimates the branch's conductance and susceptance at "
         "rated frequency, of which the currents are nearly linear, and tells mu and k_rf from "
-        "them: written in mu and k_rf it was up to 47 sigmas off, sure before it had arrived. The "
+        "them; written in mu and k_rf it would be sure before it has arrived. The "
         "current of a branch decays within 80 us (the last row) to 2 ms, so it has an exact step "
         "of its own. A branch whose susceptance is not above three sigmas shows no inductance, "
         "and the filter refuses to tell mu from k_rf."
@@ -208,7 +206,7 @@ def figures(r: Results) -> Pictures:
                 v = c[key]
                 checks[name] = (series(v["course"]) / v["dof"],
                                 tuple(b / v["dof"] for b in v["band"]))  # fmt: skip
-        panels.append((words, c["t"], ratios, None if _ignored(case) else c["goal"], checks))
+        panels.append((words, c["t"], ratios, c["goal"], checks))
     if not panels:
         return {}
     fig = partial(
