@@ -14,6 +14,7 @@ from apu_casadi.events import Ambient
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
 from apu_casadi.parameters import Parameters, par
+from apu_casadi.sharing import Parametric
 from apu_casadi.steadypoint import Limits, OperatingPoint
 from apu_casadi.trimming import trim_gas_generator
 
@@ -52,7 +53,7 @@ class JointPoint:
 
 
 @dataclass(frozen=True)
-class Apu:
+class Apu(Parametric):
     """An all-electric APU; the default is the paper's APS5000-like unit.
 
     Parameters

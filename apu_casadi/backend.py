@@ -13,31 +13,37 @@ Environment: ``APU_BACKEND`` is ``auto`` (default), ``vm`` or ``c`` (refuse to f
 Failures inside a function become NaN or a large residual in C as in the virtual machine, and must
 be looked for by the caller: ``error_on_fail`` has no effect in generated code.
 
-Nothing here is thread-safe except :func:`mapped`'s own threads.
+Threads may use everything here at once.  Functions are built, compiled and loaded one at a time;
+:class:`~apu_casadi.calling.Caller` and its batch form have buffers for each thread.  A library is
+closed when nothing uses it any more (:mod:`apu_casadi.sharing`).  Which folders are trusted is told
+in :mod:`apu_casadi.cachefolder`.
 """
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import logging
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections import OrderedDict
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from contextvars import ContextVar, Token
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 
 import casadi as ca
-import numpy as np
 
+from apu_casadi.cachefolder import cache_folder, say, unsafe_file
+from apu_casadi.calling import Caller, Mapped, available_threads, mapped
 from apu_casadi.errors import BackendError, nearest
+from apu_casadi.sharing import BUILDING
 
 __all__ = [
     "Caller",
@@ -49,6 +55,7 @@ __all__ = [
     "compiled",
     "find_compiler",
     "load_or_build",
+    "loaded_functions",
     "mapped",
     "package_digest",
     "recipe",
@@ -62,12 +69,15 @@ FLAGS = ("-fPIC", "-shared", "-fno-math-errno")  # no -ffast-math, because NaN m
 LEVELS = (1, 2, 3)  # -O1, -O2, -O3
 COMPILE_TIMEOUT = 900.0  # s
 
-_chosen: list[str | None] = [None]
-_said: set[str] = set()
-_compiled: OrderedDict[tuple[int, str, int], tuple[ca.Function, ca.Function]] = OrderedDict()
-_loaded: dict[str, ca.Function] = {}
+_chosen: list[use_backend | None] = [None]  # the last one is the choice of the process
+_here: ContextVar[str | None] = ContextVar("apu_backend", default=None)  # of a ``with`` block
+#: Compiled forms of a function, and loaded libraries by key, while something uses them.
+_compiled: weakref.WeakKeyDictionary[ca.Function, dict[tuple[str, int], ca.Function]] = (
+    weakref.WeakKeyDictionary()
+)
+_loaded: weakref.WeakValueDictionary[str, ca.Function] = weakref.WeakValueDictionary()
 _failed: dict[str, str] = {}
-_MEMO = 512
+_MANY = 256  # failures remembered
 
 
 # ------------------------------------------------------------------------------ the switch
@@ -75,6 +85,10 @@ _MEMO = 512
 
 class use_backend:  # noqa: N801 - reads as a verb: use_backend("vm"), with use_backend("vm"): ...
     """Choose the backend for this process, or for a ``with`` block.
+
+    Called, it is the choice of all threads.  A ``with`` block chooses for its own thread only (its
+    context, to be exact: threads and tasks that it starts begin with the choice of the process), so
+    that threads with different choices do not disturb each other.
 
     Parameters
     ----------
@@ -87,11 +101,16 @@ class use_backend:  # noqa: N801 - reads as a verb: use_backend("vm"), with use_
 
     def __init__(self, name: str | None) -> None:
         """Set the backend; see the class."""
-        self._before = _chosen[0]
-        _chosen[0] = None if name is None else _valid(name, "use_backend")
+        self._name = None if name is None else _valid(name, "use_backend")
+        _chosen.append(self)
+        del _chosen[:-_MANY]
 
     def __enter__(self) -> use_backend:
-        """The choice was made by the constructor."""
+        """Take the choice back from the process, and make it here."""
+        with suppress(ValueError):
+            _chosen.remove(self)
+        wanted = self._name or os.environ.get("APU_BACKEND") or "auto"
+        self._token: Token[str | None] = _here.set(wanted)
         return self
 
     def __exit__(
@@ -101,7 +120,7 @@ class use_backend:  # noqa: N801 - reads as a verb: use_backend("vm"), with use_
         traceback: TracebackType | None,
     ) -> None:
         """Return to the backend before."""
-        _chosen[0] = self._before
+        _here.reset(self._token)
 
 
 def _valid(name: str, where: str) -> str:
@@ -113,9 +132,9 @@ def _valid(name: str, where: str) -> str:
 def _wanted(backend: str | None) -> str:
     if backend is not None:
         return _valid(backend, "backend")
-    if _chosen[0] is not None:
-        return _chosen[0]
-    return _valid(os.environ.get("APU_BACKEND") or "auto", "APU_BACKEND")
+    last = _chosen[-1]
+    chosen = _here.get() or (last._name if last is not None else None)
+    return _valid(chosen or os.environ.get("APU_BACKEND") or "auto", "APU_BACKEND")
 
 
 def backend_in_use() -> str:
@@ -131,14 +150,7 @@ def backend_in_use() -> str:
     return "c" if wanted == "auto" and find_compiler() else "vm"
 
 
-def _say(level: int, text: str) -> None:
-    """Log a line once per process."""
-    if text not in _said:
-        _said.add(text)
-        log.log(level, text)
-
-
-# ------------------------------------------------------------------------------ compiler, folder
+# ------------------------------------------------------------------------------ compiler
 
 
 def find_compiler() -> tuple[str, ...] | None:
@@ -148,12 +160,22 @@ def find_compiler() -> tuple[str, ...] | None:
 
 @lru_cache(maxsize=8)
 def _find_compiler(cc: str, path: str) -> tuple[str, ...] | None:
-    words = cc.split()
-    for name, *options in [words] if words else [["cc"], ["gcc"], ["clang"]]:
+    for name, *options in _commands(cc):
         found = shutil.which(name, path=path)
         if found:
             return (found, *options)
     return None
+
+
+def _commands(cc: str) -> list[list[str]]:
+    """Return how ``$CC`` can be meant: one path with blanks, or words, quoted or not."""
+    if not cc.strip():
+        return [["cc"], ["gcc"], ["clang"]]
+    ways = [[cc.strip()]]
+    if os.name == "posix":
+        with suppress(ValueError):  # quotes that are not closed
+            ways.append(shlex.split(cc))
+    return [w for w in (*ways, cc.split()) if w]
 
 
 @lru_cache(maxsize=8)
@@ -162,54 +184,6 @@ def _identity(command: tuple[str, ...]) -> str:
     real = Path(command[0]).resolve()
     s = real.stat()
     return f"{real} {s.st_size} {s.st_mtime_ns} {' '.join(command[1:])}"
-
-
-def cache_folder() -> Path | None:
-    """Return the folder of the compiled libraries, made if absent; None if none can be written."""
-    return _cache_folder(
-        os.environ.get("APU_CACHE_DIR", ""),
-        os.environ.get("XDG_CACHE_HOME", ""),
-        os.environ.get("HOME", ""),
-    )
-
-
-@lru_cache(maxsize=8)
-def _cache_folder(own: str, xdg: str, home: str) -> Path | None:
-    if own:
-        first = Path(own)
-    elif xdg:
-        first = Path(xdg) / "apu_casadi"
-    else:
-        first = Path(home or "~").expanduser() / ".cache" / "apu_casadi"
-    if _writable(first):
-        return first
-    try:
-        user = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
-    except (KeyError, OSError):
-        user = "user"
-    second = Path(tempfile.gettempdir()) / f"apu_casadi-{user}"
-    # a folder that others can write to is no place to load libraries from
-    if _writable(second) and _private(second):
-        _say(logging.INFO, f"cache folder {first} cannot be written; libraries go to {second}")
-        return second
-    _say(logging.INFO, f"neither {first} nor {second} can be written; using the virtual machine")
-    return None
-
-
-def _writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
-
-
-def _private(folder: Path) -> bool:
-    if not hasattr(os, "getuid"):
-        return True
-    s = folder.lstat()
-    return s.st_uid == os.getuid() and not s.st_mode & 0o022
 
 
 def clear_cache() -> int:
@@ -256,11 +230,17 @@ def compiled(
     wanted = _wanted(backend)
     if wanted == "vm":
         return fun
-    memo = (fun.__hash__(), wanted, level)
-    known = _compiled.get(memo)
+    known = _compiled.get(fun, {}).get((wanted, level))
     if known is not None:
-        _compiled.move_to_end(memo)
-        return known[1]
+        return known
+    with BUILDING:
+        return _find_or_make(fun, wanted, build, level)
+
+
+def _find_or_make(fun: ca.Function, wanted: str, build: bool, level: int) -> ca.Function:
+    known = _compiled.get(fun, {}).get((wanted, level))
+    if known is not None:
+        return known
     command = _toolchain(wanted)
     if command is None:
         return fun
@@ -273,7 +253,7 @@ def compiled(
         made = _make(fun, key, (*command, f"-O{level}"), wanted)
     if made is None:
         return fun
-    _remember(memo, fun, made)
+    _compiled.setdefault(fun, {})[wanted, level] = made
     return made
 
 
@@ -302,13 +282,21 @@ def load_or_build(
     ------
     BackendError : as in :func:`compiled`.
     """
-    wanted = _wanted(backend)
+    with BUILDING:
+        return _recall(recipe, build, _wanted(backend), compile_missing)
+
+
+def _recall(
+    recipe: str, build: Callable[[], ca.Function], wanted: str, compile_missing: bool
+) -> ca.Function:
     command = None if wanted == "vm" else _toolchain(wanted)
     folder = cache_folder()
     if command is None or folder is None:
         return build()
     alias = folder / f"apu-{_library_key(recipe, command)}.txt"
     with suppress(OSError, ValueError):
+        if unsafe_file(alias):
+            raise ValueError(alias)
         name, key = alias.read_text(encoding="utf-8").split()
         made = _load(name, key)
         if made is not None:
@@ -358,7 +346,7 @@ def _toolchain(wanted: str) -> tuple[str, ...] | None:
                 f"backend 'c' demanded, but no C compiler found ({looked}); install one, set CC, "
                 f"or use backend 'auto'"
             )
-        _say(logging.INFO, f"no C compiler found ({looked}); using CasADi's virtual machine")
+        say(logging.INFO, f"no C compiler found ({looked}); using CasADi's virtual machine")
     elif cache_folder() is None:
         if wanted == "c":
             raise BackendError(
@@ -378,33 +366,36 @@ def _library_key(content: str, command: tuple[str, ...], level: int = 1) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:40]
 
 
-def _remember(memo: tuple[int, str, int], fun: ca.Function, made: ca.Function) -> None:
-    _compiled[memo] = (fun, made)  # fun is held, so that its address is not given to another
-    while len(_compiled) > _MEMO:
-        _compiled.popitem(last=False)
-
-
 def _load(name: str, key: str) -> ca.Function | None:
     """Load a library whose content is what was written; a damaged one would crash the process."""
-    if key in _loaded:
-        return _loaded[key]
+    known = _loaded.get(key)
+    if known is not None:
+        return known
     folder = cache_folder()
     if folder is None:
         return None
-    path = folder / f"apu-{key}{_SUFFIX}"
+    path, written = folder / f"apu-{key}{_SUFFIX}", folder / f"apu-{key}.sum"
     try:
-        size, digest = (folder / f"apu-{key}.sum").read_text(encoding="utf-8").split()
+        for each in (written, path):
+            if reason := unsafe_file(each):
+                raise ValueError(f"{each.name}: {reason}")
+        size, digest = written.read_text(encoding="utf-8").split()
         if path.stat().st_size != int(size):
             raise ValueError("size")
         if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
             raise ValueError("content")
-        _loaded[key] = ca.external(name, str(path))
+        made = _loaded[key] = ca.external(name, str(path))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, RuntimeError) as e:
-        _say(logging.INFO, f"library {path.name} is damaged ({e}); it is compiled again")
+        say(logging.INFO, f"library {path.name} is damaged ({e}); it is compiled again")
         return None
-    return _loaded[key]
+    return made
+
+
+def loaded_functions() -> list[str]:
+    """Return the names of the compiled functions that something in this process uses, sorted."""
+    return sorted(f.name() for f in list(_loaded.values()))
 
 
 def _make(fun: ca.Function, key: str, command: tuple[str, ...], wanted: str) -> ca.Function | None:
@@ -418,10 +409,12 @@ def _make(fun: ca.Function, key: str, command: tuple[str, ...], wanted: str) -> 
             raise BackendError("the library cannot be loaded")
     except (OSError, RuntimeError, subprocess.SubprocessError, BackendError) as e:
         why = " ".join(str(e).split())[:300]
+        while len(_failed) >= _MANY:
+            _failed.pop(next(iter(_failed)))
         _failed[key] = why
         if wanted == "c":
             raise BackendError(f"{fun.name()} could not be compiled: {why}") from e
-        _say(
+        say(
             logging.WARNING,
             f"{fun.name()} could not be compiled, using CasADi's virtual machine: {why}",
         )
@@ -442,8 +435,8 @@ def _compile(fun: ca.Function, key: str, command: tuple[str, ...]) -> None:
         # relative names: the library does not depend on where it was made
         done = subprocess.run(
             [*command, *FLAGS, "-o", library.name, source.name, "-lm"],
-            cwd=work, capture_output=True, text=True, timeout=COMPILE_TIMEOUT, check=False,
-            stdin=subprocess.DEVNULL,
+            cwd=work, capture_output=True, encoding="utf-8", errors="replace",
+            timeout=COMPILE_TIMEOUT, check=False, stdin=subprocess.DEVNULL,
         )  # fmt: skip
         if done.returncode or not library.exists():
             raise BackendError(
@@ -451,6 +444,7 @@ def _compile(fun: ca.Function, key: str, command: tuple[str, ...]) -> None:
                 f"{done.stderr.strip() or done.stdout.strip() or 'no message'}"
             )
         content = library.read_bytes()
+        library.chmod(0o700)  # whatever the umask: what others can write to is not loaded
         # the library first: a sum without its library says only that there is none
         os.replace(library, folder / f"apu-{key}{_SUFFIX}")
     digest = hashlib.sha256(content).hexdigest()
@@ -468,205 +462,3 @@ def _write(path: Path, content: bytes) -> None:
         with suppress(OSError):
             os.unlink(name)
         raise
-
-
-# ------------------------------------------------------------------------------ calling
-
-
-class Caller:
-    """A function called through flat NumPy buffers, which costs 1 to 3 us beyond its own work.
-
-    Not thread-safe and not re-entrant: the buffers belong to the object.  Make one per thread.
-
-    Parameters
-    ----------
-    fun : the function; inputs and outputs may be vectors or dense matrices.
-    copy : return copies, which stay; False returns views of the buffers, which the next call
-        overwrites.
-    """
-
-    def __init__(self, fun: ca.Function, *, copy: bool = True) -> None:
-        """Allocate and bind the buffers; see the class."""
-        self.fun = fun
-        self._buffer, self._evaluate = fun.buffer()
-        self._copy = copy
-        self._in, self._out = [], []
-        self._shape_in = [fun.size_in(i) for i in range(fun.n_in())]
-        for i in range(fun.n_in()):
-            flat, view = _flat(fun.sparsity_in(i), fun.name(), fun.name_in(i))
-            self._in.append(view)
-            if flat.size:
-                self._buffer.set_arg(i, memoryview(flat))
-        for i in range(fun.n_out()):
-            flat, view = _flat(fun.sparsity_out(i), fun.name(), fun.name_out(i))
-            self._out.append(view)
-            if flat.size:
-                self._buffer.set_res(i, memoryview(flat))
-
-    @property
-    def inputs(self) -> list[np.ndarray]:
-        """The input buffers: fill them in place and use :meth:`evaluate` to save the copies."""
-        return self._in
-
-    @property
-    def outputs(self) -> list[np.ndarray]:
-        """The output buffers, as the last call left them."""
-        return self._out
-
-    def evaluate(self) -> None:
-        """Evaluate with what the input buffers hold.
-
-        Raises
-        ------
-        BackendError : the function reported a failure.
-        """
-        self._evaluate()
-        if self._buffer.ret():
-            raise BackendError(f"{self.fun.name()}: evaluation failed ({self._buffer.ret()})")
-
-    def __call__(self, *arrays: np.ndarray | float) -> tuple[np.ndarray, ...]:
-        """Evaluate; column vectors come back with shape (n,), matrices with shape (n, m).
-
-        An argument that is the input buffer itself, filled in place, is not copied.
-
-        Raises
-        ------
-        BackendError : wrong number or size of arguments (nothing is spread), or a failure.
-        """
-        if len(arrays) != len(self._in):
-            raise BackendError(
-                f"{self.fun.name()} takes {len(self._in)} arguments "
-                f"({', '.join(self.fun.name_in())}), got {len(arrays)}"
-            )
-        for i, (view, a) in enumerate(zip(self._in, arrays, strict=True)):
-            if a is view:
-                continue
-            value = np.asarray(a, dtype=float)
-            if value.shape != view.shape:
-                if value.size != view.size or value.ndim > 2 or min(self._shape_in[i]) > 1:
-                    raise BackendError(
-                        f"{self.fun.name()}: {self.fun.name_in(i)} has shape {view.shape}, "
-                        f"got {value.shape}"
-                    )
-                value = value.reshape(view.shape)
-            view[...] = value
-        self._evaluate()
-        if self._buffer.ret():
-            raise BackendError(f"{self.fun.name()}: evaluation failed ({self._buffer.ret()})")
-        if self._copy:
-            return tuple([a.copy() for a in self._out])
-        return tuple(self._out)
-
-
-def _flat(sparsity: ca.Sparsity, fun: str, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a flat buffer and a view of it: (n,) for a column, (n, m) column by column else."""
-    if not sparsity.is_dense():
-        raise BackendError(f"{fun}: {name} is sparse; make it dense with casadi.densify")
-    n, m = sparsity.shape
-    flat = np.zeros(n * m)
-    return flat, flat if m == 1 else flat.reshape((n, m), order="F")
-
-
-def available_threads() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-class Mapped:
-    """A function of columns evaluated for many columns at once; made by :func:`mapped`.
-
-    Memory is bounded by the chunk: buffers hold that many columns, whatever the number asked for.
-    """
-
-    def __init__(
-        self, fun: ca.Function, n_threads: int | None = None, *, chunk: int = 1024
-    ) -> None:
-        """Check the shapes; evaluators of each chunk size are made when first needed."""
-        wide = [fun.name_in(i) for i in range(fun.n_in()) if fun.size2_in(i) != 1]
-        wide += [fun.name_out(i) for i in range(fun.n_out()) if fun.size2_out(i) != 1]
-        if wide:
-            raise BackendError(f"{fun.name()}: {', '.join(wide)} must be columns to be mapped")
-        self.fun = fun
-        self.n_threads = max(1, available_threads() if n_threads is None else int(n_threads))
-        # chunks are multiples of the thread count; the last one is filled up with its last column
-        sizes = sorted({max(1, c) for c in (16, 128, chunk) if c <= chunk} | {chunk})
-        self._sizes = sorted({-(-c // self.n_threads) * self.n_threads for c in sizes})
-        self._callers: dict[int, Caller] = {}
-
-    def _caller(self, size: int) -> Caller:
-        if size not in self._callers:
-            if self.n_threads == 1:
-                f = self.fun.map(size, "serial")
-            else:
-                f = self.fun.map(size, "thread", self.n_threads)
-            self._callers[size] = Caller(f, copy=False)
-        return self._callers[size]
-
-    def __call__(self, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Evaluate for N columns: arrays of shape (n, N) or (n,), the latter for every column.
-
-        Returns
-        -------
-        One array (m, N) per output, N = 1 if every argument is a single column.
-
-        Raises
-        ------
-        BackendError : wrong number or shapes of arguments.
-        """
-        fun = self.fun
-        if len(arrays) != fun.n_in():
-            raise BackendError(
-                f"{fun.name()} takes {fun.n_in()} arguments ({', '.join(fun.name_in())}), "
-                f"got {len(arrays)}"
-            )
-        given = [np.asarray(a, dtype=float) for a in arrays]
-        given = [a.reshape(-1, 1) if a.ndim < 2 else a for a in given]
-        lengths = {a.shape[1] for a in given} - {1}
-        for i, a in enumerate(given):
-            if a.ndim != 2 or a.shape[0] != fun.size1_in(i):
-                raise BackendError(
-                    f"{fun.name()}: {fun.name_in(i)} must have shape ({fun.size1_in(i)}, N), got "
-                    f"{a.shape}"
-                )
-        if len(lengths) > 1:
-            raise BackendError(f"{fun.name()}: unequal numbers of columns: {sorted(lengths)}")
-        N = lengths.pop() if lengths else 1
-        given = [np.broadcast_to(a, (a.shape[0], N)) for a in given]
-        results = tuple(np.empty((fun.size1_out(i), N)) for i in range(fun.n_out()))
-        done = 0
-        while done < N:
-            left = N - done
-            fitting = [s for s in self._sizes if s <= left]
-            size = fitting[-1] if fitting else self._sizes[0]
-            n = min(size, left)
-            call = self._caller(size)
-            for a, buffer in zip(given, call.inputs, strict=True):
-                wide = buffer.reshape(a.shape[0], size)
-                wide[:, :n] = a[:, done : done + n]
-                if n < size:
-                    wide[:, n:] = wide[:, n - 1 : n]
-            call.evaluate()
-            for r, buffer in zip(results, call.outputs, strict=True):
-                r[:, done : done + n] = buffer.reshape(r.shape[0], size)[:, :n]
-            done += n
-        return results
-
-
-def mapped(fun: ca.Function, n_threads: int | None = None, *, chunk: int = 1024) -> Mapped:
-    """Return a batch form of ``fun`` over columns, in chunks, on ``n_threads`` threads.
-
-    Give it a compiled function for speed: ``mapped(compiled(f))``.
-
-    Parameters
-    ----------
-    fun : function whose inputs and outputs are columns.
-    n_threads : default all cores that the process may use.
-    chunk : columns per evaluation; more need more memory, fewer start threads more often.
-
-    Raises
-    ------
-    BackendError : an input or output is not a column.
-    """
-    return Mapped(fun, n_threads, chunk=chunk)

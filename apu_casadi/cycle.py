@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -32,6 +31,7 @@ from apu_casadi.gas import Gas
 from apu_casadi.maps import N_CELL, N_SURGE_CELL, ScaledMap, surface_cell, surge_cell
 from apu_casadi.parameters import Parameters, par
 from apu_casadi.rootfinding import Newton, solve_bordered
+from apu_casadi.sharing import Parametric, derived
 from apu_casadi.signals import Signal, Signals
 
 RPM = math.pi / 30.0  # rad/s per r/min
@@ -465,7 +465,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Cycle:
+class Cycle(Parametric):
     """The cycle equations of one engine as CasADi functions.
 
     Parameters
@@ -481,7 +481,7 @@ class Cycle:
     cmap: ScaledMap
     tmap: ScaledMap
 
-    @cached_property
+    @derived
     def z(self) -> Signals:
         """The algebraic unknowns, with design values as magnitudes."""
         d = self.design
@@ -495,7 +495,7 @@ class Cycle:
             ]
         )
 
-    @cached_property
+    @derived
     def ambient(self) -> ca.Function:
         """Function u -> (T0, P0, T1, P1)."""
         us = ca.SX.sym("u", _NU)
@@ -568,7 +568,7 @@ class Cycle:
         y |= {"SFC": Uv["Wf"] / (Uv["PW"] + p.P_acc), "P_acceleration": P_free - Uv["PW"]}
         return ca.vertcat(*res.values()), P_free, y
 
-    @cached_property
+    @derived
     def _core(self) -> tuple[ca.Function, ca.Function, ca.Function]:
         """SX functions of a point and the map cells that it lies in.
 
@@ -674,7 +674,7 @@ class Cycle:
             ca.MX.sym("theta", _NT),
         )
 
-    @cached_property
+    @derived
     def equations(self) -> ca.Function:
         """The model: Function (x, z, u, theta) -> (ode, alg, y), from which all else is made."""
         args, point = self._point()
@@ -689,7 +689,7 @@ class Cycle:
         """dN/dt, rad/s2."""
         return rotor_acceleration(P_acceleration=c.P_free - point.u[1], N=point.x, J=self.p.J)
 
-    @cached_property
+    @derived
     def solve(self) -> ca.Function:
         """Solve 0 = alg for z by Newton's method, as a differentiable CasADi function.
 
@@ -724,7 +724,7 @@ class Cycle:
         options = {"custom_jacobian": self._solve_jacobian, "jac_penalty": 0}
         return ca.Function("solve_z", [z0, x, u, theta], [z1], *names, options)
 
-    @cached_property
+    @derived
     def _solve_jacobian(self) -> ca.Function:
         """Function (z0, x, u, theta, z) -> derivatives of z by z0, which are none, x, u, theta."""
         args, point = self._point()
@@ -758,7 +758,7 @@ class Cycle:
         rows = list(ORDER)
         return -solve_bordered(c.dq[rows, COLUMNS.z], by[rows, :], N_ORDERED)
 
-    @cached_property
+    @derived
     def sensitivities(self) -> ca.Function:
         """Exact total derivatives at a solved point.
 
@@ -781,7 +781,7 @@ class Cycle:
 
         return self.function("sensitivities", args, point, outputs)
 
-    @cached_property
+    @derived
     def dfdx(self) -> ca.Function:
         """Function (x, z, u, theta) -> (ode, d ode/dx along 0 = alg, 1-norm of alg, dz/dx)."""
         args, point = self._point()
@@ -796,7 +796,7 @@ class Cycle:
 
         return self.function("dfdx", args, point, outputs)
 
-    @cached_property
+    @derived
     def similar(self) -> ca.Function:
         """First guess of z by similarity with the design point: Function (x, u) -> z.
 

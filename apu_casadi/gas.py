@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
-from functools import cache, cached_property
 from importlib import resources
 from typing import Any
 
@@ -35,6 +34,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.errors import DataError, ParameterError, nearest
+from apu_casadi.sharing import Parametric, derived, once
 
 R_UNIVERSAL = 8314.462618  # J/(kmol K), CODATA 2018
 T_REF = 298.15  # K, reference of sensible enthalpy and of the heating value
@@ -50,7 +50,7 @@ M_C, M_H = 12.0107, 1.00794  # kg/kmol
 DATA_SETS = ("nasa9", "nasa7")
 
 
-@cache
+@once
 def _species(data: str) -> dict[str, tuple[float, np.ndarray]]:
     """Read molar masses (kg/kmol) and coefficients, shape (2, 9), of each species."""
     rows: dict[str, list[list[float]]] = {}
@@ -87,7 +87,7 @@ def _s_over_R(a: Any, T: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Gas:
+class Gas(Parametric):
     """Working gas: dry air of fixed composition, water vapour, and products of a fuel CHx.
 
     Parameters
@@ -110,7 +110,7 @@ class Gas:
         if not 0.0 <= self.x_HC <= 4.0:
             raise ParameterError(f"Gas.x_HC = {self.x_HC} is outside [0, 4]")
 
-    @cached_property
+    @derived
     def _pseudo(self) -> np.ndarray:
         """Coefficients times R in J/(kg K), shape (3, 2, 9), of air, water, burning."""
         sp = _species(self.data)
@@ -139,7 +139,7 @@ class Gas:
             ]
         )
 
-    @cached_property
+    @derived
     def _R(self) -> tuple[float, float, float]:
         """Gas constants, J/(kg K), of air, water vapour and the burning of 1 kg of fuel."""
         sp = _species(self.data)

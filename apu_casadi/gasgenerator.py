@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
@@ -27,6 +26,7 @@ from apu_casadi.errors import OperatingPointError, SimulationError
 from apu_casadi.gas import Gas
 from apu_casadi.mapfiles import MapTable, shipped
 from apu_casadi.maps import MapCalibration, ScaledMap
+from apu_casadi.sharing import Parametric, derived
 from apu_casadi.signals import Signals
 from apu_casadi.statespace import StateSpace
 
@@ -106,7 +106,7 @@ class GasGeneratorState:
 
 
 @dataclass(frozen=True)
-class GasGenerator:
+class GasGenerator(Parametric):
     """A gas generator: parameters and two maps; everything else is derived.
 
     Parameters
@@ -129,12 +129,12 @@ class GasGenerator:
 
     # ------------------------------------------------------------------ equations
 
-    @cached_property
+    @derived
     def gas(self) -> Gas:
         """The working gas."""
         return Gas(self.parameters.x_HC, self.parameters.gas_data)
 
-    @cached_property
+    @derived
     def design(self) -> DesignPoint:
         """The design point, from the parameters alone.
 
@@ -144,7 +144,7 @@ class GasGenerator:
         """
         return solve_design(self.parameters, self.gas)
 
-    @cached_property
+    @derived
     def maps(self) -> tuple[ScaledMap, ScaledMap]:
         """The compressor and turbine maps scaled to the design point."""
         p, d = self.parameters, self.design
@@ -153,7 +153,7 @@ class GasGenerator:
             self.turbine_map.scaled(W=d.W_t, PR=d.PR_t, eta=p.eta_t),
         )
 
-    @cached_property
+    @derived
     def cycle(self) -> Cycle:
         """The cycle equations with their exact Jacobians."""
         return Cycle(self.parameters, self.gas, self.design, *self.maps)
@@ -178,7 +178,7 @@ class GasGenerator:
         """Function (x, u) -> first guess of z: see :class:`~apu_casadi.cycle.Cycle`."""
         return self.cycle.similar
 
-    @cached_property
+    @derived
     def state_space(self) -> StateSpace:
         """The continuous model as :class:`StateSpace`; z is started by similarity."""
         x, z, u, theta = self.cycle.symbols()
@@ -194,7 +194,7 @@ class GasGenerator:
 
     # ------------------------------------------------------------------ discrete model (eq. 12)
 
-    @cached_property
+    @derived
     def f(self) -> ca.Function:
         """State update of eq. (12): (x, u, theta, dt, z0) -> (x1, z, residual).
 
@@ -214,7 +214,7 @@ class GasGenerator:
             ["x1", "z", "residual"],
         )
 
-    @cached_property
+    @derived
     def step(self) -> ca.Function:
         """State update and output in one: (x, u, theta, dt, z0) -> (x1, y, z, residual).
 
@@ -231,7 +231,7 @@ class GasGenerator:
         names = ["x", "u", "theta", "dt", "z0"], ["x1", "y", "z", "residual"]
         return ca.Function("gas_generator_step", [x, u, theta, dt, z0], [x1, y, z1, r], *names)
 
-    @cached_property
+    @derived
     def g(self) -> ca.Function:
         """Output of eq. (12): (x, u, theta, z0) -> (y, z); y holds the residual."""
         x, z0, u, theta = self.cycle.symbols()
@@ -243,20 +243,20 @@ class GasGenerator:
 
     # ------------------------------------------------------------------ IGDM (Algorithm 2)
 
-    @cached_property
+    @derived
     def _f_call(self) -> Caller:
         return Caller(compiled(self.f, build=False))
 
-    @cached_property
+    @derived
     def _g_call(self) -> Caller:
         return Caller(compiled(self.g, build=False))
 
-    @cached_property
+    @derived
     def stepper(self) -> Caller:
         """:attr:`step` for hot loops: generated C where there is a compiler, compiled once."""
         return Caller(compiled(self.step))
 
-    @cached_property
+    @derived
     def _step_call(self) -> Caller:
         # a single run is not worth seconds of compiling, but takes a library that is there
         return Caller(compiled(self.step, build=False))
@@ -284,7 +284,7 @@ class GasGenerator:
         self._check_exit(y)
         return x1, y, z
 
-    @cached_property
+    @derived
     def input_ranges(self) -> dict[str, tuple[float, float]]:
         """Inputs that the model is meant for, by name: lowest and highest value."""
         return {

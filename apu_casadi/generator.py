@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -45,6 +44,7 @@ from apu_casadi.machine.park import (
 )
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.machine.wrsg import Windings
+from apu_casadi.sharing import Parametric, derived, kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
 
@@ -119,7 +119,7 @@ class MeasurementNoise:
 
 
 @dataclass(frozen=True)
-class Generator:
+class Generator(Parametric):
     """One starter/generator with its exciter; the load comes with each study.
 
     Parameters
@@ -248,7 +248,7 @@ class Generator:
 
     # -- steady state -----------------------------------------------------------------------
 
-    @cached_property
+    @derived
     def V_ref_default(self) -> float:
         """Voltage reference, per unit, that gives Table 7's mean 229.677 V at 225 kW (calibrated).
 
@@ -577,7 +577,7 @@ def solve_linear(M: ca.SX, b: ca.SX) -> ca.SX:
     return ca.vertcat(*x)
 
 
-@lru_cache(maxsize=64)
+@kept
 def _build(gen: Generator, load_kind: str, faulted: str | None) -> StateSpace:
     """Write the semi-explicit DAE once, and eliminate its algebraic unknowns."""
     p, e = gen.machine, gen.exciter

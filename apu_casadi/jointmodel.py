@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -35,6 +34,7 @@ from apu_casadi.errors import SignalError
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
 from apu_casadi.machine.park import Abc, abc_to_qd0
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
 
@@ -87,7 +87,7 @@ def _balanced_inputs(ss: StateSpace) -> Signals:
     return Signals(kept)
 
 
-@lru_cache(maxsize=64)
+@kept
 def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpace:
     """Return one generator, averaged over an electrical period, under a balanced load.
 
@@ -188,7 +188,7 @@ def _joint_signals(apu: Apu, load_kind: str) -> tuple[Signals, Signals, Signals,
     return X, U, Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
 
-@lru_cache(maxsize=32)
+@kept
 def _joint(apu: Apu, load_kind: str) -> tuple[ca.Function, ca.Function]:
     """Return the equations (x, z, u, theta) -> (ode, alg, y), and the search (x, u, theta) -> z."""
     gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
@@ -221,7 +221,7 @@ def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
     return _joint(apu, load_kind)[0]
 
 
-@lru_cache(maxsize=32)
+@kept
 def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
     """Return the whole unit with averaged generators, continuous in time.
 

@@ -18,11 +18,12 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu
-from apu_casadi.backend import Caller, compiled
+from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.control import governor
 from apu_casadi.gasgenerator import RESIDUAL_TOL
 from apu_casadi.meanstep import MeanStep
 from apu_casadi.propagation import Propagator
+from apu_casadi.sharing import Rebuilt, keep
 
 BLOCK = 10  # exchange steps in one call
 
@@ -37,7 +38,7 @@ class BlockResult(NamedTuple):
     means : means over each step, shape (quantities, BLOCK).
     waves : samples, shape (outputs, BLOCK * n_out).
 
-    ``y``, ``means`` and ``waves`` are overwritten by the next block.
+    ``y``, ``means`` and ``waves`` are overwritten by the thread's next block.
     """
 
     N: np.ndarray
@@ -92,7 +93,7 @@ def _function(apu: Apu, machine: Propagator | MeanStep) -> ca.Function:
     )
 
 
-class JointBlock:
+class JointBlock(Rebuilt):
     """Blocks of exchange steps with one load and fault."""
 
     def __init__(self, apu: Apu, machine: Propagator | MeanStep) -> None:
@@ -141,12 +142,10 @@ class JointBlock:
         )
 
 
-_CALLERS: dict[tuple[object, ...], Caller] = {}
-
-
 def _caller(apu: Apu, machine: Propagator | MeanStep) -> Caller:
     """One compiled block for each unit and layout."""
-    key = (apu, *machine.layout)
-    if key not in _CALLERS:
-        _CALLERS[key] = Caller(compiled(_function(apu, machine), level=3), copy=False)
-    return _CALLERS[key]
+    key = (*machine.layout, backend_in_use())
+    return keep(
+        apu, JointBlock, key,
+        lambda: Caller(compiled(_function(apu, machine), level=3), copy=False),
+    )  # fmt: skip

@@ -16,8 +16,7 @@ has no mean, and no place in a linear model with constant coefficients.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -35,6 +34,7 @@ from apu_casadi.jointmodel import (
     joint_vectors,
     load_kind,
 )
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signals
 from apu_casadi.statespace import StateSpace
 from apu_casadi.steadypoint import OperatingPoint
@@ -254,27 +254,7 @@ def _step(signals: Signals, values: Mapping[str, float] | None) -> np.ndarray:
     return d
 
 
-@dataclass(frozen=True, eq=False)
-class _Built:
-    """One model's function; the model is held, so that its id stays its own."""
-
-    owner: Any
-    function: ca.Function
-
-
-_BUILT: OrderedDict[int, _Built] = OrderedDict()
-_MAX_BUILT = 32
-
-
-def _kept(owner: Any, build: Callable[[], ca.Function]) -> ca.Function:
-    if id(owner) not in _BUILT:
-        _BUILT[id(owner)] = _Built(owner, build())
-        if len(_BUILT) > _MAX_BUILT:
-            _BUILT.popitem(last=False)
-    _BUILT.move_to_end(id(owner))
-    return _BUILT[id(owner)].function
-
-
+@kept
 def _eliminated(ss: StateSpace) -> ca.Function:
     """(x, u, theta) -> xdot, y, alg, d(xdot, y)/d(x, u, theta), with one search for z in all."""
     sx = all(f.is_a("SXFunction") for f in (ss.f, ss.g, ss.z_of, ss.residual))
@@ -290,6 +270,7 @@ def _eliminated(ss: StateSpace) -> ca.Function:
     return ca.Function(f"{ss.name}_linear", args, [xdot, y, alg, J], {"cse": True})
 
 
+@kept
 def _explicit(ss: StateSpace, equations: ca.Function) -> ca.Function:
     """(x, z, u, theta) -> xdot, y, alg, d(xdot, y, alg)/d(x, u, theta, z)."""
     x, z, u, theta = args = [
@@ -334,10 +315,9 @@ def linearise(
         for label, signals, value in (("x", ss.x, x), ("u", ss.u, u), ("theta", ss.theta, theta))
     )
     if equations is None:
-        out = _kept(ss, lambda: _eliminated(ss))(x0, u0, theta0)
+        out = _eliminated(ss)(x0, u0, theta0)
     else:
-        fun = _kept(equations, lambda: _explicit(ss, equations))
-        out = fun(x0, _vector(ss, "z", ss.z, z), u0, theta0)
+        out = _explicit(ss, equations)(x0, _vector(ss, "z", ss.z, z), u0, theta0)
     xdot, y, alg = (o.full().reshape(-1) for o in out[:3])
     J = out[3].full()
     nx, nu, nt, ny = len(ss.x), len(ss.u), len(ss.theta), len(ss.y)

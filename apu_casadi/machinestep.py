@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
@@ -23,6 +22,7 @@ from apu_casadi.generator import GeneratorPoint
 from apu_casadi.jointstep import BLOCK, BlockResult, JointBlock
 from apu_casadi.meanstep import MeanStep
 from apu_casadi.propagation import Propagator
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.simulation import stepper
 from apu_casadi.statespace import StateSpace
@@ -73,7 +73,7 @@ _LOG = logging.getLogger("apu_casadi")
 GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
-@lru_cache(maxsize=64)
+@kept
 def ramped(ss: StateSpace) -> StateSpace:
     """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input."""
     X = Signals([*ss.x, dataclasses.replace(ss.u["w_r"], name="w_r", default=None)])
@@ -98,7 +98,7 @@ def ramped(ss: StateSpace) -> StateSpace:
     )
 
 
-@lru_cache(maxsize=64)
+@kept
 def with_moments(ss: StateSpace) -> StateSpace:
     """Return a generator variant with the products in ``MOMENTS`` as further outputs."""
     Y = Signals([*ss.y, *(Signal(n, "1", "product with the rotor angle's cosine or sine",

@@ -39,15 +39,16 @@ import csv
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass, field, fields
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from apu_casadi.errors import DataError, MapError, nearest
+from apu_casadi.sharing import Parametric, once
 
 KINDS = ("compressor", "turbine")
 GRID_COLUMNS = ("N", "beta", "W", "PR", "eta")
@@ -57,8 +58,8 @@ MIN_LINES = 4  # a natural cubic spline of fewer points says little about a map
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MapTable:
-    """The table of a component map, checked on construction.  Tables compare by identity.
+class MapTable(Parametric):
+    """The table of a component map, checked on construction.  Tables compare by their content.
 
     Parameters
     ----------
@@ -102,6 +103,30 @@ class MapTable:
                 a.setflags(write=False)
                 object.__setattr__(self, name, a)
         self._check()
+
+    def _content(self) -> tuple[object, ...]:
+        values = (getattr(self, f.name) for f in fields(self))
+        return tuple((v.shape, v.tobytes()) if isinstance(v, np.ndarray) else v for v in values)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all fields are the same, bit for bit."""
+        if self is other or not isinstance(other, MapTable):
+            return self is other
+        return hash(self) == hash(other) and self._content() == other._content()
+
+    def __hash__(self) -> int:
+        """Hash of the content, computed once."""
+        known: int | None = self.__dict__.get("_hash")
+        if known is None:
+            known = self.__dict__["_hash"] = hash(self._content())
+        return known
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take up the fields, arrays read-only again."""
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+        self.__dict__.update(state)
 
     def _check(self) -> None:
         who = f"map {self.name!r}"
@@ -636,7 +661,7 @@ def shipped(name: str) -> MapTable:
     return _shipped(name.lower())
 
 
-@cache
+@once
 def _shipped(name: str) -> MapTable:
     folder = resources.files("apu_casadi.data")
     if name not in SHIPPED:

@@ -30,7 +30,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -41,6 +40,7 @@ from scipy.interpolate import BSpline
 from apu_casadi.errors import MapError
 from apu_casadi.mapfiles import MapTable
 from apu_casadi.parameters import Parameters, par
+from apu_casadi.sharing import Parametric, derived, kept
 
 REACH = 2.0  # table spans from the table's edge to where everything is held
 LOWEST = 0.05  # held below this fraction of the table's lowest speed
@@ -144,7 +144,7 @@ def _cubic(c: list[Any], t: Any) -> Any:
     return c[0] + t * (c[1] + t * (c[2] + t * c[3]))
 
 
-@lru_cache(maxsize=64)
+@kept
 def _surface(table: MapTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Breaks in N and beta, and coefficients of every cell, shape (48, cells).
 
@@ -162,7 +162,7 @@ def _surface(table: MapTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return breaks_N, breaks_b, cells.reshape(48, -1)
 
 
-@lru_cache(maxsize=64)
+@kept
 def surface_cell(table: MapTable) -> ca.Function:
     """Return the CasADi function (N, beta) -> cell, shape (52,): where it lies, coefficients.
 
@@ -185,7 +185,7 @@ def surface_logs(table: MapTable, N: Any, beta: Any, cell: Any) -> tuple[Any, li
     return held, [_cubic(rows[k : k + 4], t) for k in range(0, 12, 4)]
 
 
-@lru_cache(maxsize=64)
+@kept
 def _log_map(table: MapTable) -> ca.Function:
     """(N, beta) -> N as held, and (ln W, ln(PR - 1), ln eta) stacked."""
     N, beta, cell = ca.SX.sym("N"), ca.SX.sym("beta"), ca.SX.sym("cell", N_CELL)
@@ -196,7 +196,7 @@ def _log_map(table: MapTable) -> ca.Function:
     return ca.Function("log_map", [*q], [*out], ["N", "beta"], ["N_held", "logs"])
 
 
-@lru_cache(maxsize=64)
+@kept
 def map_function(table: MapTable) -> ca.Function:
     """Return the unscaled surface as a CasADi function (N, beta) -> (W, PR, eta).
 
@@ -208,7 +208,7 @@ def map_function(table: MapTable) -> ca.Function:
     return ca.Function("map", [N, beta], out, ["N", "beta"], ["W", "PR", "eta"])
 
 
-@lru_cache(maxsize=64)
+@kept
 def _surge_line(table: MapTable) -> tuple[np.ndarray, np.ndarray]:
     """Breaks in ln W and coefficients of ln(PR_surge - 1), shape (4, intervals).
 
@@ -223,7 +223,7 @@ def _surge_line(table: MapTable) -> tuple[np.ndarray, np.ndarray]:
     return local_cubics(knots, P @ np.log(table.surge_PR - 1))
 
 
-@lru_cache(maxsize=64)
+@kept
 def surge_cell(table: MapTable) -> ca.Function:
     """Return the CasADi function W -> cell of the surge line, shape (6,); piecewise constant.
 
@@ -244,7 +244,7 @@ def surge_PR(table: MapTable, W: Any, cell: Any) -> Any:
     return 1 + ca.exp(_cubic(c, (_held(ca.log(W), breaks) - start) * per))
 
 
-@lru_cache(maxsize=64)
+@kept
 def surge_function(table: MapTable) -> ca.Function:
     """Return the unscaled surge line as a CasADi function W -> PR_surge, in the table's units.
 
@@ -261,7 +261,7 @@ def surge_function(table: MapTable) -> ca.Function:
     return ca.Function("surge", [q], [inner(q, find(q))], ["W"], ["PR_surge"])
 
 
-@lru_cache(maxsize=64)
+@kept
 def off_function(table: MapTable) -> ca.Function:
     """Return the CasADi function (N, beta) -> (off, off_N, off_beta), in table spans.
 
@@ -337,7 +337,7 @@ class MapCalibration(Parameters):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaledMap:
+class ScaledMap(Parametric):
     """A map scaled so that n = 1, beta = beta_des, RNI = 1 gives the design values exactly.
 
     Flow, PR - 1 and eta are each multiplied by a constant; the calibration then bends the map away
@@ -394,7 +394,7 @@ class ScaledMap:
                 f"{t.beta[j]:g}; choose a design location of higher efficiency on the map"
             )
 
-    @cached_property
+    @derived
     def function(self) -> ca.Function:
         """(n, beta, RNI) -> W, PR, eta, for a compressor SM, and off."""
         n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
@@ -402,7 +402,7 @@ class ScaledMap:
         names = ["n", "beta", "RNI"]
         return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
 
-    @cached_property
+    @derived
     def calibrated(self) -> ca.Function:
         """As ``function`` with the numbers of the calibration as fourth argument.
 
@@ -426,7 +426,7 @@ class ScaledMap:
         out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
         return {k: out[k] for k in MapPoint._fields if k in out}
 
-    @cached_property
+    @derived
     def _design_logs(self) -> tuple[float, float, float]:
         """ln W, ln(PR - 1), ln eta of the table where the design point lies."""
         _, y = _log_map(self.table)(self.N_map_des, self.beta_des)

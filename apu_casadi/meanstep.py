@@ -17,13 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.backend import Caller, compiled
+from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import SimulationError
 from apu_casadi.generator import Generator
 from apu_casadi.propagation import (
@@ -38,6 +37,7 @@ from apu_casadi.propagation import (
     symmetry,
     through,
 )
+from apu_casadi.sharing import Rebuilt, kept
 from apu_casadi.statespace import StateSpace
 
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
@@ -375,7 +375,7 @@ def _periodic_step(
 # ------------------------------------------------------------------------------ both
 
 
-@lru_cache(maxsize=64)
+@kept
 def _function(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float,
               harmonics: int) -> ca.Function:  # fmt: skip
     """Function (x0, series, u[, theta], dt) -> (x, mean, miss); ``dt`` only bounds the samples."""
@@ -384,7 +384,14 @@ def _function(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float,
     return _periodic_step(gen, ss, quad, dt, harmonics)
 
 
-class MeanStep:
+@kept
+def _caller(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float, harmonics: int,
+            _in_use: str) -> Caller:  # fmt: skip
+    """The same in the backend in use, one for each layout."""
+    return Caller(compiled(_function(gen, ss, quad, dt, harmonics), level=3))
+
+
+class MeanStep(Rebuilt):
     """Exchange steps without waveforms of one model variant with one load and fault.
 
     Parameters
@@ -446,7 +453,6 @@ class MeanStep:
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]
         self.limits = np.array([drive] if self.constant else [drive, END_TOL])
         self._iw = ss.u.index("w_r")
-        self._compiled: Caller | None = None
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the tables."""
@@ -465,10 +471,9 @@ class MeanStep:
         w = float(u[self._iw])
         if not self.valid(w):
             raise SimulationError(f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table")
-        if self._compiled is None:
-            self._compiled = Caller(compiled(self.advance, level=3))
+        call = _caller(*self.layout, backend_in_use())
         held = [self.theta] if self.theta.size else []
-        x, mean, miss = self._compiled(x0, self.parameters, u, *held, self.dt)
+        x, mean, miss = call(x0, self.parameters, u, *held, self.dt)
         if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):
             raise SimulationError(
                 f"{self.ss.name}: step from {t0:.6g} s: errors of E_fd and of the state at the end "

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -33,6 +32,7 @@ from apu_casadi.events import (
 from apu_casadi.gasgenerator import RESIDUAL_TOL
 from apu_casadi.multirate import MEANS, RMS, exchange_grid
 from apu_casadi.results import dataset
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.simulation import stepper
 from apu_casadi.statespace import StateSpace
@@ -47,7 +47,7 @@ _AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 _GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
-@lru_cache(maxsize=32)
+@kept
 def joint_state_space(
     apu: Apu,
     load_kind: str = "resistive",

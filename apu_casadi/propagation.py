@@ -23,19 +23,18 @@ microseconds, an adaptive integrator samples the mean power better.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.backend import Caller, compiled
+from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import SimulationError
 from apu_casadi.generator import Generator
 from apu_casadi.machine import exciter as ac5a
+from apu_casadi.sharing import Rebuilt, keep, kept
 from apu_casadi.simulation import StepResult
 from apu_casadi.statespace import StateSpace
 
@@ -79,7 +78,7 @@ def _split(ss: StateSpace) -> _Split:
     return _Split(linear, slow, angle, drive)
 
 
-@lru_cache(maxsize=64)
+@kept
 def _coefficients(ss: StateSpace) -> ca.Function:
     """Function (theta_e, u, theta) -> augmented matrix M of d/dt [x; E; E'; E''; E'''; 1].
 
@@ -150,7 +149,7 @@ def _transition(
     return out
 
 
-@lru_cache(maxsize=128)
+@kept
 def _coefficients_at(ss: StateSpace, count: int) -> Caller:
     """:func:`_coefficients` at ``count`` angles at once."""
     return Caller(compiled(_coefficients(ss).map(count), build=False))
@@ -417,7 +416,7 @@ def strides(n_out: int, h: float, constant: bool, fine: bool) -> Strides:
     return Strides(head, m, (n_out - head) // m)
 
 
-@lru_cache(maxsize=64)
+@kept
 def exciter_step(gen: Generator, ss: StateSpace) -> tuple[ca.Function, ca.Function]:
     """The exciter's drive and its step, of the states that are neither windings nor angle.
 
@@ -447,7 +446,7 @@ def exciter_step(gen: Generator, ss: StateSpace) -> tuple[ca.Function, ca.Functi
     return drive, ca.Function("exciter", [slow, V, V_ref, H], [end])
 
 
-@lru_cache(maxsize=64)
+@kept
 def leap(
     gen: Generator, ss: StateSpace, m: int, constant: bool, chained: bool = False
 ) -> tuple[ca.Function, ca.Function]:
@@ -550,7 +549,7 @@ def _fold(step: ca.Function, steps: int, n_P: Sequence[int], constant: bool,
     return ca.Function("fold", [S, *PP], [last[: S.numel(), steps // size - 1], X_all])
 
 
-@lru_cache(maxsize=64)
+@kept
 def _advance(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs: tuple[str, ...],
              quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
     """n_out samples at once: (x0, P, u, theta, h) -> (x, y, mean, miss).
@@ -606,7 +605,7 @@ def _advance(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs:
     )
 
 
-@lru_cache(maxsize=64)
+@kept
 def _at_any_speed(function: ca.Function, at: int, n_out: int, entries: int) -> ca.Function:
     """A function of :func:`_advance` for constant coefficients that takes the table itself.
 
@@ -623,7 +622,7 @@ def _at_any_speed(function: ca.Function, at: int, n_out: int, entries: int) -> c
     return ca.Function(f"{function.name()}_series", [X0, series, U, dt], list(out))
 
 
-class Propagator:
+class Propagator(Rebuilt):
     """Steps of one model variant with one load and fault; a fast stand-in for a ``Stepper``.
 
     Parameters
@@ -672,16 +671,14 @@ class Propagator:
         self.tol = DRIVE_TOL["fine" if fine else "constant" if constant else "periodic"]
         self.limits = np.array([self.tol])
         self.layout = (gen, ss, plan, self.outputs, self.quad)  # what ``function`` depends on
-        self._compiled: Caller | None = None
+        self._call_key = (gen, ss, n_out, plan, self.outputs, self.quad, constant)
         self._t = dt * (np.arange(1, n_out + 1) / n_out)  # rounded as a Stepper does
         self._angle = ss.x.index("theta_e")
         self._iw = ss.u.index("w_r")
         self._w_ok = (1 - SPEED_RANGE) * w_rated, (1 + SPEED_RANGE) * w_rated
         self._starts = self.h * plan.starts()
         # powers of exp(j theta), columns as in Table: 0, 2, 4, ... and 1, 3, 5, ...
-        n_even, n_odd = (s.shape[1] // 2 for s in (self.table.even, self.table.odd))
-        self._even = np.ones((self._starts.size, n_even), complex)
-        self._odd = np.ones((self._starts.size, n_odd), complex)
+        self._powers = tuple(s.shape[1] // 2 for s in (self.table.even, self.table.odd))
 
     @property
     def advance(self) -> ca.Function:
@@ -705,7 +702,7 @@ class Propagator:
         Returns
         -------
         State at the end, outputs at the samples of shape (outputs, n_out), and means.  The arrays
-        are overwritten by the next call.
+        are overwritten by the thread's next call.
 
         Raises
         ------
@@ -719,13 +716,13 @@ class Propagator:
                 f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
             )
         even, odd = self.table.at(w)
-        if self._compiled is None:  # a run in blocks may never need it
-            self._compiled = _caller(self.function)
+        call = _caller(*self._call_key, backend_in_use())  # a run in blocks may never need it
         if self.constant:
-            x, y, mean, miss = self._compiled(x0, even, u, self.theta, self.h)
+            x, y, mean, miss = call(x0, even, u, self.theta, self.h)
         else:
             z = np.exp(1j * (float(x0[self._angle]) + w * self._starts))
-            E, O = self._even, self._odd
+            # this call's own, since threads may share the object
+            E, O = (np.ones((z.size, n), complex) for n in self._powers)
             E[:, 1] = z * z
             known = 2
             while known < E.shape[1]:  # powers by doubling: fewer, longer operations
@@ -735,10 +732,10 @@ class Propagator:
                 known *= 2
             np.multiply(E[:, : O.shape[1]], z[:, None], out=O)
             # one row for each step of the exciter is one column of the compiled function's input
-            _, P, Q, *_ = self._compiled.inputs
+            _, P, Q, *_ = call.inputs
             np.matmul(E.view(float), even, out=P.T)
             np.matmul(O.view(float), odd, out=Q.T)
-            x, y, mean, miss = self._compiled(x0, P, Q, u, self.theta, self.h)
+            x, y, mean, miss = call(x0, P, Q, u, self.theta, self.h)
         if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
             raise SimulationError(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
@@ -758,17 +755,12 @@ class Propagator:
         return StepResult(t, x.reshape(-1, 1).copy(), y.copy(), means, {"nsteps": self.n_out})
 
 
-_CALLERS: dict[int, tuple[ca.Function, Any]] = {}
-
-
-def _caller(fun: ca.Function) -> Any:
-    """One compiled caller per function; the function is kept, so that its id stays valid."""
-    if id(fun) not in _CALLERS:
-        _CALLERS[id(fun)] = (fun, Caller(compiled(fun, level=3), copy=False))
-    return _CALLERS[id(fun)][1]
-
-
-_TABLES: OrderedDict[tuple[Any, ...], tuple[StateSpace, Table]] = OrderedDict()
+@kept
+def _caller(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs: tuple[str, ...],
+            quad: tuple[str, ...], constant: bool, _in_use: str) -> Caller:  # fmt: skip
+    """Function of :func:`_advance` in the backend in use, one for each layout."""
+    fun = _advance(gen, ss, n_out, plan, outputs, quad, constant)
+    return Caller(compiled(fun, level=3), copy=False)
 
 
 def cached_table(
@@ -785,11 +777,8 @@ def cached_table(
     key_u = np.array(u, dtype=float)
     key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
     length = (None if h is None else round(h, 15), angle)
-    key = (id(ss), key_u.tobytes(), theta.tobytes(), *length, w_rated, leaps)
-    if key not in _TABLES:
-        made = transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps)
-        _TABLES[key] = (ss, made)
-        if len(_TABLES) > 256:
-            _TABLES.popitem(last=False)
-    _TABLES.move_to_end(key)
-    return _TABLES[key][1]
+    key = (key_u.tobytes(), theta.tobytes(), *length, w_rated, leaps)
+    return keep(
+        ss, Table, key,
+        lambda: transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps),
+    )  # fmt: skip

@@ -10,7 +10,6 @@ over a step, and a step ends at every switching instant: nothing is stepped over
 from __future__ import annotations
 
 import re
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +17,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi.calling import Buffers
 from apu_casadi.errors import SignalError, SimulationError, nearest
+from apu_casadi.sharing import PerThread, Rebuilt, keep, twin
 from apu_casadi.statespace import StateSpace
 
 SOLVERS = ("cvodes", "idas")
@@ -66,10 +67,11 @@ class StepResult:
         return self.x[:, -1]
 
 
-class Stepper:
+class Stepper(Rebuilt):
     """Integrates one model over steps of any length with outputs at fixed fractions of the step.
 
-    Make it with :func:`stepper`, which keeps the ones already built.
+    Make it with :func:`stepper`, which keeps the ones already built.  Threads may share it: each
+    has solver memory of its own.
 
     Parameters
     ----------
@@ -242,36 +244,27 @@ class Stepper:
 class _Buffered:
     """A function called through flat NumPy buffers; the conversions to DM cost more than CVODES.
 
-    Not re-entrant: the buffers belong to the function.
+    Each thread has buffers and solver memory of its own.
     """
 
     def __init__(
         self, fun: ca.Function, arguments: Sequence[str] = (), results: Sequence[str] = ()
     ) -> None:
-        pair: Any = fun.buffer()
-        self._buffer, self._evaluate = pair
-        index_in = [fun.index_in(n) for n in arguments] or list(range(fun.n_in()))
-        index_out = [fun.index_out(n) for n in results] or list(range(fun.n_out()))
-        self._in = [np.zeros(fun.numel_in(i)) for i in index_in]
-        self._out = [np.zeros(fun.numel_out(i)) for i in index_out]
+        index_in = tuple(fun.index_in(n) for n in arguments) or tuple(range(fun.n_in()))
+        index_out = tuple(fun.index_out(n) for n in results) or tuple(range(fun.n_out()))
         self._shapes = [fun.size_out(i) for i in index_out]
-        for bind, index, arrays in (
-            (self._buffer.set_arg, index_in, self._in),
-            (self._buffer.set_res, index_out, self._out),
-        ):
-            for i, a in zip(index, arrays, strict=True):
-                if a.size:
-                    bind(i, memoryview(a))
+        self._here: PerThread[Buffers] = PerThread(Buffers, fun, index_in, index_out)
 
     def __call__(self, *values: np.ndarray) -> list[np.ndarray]:
-        for a, v in zip(self._in, values, strict=True):
+        own = self._here.own
+        for a, v in zip(own.inputs, values, strict=True):
             a[:] = v.ravel(order="F")
-        self._evaluate()
-        pairs = zip(self._out, self._shapes, strict=True)
+        own.evaluate()
+        pairs = zip(own.outputs, self._shapes, strict=True)
         return [a.copy().reshape(shape, order="F") for a, shape in pairs]
 
     def stats(self) -> dict[str, Any]:
-        return dict(self._buffer.stats())
+        return self._here.own.stats()
 
 
 def _symbols(ss: StateSpace) -> Any:
@@ -290,10 +283,6 @@ def _vector(model: str, label: str, values: Any, n: int) -> np.ndarray:
     if not np.all(np.isfinite(a)):
         raise SignalError(f"{model}: {label} holds values that are not finite: {a}")
     return a
-
-
-_STEPPERS: OrderedDict[tuple[Any, ...], Stepper] = OrderedDict()
-_MAX_STEPPERS = 128
 
 
 def stepper(
@@ -318,13 +307,12 @@ def stepper(
         grid = np.arange(1, n_out + 1) / n_out
     else:
         raise SimulationError(f"{ss.name}: at least one output per step is needed, got {n_out}")
-    key = (id(ss), grid.tobytes(), tuple(quad), solver, rtol, atol)
-    if key not in _STEPPERS:  # a stepper holds its model, so an id in the table stays valid
-        _STEPPERS[key] = Stepper(ss, grid, quad=quad, solver=solver, rtol=rtol, atol=atol)
-        if len(_STEPPERS) > _MAX_STEPPERS:
-            _STEPPERS.popitem(last=False)
-    _STEPPERS.move_to_end(key)
-    return _STEPPERS[key]
+    key = (grid.tobytes(), tuple(quad), solver, rtol, atol)
+    model = twin(ss)
+    return keep(
+        ss, Stepper, key,
+        lambda: Stepper(model, grid, quad=quad, solver=solver, rtol=rtol, atol=atol),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,12 @@ from typing import Any
 import casadi as ca
 
 from apu_casadi.errors import SignalError
+from apu_casadi.sharing import Parametric
 from apu_casadi.signals import Signals
 
 
 @dataclass(frozen=True)
-class StateSpace:
+class StateSpace(Parametric):
     """A model as named signals and functions.
 
     Parameters

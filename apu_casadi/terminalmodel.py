@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -43,6 +42,7 @@ from apu_casadi.machine.park import (
     qd0_to_abc,
 )
 from apu_casadi.machine.wrsg import Windings
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
 
@@ -358,7 +358,7 @@ def voltage_weight(w_r: Any, dt: Any) -> Any:
     return dt * (1.0 / 6.0 + 2.0 / 3.0 * middle_weight(w_r, dt))
 
 
-@lru_cache(maxsize=16)
+@kept
 def terminal_model(p: MachineParameters, fault: str = "shunts") -> StateSpace:
     """Return the continuous model of the machine with its terminals given.
 

@@ -9,7 +9,6 @@ when to stop, and the residual is evaluated again at the end, whatever the itera
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -31,6 +30,7 @@ from apu_casadi.cycle import (
     Y,
 )
 from apu_casadi.rootfinding import solve_bordered
+from apu_casadi.sharing import Rebuilt, derived
 
 NZ = len(Z_NAMES)
 N_W = NZ + 3  # w = (z, N, Wf, PW)
@@ -73,7 +73,7 @@ class System(NamedTuple):
     y: Any
 
 
-class TrimKernel:
+class TrimKernel(Rebuilt):
     """The equations of steady points with two given quantities.
 
     Parameters
@@ -286,7 +286,7 @@ class TrimKernel:
         )  # fmt: skip
         return [*end(v[:n], p, a), v[:n], v[n] / _COUNT]
 
-    @cached_property
+    @derived
     def cold(self) -> ca.Function:
         """Solve from the similarity guess: (p,) -> :class:`Output`.
 
@@ -299,7 +299,7 @@ class TrimKernel:
         out = self._outputs(start(p, a), p, a, MAX_ITERATIONS)
         return ca.Function(f"trim_{self.label}", [p], out, ["p"], list(Output._fields))
 
-    @cached_property
+    @derived
     def warm(self) -> ca.Function:
         """Solve from a given start: (s, p) -> :class:`Output`."""
         s, p = ca.MX.sym("s", len(self.free)), ca.MX.sym("p", self.n_p)
@@ -308,7 +308,7 @@ class TrimKernel:
         names[names.index("s")] = "s1"
         return ca.Function(f"trim_warm_{self.label}", [s, p], out, ["s", "p"], names)
 
-    @cached_property
+    @derived
     def equations(self) -> ca.Function:
         """(s, p) -> residuals, and their Jacobian by the scaled unknowns, which tells a fold."""
         s, p, _ = self._symbols()

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-import threading
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +16,7 @@ import numpy as np
 from apu_casadi import backend
 from apu_casadi.errors import SignalError
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator, MapChoice
+from apu_casadi.sharing import BUILDING, Rebuilt, keep, kept
 from apu_casadi.steadypoint import Limits, Status, limit_status
 from apu_casadi.trimkernel import AMBIENT, LAW, TrimKernel
 
@@ -27,7 +26,7 @@ HOT = (("N", "PW"), ("N", "Wf"), ("N", "T4"), ("N", "T5"), ("PW", "Wf"), (LAW, "
 """Pairs worth compiling ahead of time, names sorted."""
 
 
-class Solver:
+class Solver(Rebuilt):
     """The kernel of one engine and one pair of fixed quantities, in the backend in use."""
 
     def __init__(self, gg: GasGenerator, spec: tuple[str, str]) -> None:
@@ -35,8 +34,6 @@ class Solver:
         self.gg, self.kernel = gg, TrimKernel(gg.cycle, spec)
         self._digest = backend.recipe("trim", spec, gg.parameters, *map_digest(gg))
         self._made: dict[tuple[str, str], Any] = {}
-        self._callers: dict[Any, Any] = {}
-        self.lock = threading.Lock()
         self.regular: bool | None = None
 
     def function(self, which: str, *, compile: bool) -> Any:
@@ -44,7 +41,12 @@ class Solver:
         mode = backend.backend_in_use()
         if mode == "vm":
             return getattr(self.kernel, which)
-        if (which, "c") not in self._made:
+        made = self._made.get((which, "c"))
+        if made is not None:
+            return made
+        with BUILDING:
+            if (which, "c") in self._made:
+                return self._made[which, "c"]
             tried = (which, "load")
             if not compile and tried in self._made:
                 return self._made[tried]
@@ -55,30 +57,23 @@ class Solver:
             loaded = compile or f.class_name() == "External"
             self._made[(which, "c") if loaded else tried] = f
             return f
-        return self._made[(which, "c")]
 
     def one(self, which: str, *args: np.ndarray) -> tuple[np.ndarray, ...]:
         """Evaluate for one point; safe to call from several threads."""
-        with self.lock:
-            f = self.function(which, compile=False)
-            key = (which, f.__hash__())
-            if key not in self._callers:
-                self._callers[key] = backend.Caller(f)
-            return self._callers[key](*args)
+        f = self.function(which, compile=False)
+        return keep(self, "one", (which, f), lambda: backend.Caller(f))(*args)
 
     def many(
         self, which: str, *args: np.ndarray, n_threads: int | None, compile: bool = True
     ) -> tuple[np.ndarray, ...]:
-        """Evaluate for columns."""
-        with self.lock:
-            f = self.function(which, compile=compile)
-            key = (which, f.__hash__(), n_threads)
-            if key not in self._callers:
-                self._callers[key] = backend.mapped(f, n_threads)
-            return self._callers[key](*args)
+        """Evaluate for columns; safe to call from several threads."""
+        f = self.function(which, compile=compile)
+        return keep(self, "many", (which, f, n_threads), lambda: backend.mapped(f, n_threads))(
+            *args
+        )
 
 
-@lru_cache(maxsize=64)
+@kept
 def solver_of(gg: GasGenerator, spec: tuple[str, str]) -> Solver:
     """Return the solver of an engine and a pair of fixed quantities, made once."""
     return Solver(gg, spec)
@@ -137,7 +132,7 @@ def origin_of(solver: Solver) -> tuple[np.ndarray, np.ndarray]:
     return p, k.design_start()
 
 
-@lru_cache(maxsize=16)
+@kept
 def _design_output(gg: GasGenerator) -> np.ndarray:
     k = TrimKernel(gg.cycle, ("N", "PW"))
     par, d = gg.parameters, gg.design

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi import backend
+from apu_casadi import backend, cachefolder
 from apu_casadi.errors import BackendError
 
 needs_compiler = pytest.mark.skipif(
@@ -34,8 +34,9 @@ def fresh(monkeypatch, tmp_path):
     """Give every test an empty cache folder and forget what the process has compiled."""
     monkeypatch.setenv("APU_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("APU_BACKEND", "auto")
-    for store in (backend._compiled, backend._loaded, backend._failed, backend._said):
+    for store in (backend._compiled, backend._loaded, backend._failed):
         monkeypatch.setattr(backend, _name_of(store), type(store)())
+    monkeypatch.setattr(cachefolder, "_said", set())
     monkeypatch.setattr(backend, "_chosen", [None])
     return tmp_path / "cache"
 
@@ -204,7 +205,7 @@ PROCESS = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from test_backend import X, P, pendulum
-from apu_casadi import backend
+from apu_casadi import backend, cachefolder
 c = backend.compiled(pendulum())
 assert c.class_name() == "External"
 print(repr(backend.Caller(c)(X, P)[0].tolist()))
@@ -236,17 +237,14 @@ def test_no_folder_to_write_to_falls_back(monkeypatch, tmp_path, caplog):
     blocked.write_text("not a folder")
     monkeypatch.setenv("APU_CACHE_DIR", str(blocked / "x"))
     (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(backend.tempfile, "gettempdir", lambda: str(tmp_path / "tmp"))
-    backend._cache_folder.cache_clear()
+    monkeypatch.setattr(cachefolder.tempfile, "gettempdir", lambda: str(tmp_path / "tmp"))
     assert backend.compiled(pendulum()).class_name() == "External"
     assert backend.cache_folder().parent == tmp_path / "tmp"
-    monkeypatch.setattr(backend.tempfile, "gettempdir", lambda: str(blocked))
-    backend._cache_folder.cache_clear()
+    monkeypatch.setattr(cachefolder.tempfile, "gettempdir", lambda: str(blocked))
     f = pendulum(1.62)
     assert backend.compiled(f) is f
     with pytest.raises(BackendError, match="set APU_CACHE_DIR"):
         backend.compiled(f, backend="c")
-    backend._cache_folder.cache_clear()
 
 
 def test_the_switch(monkeypatch):

@@ -79,8 +79,8 @@ def gas_generator_functions() -> list[str]:
 
 def joint_functions() -> list[str]:
     """Compile what joint runs by exact propagation use, with a healthy and a faulted machine."""
-    from apu_casadi import jointstep, propagation
     from apu_casadi.apu import Apu
+    from apu_casadi.backend import loaded_functions
     from apu_casadi.events import FaultChange
     from apu_casadi.machine.load import SeriesLoad
     from apu_casadi.machine.ttsc import Ttsc
@@ -94,5 +94,4 @@ def joint_functions() -> list[str]:
                 apu, duration=0.4, load=load, events=events, solver="propagator",
                 waveform_dt=waveform_dt,
             )  # fmt: skip
-    callers = [c for _, c in propagation._CALLERS.values()] + list(jointstep._CALLERS.values())
-    return [c.fun.name() for c in callers]
+    return loaded_functions()
