@@ -781,4 +781,5 @@ def cached_table(
     return keep(
         ss, Table, key,
         lambda: transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps),
+        locked=False,
     )  # fmt: skip

@@ -14,8 +14,10 @@ function made as the call that made it.  ``fork`` waits until nothing is being b
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
+import itertools
 import os
 import threading
 import weakref
@@ -31,9 +33,11 @@ __all__ = [
     "Parametric",
     "PerThread",
     "Rebuilt",
+    "building",
     "derived",
     "keep",
     "kept",
+    "last",
     "once",
     "remade",
     "twin",
@@ -48,7 +52,7 @@ BUILDING = threading.RLock()
 _TABLES = threading.RLock()
 
 T = TypeVar("T")
-_STORE, _WEAK, _MADE_BY = "_store", "_weak_store", "_made_by"
+_STORE, _WEAK, _MADE_BY, _MADE_AT = "_store", "_weak_store", "_made_by", "_made_at"
 
 
 class Store:
@@ -96,6 +100,7 @@ def twin(owner: Any) -> Any:
     new = object.__new__(type(owner))
     new.__dict__.update({f.name: getattr(owner, f.name) for f in dataclasses.fields(owner)})
     new.__dict__[_WEAK] = weakref.ref(_store_of(owner))
+    new.__dict__.update({n: owner.__dict__[n] for n in (_MADE_BY, _MADE_AT) if n in owner.__dict__})
     return new
 
 
@@ -130,14 +135,25 @@ def _find(owner: Any) -> Store:
     return store
 
 
-def keep(owner: Any, which: Hashable, key: Hashable, make: Callable[[], T]) -> T:
+def keep(
+    owner: Any,
+    which: Hashable,
+    key: Hashable,
+    make: Callable[[], T],
+    *,
+    limit: int = RESULTS,
+    locked: bool = True,
+) -> T:
     """Return what ``make`` returns, made once for an owner and a key.
 
     Parameters
     ----------
     owner : a frozen dataclass, or anything that takes attributes.
-    which : tells what is made from what else is made; ``RESULTS`` of each are kept.
+    which : tells what is made from what else is made.
     key : all that the result depends on beside the owner.
+    limit : results of this kind that are kept for the owner.
+    locked : make it under the lock; False for what is mere arithmetic and takes long: two threads
+        may then make the same, and the first one's stays.
     """
     table = _store_of(owner).results.get(which)
     if table is not None:
@@ -147,18 +163,24 @@ def keep(owner: Any, which: Hashable, key: Hashable, make: Callable[[], T]) -> T
                 if key in table:
                     table.move_to_end(key)
             return found
-    with BUILDING:
-        store = _store_of(owner)
-        with _TABLES:
-            table = store.results.setdefault(which, OrderedDict())
+    store = _store_of(owner)
+    if locked:
+        with BUILDING:
+            return _entered(store, which, key, make, limit)
+    return _entered(store, which, key, make, limit)
+
+
+def _entered(store: Store, which: Hashable, key: Hashable, make: Callable[[], T], limit: int) -> T:
+    with _TABLES:
+        table = store.results.setdefault(which, OrderedDict())
         if key in table:
-            return table[key]
-        made = make()
-        with _TABLES:
-            table[key] = made
-            gone = table.popitem(last=False) if len(table) > RESULTS else None
-        del gone
-        return made
+            return table[key]  # type: ignore[no-any-return]
+    made = make()
+    with _TABLES:
+        made = table.setdefault(key, made)
+        gone = table.popitem(last=False) if len(table) > limit else None
+    del gone
+    return made
 
 
 class derived(Generic[T]):  # noqa: N801 - a decorator, like cached_property
@@ -170,6 +192,9 @@ class derived(Generic[T]):  # noqa: N801 - a decorator, like cached_property
     def __init__(self, make: Callable[[Any], T]) -> None:
         """Take the method."""
         self.make, self.__doc__ = make, make.__doc__
+
+    def _build(self, owner: Any) -> T:
+        return _recorded(getattr, self.make, (owner,), {}, (owner, self.name))
 
     def __set_name__(self, owner: type, name: str) -> None:
         """Learn the attribute's name."""
@@ -183,7 +208,7 @@ class derived(Generic[T]):  # noqa: N801 - a decorator, like cached_property
         """Return the value; an ordinary attribute from then on."""
         if obj is None:
             return self
-        value = keep(obj, self, None, lambda: self.make(twin(obj)))
+        value = keep(obj, self, None, lambda: self._build(twin(obj)))
         if _WEAK not in obj.__dict__:
             obj.__dict__[self.name] = value
         return value
@@ -200,25 +225,40 @@ def kept(make: Callable[..., T]) -> Callable[..., T]:
     return call
 
 
+def last(limit: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Keep the last ``limit`` results of a function that belong to no one model."""
+
+    def decorate(make: Callable[..., T]) -> Callable[..., T]:
+        table = _Owner()
+
+        @functools.wraps(make)
+        def call(*args: Any, **more: Any) -> T:
+            key = (args, tuple(sorted(more.items()))) if more else args
+            return keep(table, call, key, lambda: _recorded(call, make, args, more), limit=limit)
+
+        return call
+
+    return decorate
+
+
 def once(make: Callable[..., T]) -> Callable[..., T]:
-    """Keep the last ``RESULTS`` results of a function that belong to no model; as ``lru_cache``."""
-    table = _Owner()
-
-    @functools.wraps(make)
-    def call(*args: Any, **more: Any) -> T:
-        key = (args, tuple(sorted(more.items()))) if more else args
-        return keep(table, call, key, lambda: _recorded(call, make, args, more))
-
-    call.cache_clear = table.clear  # type: ignore[attr-defined]
-    return call
+    """Keep the results of a function that belong to no model and are small; as ``cache``."""
+    return last(RESULTS)(make)
 
 
 class _Owner:
-    """Holds the results of one function of :func:`once`."""
+    """Holds the results of one function of :func:`last`."""
 
-    def clear(self) -> None:
-        """Forget them."""
-        self.__dict__.pop(_STORE, None)
+
+def building(make: Callable[..., T]) -> Callable[..., T]:
+    """Let a function or constructor that builds expressions hold the lock."""
+
+    @functools.wraps(make)
+    def call(*args: Any, **more: Any) -> T:
+        with BUILDING:
+            return make(*args, **more)
+
+    return call
 
 
 def remade(make: Callable[..., T]) -> Callable[..., T]:
@@ -226,19 +266,39 @@ def remade(make: Callable[..., T]) -> Callable[..., T]:
 
     @functools.wraps(make)
     def call(*args: Any, **more: Any) -> T:
+        # copies of what the caller may change later
+        kept_args = tuple(copy.copy(a) if isinstance(a, _CHANGEABLE) else a for a in args)
         with BUILDING:
-            return _recorded(call, make, args, more)
+            return _recorded(call, make, kept_args, more)
 
     return call
 
 
+_CHANGEABLE = (dict, list, set)
+
+
 def _recorded(
-    call: Callable[..., T], make: Callable[..., T], args: tuple[Any, ...], more: dict[str, Any]
+    call: Callable[..., T],
+    make: Callable[..., T],
+    args: tuple[Any, ...],
+    more: dict[str, Any],
+    call_args: tuple[Any, ...] | None = None,
 ) -> T:
+    """Make something, and note the call with it if it is new.
+
+    The outermost call of those that made it counts.  What was there before keeps its own.
+    """
+    began = next(_count)
     made = make(*args, **more)
-    if isinstance(made, Parametric):
-        made.__dict__.setdefault(_MADE_BY, (call, args, more))
+    if isinstance(made, Parametric) and not any(made is a for a in (*args, *more.values())):
+        own = made.__dict__
+        if own.get(_MADE_AT, began) >= began:
+            own[_MADE_BY] = call, args if call_args is None else call_args, more
+            own[_MADE_AT] = next(_count)
     return made
+
+
+_count = itertools.count()
 
 
 def _remake(call: Callable[..., Any], args: tuple[Any, ...], more: dict[str, Any]) -> Any:

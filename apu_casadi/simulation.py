@@ -19,7 +19,7 @@ import numpy as np
 
 from apu_casadi.calling import Buffers
 from apu_casadi.errors import SignalError, SimulationError, nearest
-from apu_casadi.sharing import PerThread, Rebuilt, keep, twin
+from apu_casadi.sharing import PerThread, Rebuilt, building, keep, twin
 from apu_casadi.statespace import StateSpace
 
 SOLVERS = ("cvodes", "idas")
@@ -84,6 +84,7 @@ class Stepper(Rebuilt):
     max_steps : solver steps allowed between two outputs.
     """
 
+    @building
     def __init__(
         self,
         ss: StateSpace,

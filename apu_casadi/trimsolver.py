@@ -16,7 +16,7 @@ import numpy as np
 from apu_casadi import backend
 from apu_casadi.errors import SignalError
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator, MapChoice
-from apu_casadi.sharing import BUILDING, Rebuilt, keep, kept
+from apu_casadi.sharing import BUILDING, Rebuilt, building, keep, kept
 from apu_casadi.steadypoint import Limits, Status, limit_status
 from apu_casadi.trimkernel import AMBIENT, LAW, TrimKernel
 
@@ -29,6 +29,7 @@ HOT = (("N", "PW"), ("N", "Wf"), ("N", "T4"), ("N", "T5"), ("PW", "Wf"), (LAW, "
 class Solver(Rebuilt):
     """The kernel of one engine and one pair of fixed quantities, in the backend in use."""
 
+    @building
     def __init__(self, gg: GasGenerator, spec: tuple[str, str]) -> None:
         """Compile nothing yet; functions are made or loaded when first called."""
         self.gg, self.kernel = gg, TrimKernel(gg.cycle, spec)

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -31,6 +30,7 @@ import numpy as np
 
 from apu_casadi.backend import Caller, compiled
 from apu_casadi.errors import EstimationError, SignalError
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter
@@ -110,7 +110,7 @@ def _truth_of(model: FilterModel, data: Recording, truth: Any) -> np.ndarray:
     return x
 
 
-@lru_cache(maxsize=64)
+@kept
 def error_model(model: FilterModel) -> FilterModel:
     """Return the linear model of small errors whose Jacobians come as inputs.
 
@@ -182,7 +182,7 @@ def posterior_bound(
     return found.cov
 
 
-@lru_cache(maxsize=64)
+@kept
 def _jacobians(model: FilterModel) -> ca.Function:
     """Function (x, u, p, dt) -> (H, F, check), both over state and noise, at w = 0."""
     x, u, p, w, dt = model.symbols()
@@ -197,7 +197,7 @@ def _jacobians(model: FilterModel) -> ca.Function:
     return ca.Function(f"{model.name}_jacobians", [x, u, p, dt], [ca.densify(o) for o in out])
 
 
-@lru_cache(maxsize=64)
+@kept
 def _jacobian_call(model: FilterModel, build: bool, backend: str | None) -> Caller:
     return Caller(compiled(_jacobians(model), backend=backend, build=build), copy=False)
 

@@ -21,13 +21,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.errors import ParameterError, nearest
+from apu_casadi.sharing import kept, once
 from estimators.algebra import backward, cholesky, forward, symmetric
 from estimators.belief import Belief
 from estimators.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
@@ -59,7 +59,7 @@ class Corrected(NamedTuple):
     measured: Any
 
 
-@lru_cache(maxsize=64)
+@once
 def _kernel(P_at: tuple[int, ...], H_at: tuple[int, ...], fixed: tuple[int, ...]) -> ca.Function:
     """The update as an SX Function (P, H, nu, R) -> Corrected; ``fixed`` rows have no gain.
 
@@ -159,7 +159,7 @@ def step_symbols(model: FilterModel, kind: Any) -> list[Any]:
     return [kind.sym(n, *s) for n, s in zip(STEP_IN, shapes, strict=True)]
 
 
-@lru_cache(maxsize=64)
+@kept
 def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
     """Build the filter's step for a model.
 

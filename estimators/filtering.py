@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -18,6 +17,7 @@ import numpy as np
 from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import EstimationError, SignalError
 from apu_casadi.results import dataset
+from apu_casadi.sharing import Parametric, derived, kept
 from apu_casadi.signals import Signal, Signals
 from estimators.algebra import cholesky_semidefinite, root_of
 from estimators.belief import Belief
@@ -49,7 +49,7 @@ STATS = ("check", "nis", "loglik", "measured")
 
 
 @dataclass(frozen=True, eq=False)
-class FilterStep:
+class FilterStep(Parametric):
     """A filter for a model: one function, and its compiled forms.
 
     Parameters
@@ -64,7 +64,7 @@ class FilterStep:
     function: ca.Function
     root: bool = False
 
-    @cached_property
+    @derived
     def plain(self) -> FilterStep:
         """The same filter with covariances in and out, for use inside other functions.
 
@@ -198,7 +198,7 @@ def block_of(one: ca.Function, name: str, carried: int) -> ca.Function:
     return _chained(chain, CHAIN, f"{name}_block", carried, kept)
 
 
-@lru_cache(maxsize=64)
+@kept
 def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> ca.Function:
     """``BLOCK`` steps in one function; ``_in_use`` keeps the forms of each backend apart.
 

@@ -31,6 +31,7 @@ import numpy as np
 
 from apu_casadi.backend import Caller, compiled
 from apu_casadi.errors import DataError, EstimationError, SignalError
+from apu_casadi.sharing import Rebuilt, building
 from estimators.belief import Belief
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording
@@ -39,9 +40,10 @@ from estimators.ukf import PointSet
 __all__ = ["filterpy_ekf", "filterpy_ukf", "run_filterpy"]
 
 
-class _Evaluated:
+class _Evaluated(Rebuilt):
     """f and g of a model with numbers: values, Jacobians and process noise, checked."""
 
+    @building
     def __init__(
         self, model: FilterModel, p: Mapping[str, float] | None, backend: str | None
     ) -> None:

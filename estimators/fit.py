@@ -32,6 +32,7 @@ from scipy.sparse.linalg import splu
 from scipy.special import ndtri
 
 from apu_casadi.errors import EstimationError, ParameterError, nearest
+from apu_casadi.sharing import Rebuilt, building
 from estimators.belief import Belief
 from estimators.lifting import Lifted, plain
 from estimators.model import FilterModel
@@ -197,7 +198,7 @@ class _Run:
     tangent: np.ndarray  # of all unknowns along each estimated parameter, others re-fitted
 
 
-class FitProblem:
+class FitProblem(Rebuilt):
     """A fit built once, for any data of the same sizes.
 
     Parameters
@@ -218,6 +219,7 @@ class FitProblem:
     ParameterError : unknown or doubled names, nothing to estimate.
     """
 
+    @building
     def __init__(
         self,
         model: FilterModel | Lifted,

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -29,6 +28,7 @@ from scipy.linalg import expm
 
 from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signals
 from estimators.belief import Belief
 from estimators.ekf import ekf_step
@@ -291,9 +291,13 @@ def _weigher(x: Sequence[Signals], common: Signals) -> ca.Function:
     return ca.Function("weigh", [logs, ll, m_in, P_in], out)
 
 
-@lru_cache(maxsize=16)
+@kept
 def _block(
-    steps: tuple[FilterStep, ...], common: Signals, backend: str | None, _in_use: str
+    first: FilterStep,
+    others: tuple[FilterStep, ...],
+    common: Signals,
+    backend: str | None,
+    _in_use: str,
 ) -> ca.Function:
     """``BLOCK`` cycles of mixing, filtering and weighing in one function.
 
@@ -301,6 +305,7 @@ def _block(
     the predicted m, P, the filtered m, P, mean and variance of the mixture, and log-likelihood with
     checks; m, P of all modes stacked.
     """
+    steps = (first, *others)
     models = [s.model for s in steps]
     x = [m.x for m in models]
     n = [len(s) for s in x]
@@ -429,7 +434,8 @@ def interacting_multiple_models(
     # a padded sample changes no mode
     logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
     # the buffers are this run's own, as in estimators.filtering
-    block = _block(tuple(steps.values()), common, backend, backend_in_use())
+    one, *others = steps.values()
+    block = _block(one, tuple(others), common, backend, backend_in_use())
     call = Caller(block, copy=False)
     logs = _log_prior(names, prior_probability)
     m = np.concatenate([b.mean for b in priors])

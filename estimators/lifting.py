@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.errors import ParameterError, SignalError
+from apu_casadi.sharing import Parametric, building, remade
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
 from estimators.model import FilterModel, discretise
@@ -32,7 +33,7 @@ _STAGE = ["x", "s", "u", "p", "w", "dt", "k"], ["y", "x1", "c", "check"]
 
 
 @dataclass(frozen=True, eq=False)
-class Lifted:
+class Lifted(Parametric):
     """A model as optimisers take it: one sample is a *stage*.
 
     Parameters
@@ -73,6 +74,7 @@ class Lifted:
         return int(self.stage.size1_out(2))
 
 
+@remade
 def plain(model: FilterModel) -> Lifted:
     """Return a filter's model as it is, nothing lifted."""
     model = model.expanded()
@@ -88,6 +90,7 @@ def plain(model: FilterModel) -> Lifted:
     return Lifted(model, Signals(), _scalar(stage), frozen, start)
 
 
+@building
 def lift(
     ss: StateSpace,
     build: Callable[[FilterModel], FilterModel] | None = None,

@@ -16,7 +16,6 @@ N.  Bounds do not enter the arrival cost, nor the claimed covariance, which is s
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -24,6 +23,7 @@ import numpy as np
 
 from apu_casadi.backend import Caller, compiled
 from apu_casadi.errors import EstimationError, ParameterError, SignalError
+from apu_casadi.sharing import Rebuilt, building, kept
 from estimators.belief import Belief
 from estimators.ekf import correct, kind_of
 from estimators.filtering import FilterResult
@@ -48,7 +48,7 @@ class _Along(NamedTuple):
     stats: Any
 
 
-@lru_cache(maxsize=32)
+@kept
 def _along(model: FilterModel) -> ca.Function:
     """Function (m, P, at, w, u, p, y, R, dt) -> :class:`_Along`.
 
@@ -84,7 +84,7 @@ def _along(model: FilterModel) -> ca.Function:
     return ca.Function(f"along_{model.name}", args, dense, names, list(_Along._fields))
 
 
-class HorizonEstimator:
+class HorizonEstimator(Rebuilt):
     """A moving-horizon estimator, built once for a model and a length.
 
     Parameters
@@ -100,6 +100,7 @@ class HorizonEstimator:
     ParameterError : horizon below 1, or considered states, which an optimiser cannot but estimate.
     """
 
+    @building
     def __init__(
         self,
         model: FilterModel | Lifted,

@@ -29,6 +29,7 @@ import numpy as np
 
 from apu_casadi.discretisation import linearly_implicit_midpoint
 from apu_casadi.errors import ParameterError, SignalError, nearest
+from apu_casadi.sharing import Parametric, remade
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
 
@@ -82,7 +83,7 @@ class Unknown:
 
 
 @dataclass(frozen=True, eq=False)
-class FilterModel:
+class FilterModel(Parametric):
     """A discrete-time model with named vectors; see the module's text.
 
     Parameters
@@ -158,6 +159,7 @@ class FilterModel:
         names = zip("xupw", (nx, nu, np_, nw), strict=True)
         return (*(kind.sym(n, m) for n, m in names), kind.sym("dt"))
 
+    @remade
     def with_walk(self, walks: Mapping[str, float]) -> FilterModel:
         """Return the model with other random-walk standard deviations, by state name.
 
@@ -170,6 +172,7 @@ class FilterModel:
             new[self.x.index(name)] = value
         return dataclasses.replace(self, walk=new)
 
+    @remade
     def expanded(self) -> FilterModel:
         """Return the same model in scalar operations, faster, where that is possible.
 
@@ -214,6 +217,7 @@ def _model(
     )
 
 
+@remade
 def discretise(
     ss: StateSpace,
     *,
@@ -271,6 +275,7 @@ def discretise(
     return model.with_walk(walk or {})
 
 
+@remade
 def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model with only these outputs, in this order.
 
@@ -287,6 +292,7 @@ def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
     return dataclasses.replace(model, y=Signals([model.y[i] for i in rows]), output=output)
 
 
+@remade
 def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
     """Return the model for inputs that are measured with white noise.
 
@@ -369,6 +375,7 @@ def _sensor_errors(model: FilterModel, names: Sequence[str], kind: str) -> Filte
     )
 
 
+@remade
 def gains(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model with parameters ``gain_<name>``: that sensor reads (1 + gain) y.
 
@@ -379,6 +386,7 @@ def gains(model: FilterModel, names: Sequence[str]) -> FilterModel:
     return _sensor_errors(model, names, "gain")
 
 
+@remade
 def biases(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model with parameters ``bias_<name>``: that sensor reads y + bias.
 
@@ -389,6 +397,7 @@ def biases(model: FilterModel, names: Sequence[str]) -> FilterModel:
     return _sensor_errors(model, names, "bias")
 
 
+@remade
 def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
     """Return the model in which these parameters are states, appended in the given order.
 
@@ -424,6 +433,7 @@ def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
     )
 
 
+@remade
 def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model for inputs whose white noise comes with the data.
 

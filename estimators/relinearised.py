@@ -13,12 +13,12 @@ recording, so it is nothing for estimation while samples come in.
 from __future__ import annotations
 
 import dataclasses
-from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.errors import ParameterError
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signals
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter, kind_of
@@ -30,7 +30,7 @@ from estimators.smoother import rts_smoother
 __all__ = ["linearised", "relinearised_filter"]
 
 
-@lru_cache(maxsize=16)
+@kept
 def linearised(model: FilterModel) -> FilterModel:
     """Return the model linearised about states that come as inputs ``at_<state>``.
 

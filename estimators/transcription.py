@@ -16,9 +16,10 @@ functions serve every length of recording, and data are parameters of the progra
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ import scipy.sparse as sp
 
 from apu_casadi.backend import compiled
 from apu_casadi.errors import EstimationError
+from apu_casadi.sharing import Rebuilt, building, derived, keep, kept
 from estimators.belief import Belief
 from estimators.lifting import Lifted
 from estimators.model import CHECK_TOL
@@ -67,7 +69,7 @@ class Kernel(NamedTuple):
     walk: tuple[int, ...]
 
 
-@lru_cache(maxsize=32)
+@kept
 def kernel(lifted: Lifted, names: tuple[str, ...]) -> Kernel:
     """Make the functions of one stage; ``names`` are the parameters that are unknowns."""
     model = lifted.model
@@ -177,7 +179,20 @@ class Solution:
     iterations: int
 
 
-class Transcription:
+#: MUMPS, with which IPOPT solves its linear systems, keeps data of its own outside of any solver:
+#: solutions in several threads wait for each other.
+_ipopt = [threading.RLock()]
+
+
+def _after_fork() -> None:
+    _ipopt[0] = threading.RLock()  # another thread may have held it, and is not here
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+class Transcription(Rebuilt):
     """The program for given numbers of samples.
 
     Parameters
@@ -189,6 +204,7 @@ class Transcription:
     backend, build : see :func:`apu_casadi.backend.compiled`.
     """
 
+    @building
     def __init__(
         self,
         lifted: Lifted,
@@ -205,7 +221,6 @@ class Transcription:
         self.sizes, self.shared, self.own = tuple(sizes), tuple(shared), tuple(own)
         self.prior = prior and not lifted.steady
         self.kernel = kernel(lifted, (*self.shared, *self.own))
-        self._solvers: dict[tuple[bool, int], ca.Function] = {}
         self._compile = lambda f: compiled(f, backend=backend, build=build)
         nx, ns, nw, nq, nt = self.kernel.sizes
         R, K = len(self.sizes), sum(self.sizes)
@@ -241,7 +256,7 @@ class Transcription:
         R = len(self.sizes)
         return (*self.shared, *(f"{n}[{r}]" for r in range(R) for n in self.own))
 
-    @cached_property
+    @derived
     def theta_scale(self) -> np.ndarray:
         """Magnitudes of the parameters, shape (n_theta,)."""
         m = len(self.shared)
@@ -249,7 +264,7 @@ class Transcription:
             [self._theta_scale[:m], np.tile(self._theta_scale[m:], len(self.sizes))]
         )
 
-    @cached_property
+    @derived
     def scale(self) -> np.ndarray:
         """Magnitudes of all unknowns, shape (n_z,)."""
         out = np.ones(self.n_z)
@@ -308,7 +323,7 @@ class Transcription:
 
     # ------------------------------------------------------------------ the program
 
-    @cached_property
+    @derived
     def _places(self) -> dict[str, Any]:
         """Triplets of Jacobian and Hessian, as constant matrices from parts to nonzeros."""
         k, nx, K, R = self.kernel, self.kernel.sizes[0], sum(self.sizes), len(self.sizes)
@@ -355,14 +370,14 @@ class Transcription:
         )
         return {"jac": jac, "hess": hess, "spread": spread, "link": link, "n_one": n_one}
 
-    @cached_property
+    @derived
     def _mapped(self) -> tuple[ca.Function, ca.Function, ca.Function]:
         """Value, first and second derivatives of all stages at once."""
         k, K = self.kernel, sum(self.sizes)
         first, second = (self._compile(f).map(K) for f in (k.first, k.second))
         return self._compile(k.value).map(K), first, second
 
-    @cached_property
+    @derived
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions: f, g and their exact derivatives, in z and its parameters."""
         k, K, R = self.kernel, sum(self.sizes), len(self.sizes)
@@ -422,7 +437,7 @@ class Transcription:
             ),
         }
 
-    @cached_property
+    @derived
     def _n_data(self) -> int:
         nx, nu, np_, _, ny = self.model.sizes
         n = (nu + np_ + 2 * ny + 1) * sum(self.sizes) + 2 * self.n_theta
@@ -431,9 +446,7 @@ class Transcription:
     def solver(self, warm: bool = False, max_iterations: int = 200) -> ca.Function:
         """IPOPT with exact derivatives; ``warm`` for a start that is nearly the solution."""
         key = warm, max_iterations
-        if key not in self._solvers:
-            self._solvers[key] = self._solver(warm, max_iterations)
-        return self._solvers[key]
+        return keep(self, "solver", key, lambda: self._solver(warm, max_iterations))
 
     def _solver(self, warm: bool, max_iterations: int) -> ca.Function:
         F = self.functions
@@ -488,8 +501,9 @@ class Transcription:
         given = {"x0": z0, "p": data, "lbx": lower, "ubx": upper, "lbg": 0.0, "ubg": 0.0}
         if start is not None:
             given |= {"lam_g0": start.lam_g, "lam_x0": start.lam_z}
-        out = solver(**given)
-        stats = solver.stats()
+        with _ipopt[0]:
+            out = solver(**given)
+            stats = solver.stats()
         s = Solution(
             z=np.array(out["x"]).ravel(),
             data=data,
@@ -531,7 +545,7 @@ class Transcription:
                 f"{k - self.starts[self.recording_of[k]]} of recording {self.recording_of[k]}"
             )
 
-    @cached_property
+    @derived
     def _check(self) -> ca.Function:
         return self.kernel.check.map(sum(self.sizes))
 

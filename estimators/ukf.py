@@ -30,12 +30,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 
 from apu_casadi.errors import ParameterError, nearest
+from apu_casadi.sharing import kept
 from estimators.algebra import append_column, forward, qr_lower, root_update
 from estimators.belief import Belief
 from estimators.ekf import projected, step_symbols
@@ -170,7 +170,7 @@ def _straight(fun: ca.Function, nx: int) -> list[int]:
     return [i for i, b in enumerate(bent) if not b]
 
 
-@lru_cache(maxsize=64)
+@kept
 def ukf_step(
     model: FilterModel,
     points: str = "cubature",

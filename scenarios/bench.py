@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import ScenarioError, SimulationError, nearest
+from apu_casadi.sharing import once
 from scenarios import pages, registry
 from scenarios.schema import Scenario
 
@@ -123,7 +124,7 @@ def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     return median(times), result
 
 
-@lru_cache(maxsize=1)
+@once
 def _apu() -> Apu:
     from apu_casadi.apu import Apu
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.multirate import simulate_joint
 from apu_casadi.results import RPM
+from apu_casadi.sharing import once
 from apu_casadi.steadypoint import OperatingPoint
 from apu_casadi.trimming import trim_gas_generator
 from scenarios.pages import markdown_table
@@ -65,7 +65,7 @@ class Item:
 # --------------------------------------------------------------------------- gas generator
 
 
-@cache
+@once
 def _apu() -> Apu:
     return Apu()
 
@@ -129,7 +129,7 @@ def _ambient_error() -> float:
     return max(abs(r.error) for r in table5() if r.quantity in ("T1", "P1", "P2"))
 
 
-@cache
+@once
 def _fault_point(sign: str | None) -> OperatingPoint:
     """Steady point of the joint run before (None) or after the gas-path fault, at 100 kW each."""
     gg = _apu().gas_generator
@@ -234,7 +234,7 @@ def field_loss() -> str:
     )
 
 
-@cache
+@once
 def _settled(load: SeriesLoad, fault: Ttsc | None, kind: str = "grounded") -> dict[str, float]:
     """Means over 8 periods, and the rms fault current, at rated speed and V_ref of Table 7."""
     g = Generator(neutral=kind)
@@ -249,7 +249,7 @@ def _settled(load: SeriesLoad, fault: Ttsc | None, kind: str = "grounded") -> di
     return {**r.mean, "I_fault": math.sqrt(r.mean["i_fault^2"])}
 
 
-@cache
+@once
 def _PW_100() -> float:
     return float(_apu().PW(Generator().steady_state(KW100).y["P_total"]))
 

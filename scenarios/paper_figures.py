@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,7 @@ from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.machine.ttsc import Ttsc
 from apu_casadi.results import dataset
+from apu_casadi.sharing import last
 from apu_casadi.statespace import StateSpace
 from apu_casadi.trimming import trim_gas_generator
 from scenarios.validation import Row, relative, run, section
@@ -210,12 +211,12 @@ def table6() -> list[Row]:
     return rows
 
 
-@cache
+@last(16)
 def _gas(turbine_flow: str, route: str) -> xr.Dataset:
     return gas_generator_transient(turbine_flow, route)
 
 
-@cache
+@last(16)
 def _machine(kind: str, solver: str) -> xr.Dataset:
     return machine_transient(kind, solver)
 

@@ -7,12 +7,12 @@ Table 5's row "P1" is the ambient static pressure, not the total pressure that i
 from __future__ import annotations
 
 import math
-from functools import cache
 
 from apu_casadi.apu import Apu
 from apu_casadi.gasgenerator import RPM, GasGenerator
 from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
+from apu_casadi.sharing import once
 from apu_casadi.steadypoint import OperatingPoint
 from apu_casadi.trimming import trim_gas_generator
 from scenarios.validation import Row, mean_row, reference, relative, section
@@ -47,7 +47,7 @@ def high_altitude_point(gg: GasGenerator | None = None) -> OperatingPoint:
     return trim_gas_generator(gg, fixed, altitude=8000.0, Mach=0.7, dT_isa=5.0)
 
 
-@cache
+@once
 def _engine() -> GasGenerator:
     return Apu().gas_generator
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.errors import ScenarioError, nearest
+from apu_casadi.sharing import last, once
 from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ Progress = Callable[[float, float], None]
 """Called with the simulated and the total time [s]."""
 
 
-@cache
+@once
 def _library() -> dict[str, Scenario]:
     made = {}
     folder = files("scenarios") / "library"
@@ -110,7 +110,7 @@ def run(
     return ds
 
 
-@lru_cache(maxsize=4)
+@last(4)
 def _unit(parameters: str) -> Apu:
     """Return the unit with some parameters changed (JSON); kept, since building takes longer."""
     from apu_casadi.apu import Apu

@@ -13,8 +13,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.backend import compiled, mapped
+from apu_casadi.backend import backend_in_use, compiled, mapped
 from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.sharing import keep
 from estimators.filtering import FilterResult
 from estimators.model import FilterModel
 from estimators.recording import Recording
@@ -247,26 +248,24 @@ def linearised(
     return LinearFilter(names, Fx, L, Hx, S, nu, state, drift, output)
 
 
-_JACOBIANS: dict[tuple[int, int, str | None], tuple[Any, Any, Any]] = {}
-
-
 def _jacobians(model: FilterModel, backend: str | None) -> tuple[Any, Any]:
-    """Batch forms of the Jacobians of transition and output; kept for a model's functions."""
-    key = (hash(model.transition), hash(model.output), backend)
-    if key not in _JACOBIANS:
-        x, u, p, w, dt = model.symbols()
-        x1, _ = model.transition(x, u, p, w, dt)
-        y, _ = model.output(x, u, p, w)
+    """Batch forms of the Jacobians of transition and output; kept with the model's functions."""
+    key = model.output, backend, backend_in_use()
+    return keep(model.transition, _jacobians, key, lambda: _build_jacobians(model, backend))
 
-        def made(name: str, args: list[Any], of: list[Any]) -> Any:
-            columns = [ca.vec(ca.densify(e)) for e in of]
-            return mapped(compiled(ca.Function(name, args, columns), backend=backend), 1)
 
-        rates = made(f"{model.name}_df", [x, u, p, w, dt], [ca.jacobian(x1, v) for v in (x, w, p)])
-        outs = made(f"{model.name}_dg", [x, u, p, w], [y, *(ca.jacobian(y, v) for v in (x, w, p))])
-        # the model is kept too, so that a hash is never that of another, later function
-        _JACOBIANS[key] = (rates, outs, model)
-    return _JACOBIANS[key][:2]
+def _build_jacobians(model: FilterModel, backend: str | None) -> tuple[Any, Any]:
+    x, u, p, w, dt = model.symbols()
+    x1, _ = model.transition(x, u, p, w, dt)
+    y, _ = model.output(x, u, p, w)
+
+    def made(name: str, args: list[Any], of: list[Any]) -> Any:
+        columns = [ca.vec(ca.densify(e)) for e in of]
+        return mapped(compiled(ca.Function(name, args, columns), backend=backend), 1)
+
+    rates = made(f"{model.name}_df", [x, u, p, w, dt], [ca.jacobian(x1, v) for v in (x, w, p)])
+    outs = made(f"{model.name}_dg", [x, u, p, w], [y, *(ca.jacobian(y, v) for v in (x, w, p))])
+    return rates, outs
 
 
 def _stacks(

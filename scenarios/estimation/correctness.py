@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -21,6 +20,7 @@ import numpy as np
 import scipy.linalg
 
 from apu_casadi.errors import EstimationError
+from apu_casadi.sharing import once
 from apu_casadi.signals import Signal, Signals
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter
@@ -42,7 +42,7 @@ WALK = (0.1, 0.2, 0.3)  # 1/sqrt(s)
 GOAL = 1e-9
 
 
-@lru_cache(maxsize=2)
+@once
 def linear_model(*, shared: bool = True) -> FilterModel:
     """x1 = A x + B u + G w, y = C x + D w; the matrices are parameters, so it is built once.
 

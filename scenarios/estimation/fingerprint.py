@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 
 import casadi as ca
+
+from apu_casadi.sharing import once
 
 __all__ = ["FUNCTIONS", "digest", "digest_of"]
 
@@ -81,7 +82,7 @@ def digest_of(functions: Sequence[ca.Function]) -> str:
     return h.hexdigest()[:12]
 
 
-@lru_cache(maxsize=32)
+@once
 def digest(study: str) -> str:
     """Return the digest of a study's filters as the code makes them now; a second or two."""
     return digest_of(FUNCTIONS[study]())

@@ -15,7 +15,6 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ import numpy as np
 from apu_casadi.control import GovernorParameters, governor
 from apu_casadi.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
+from apu_casadi.sharing import kept, once
 from apu_casadi.simulation import stepper
 from apu_casadi.trimming import trim_gas_generator
 from estimators.fit import FitProblem, FitResult, quantile
@@ -70,12 +70,12 @@ def words(name: str) -> str:
     return {"gain": f"gain of the {sensor} sensor", "bias": f"bias of the {sensor} sensor"}[kind]
 
 
-@lru_cache(maxsize=8)
+@once
 def _engine() -> GasGenerator:
     return GasGenerator()
 
 
-@lru_cache(maxsize=16)
+@kept
 def engine_model(
     gg: GasGenerator,
     outputs: tuple[str, ...],

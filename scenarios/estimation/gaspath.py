@@ -24,7 +24,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +34,7 @@ from scipy.stats import chi2
 from apu_casadi.control import GovernorParameters
 from apu_casadi.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
+from apu_casadi.sharing import Parametric, derived, kept
 from apu_casadi.signals import Signal, Signals
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter
@@ -92,7 +92,7 @@ JUMP = 0.03  # standard deviation that a jump of the health factors is met with
 # ------------------------------------------------------------------------------ the model
 
 
-@lru_cache(maxsize=8)
+@kept
 def engine_function(gg: GasGenerator) -> ca.Function:
     """The cycle as Function (N, u, theta) -> (xdot, y, check, z) with exact, cheap derivatives.
 
@@ -133,7 +133,7 @@ _GAIN_DOCS = {
 }
 
 
-@lru_cache(maxsize=16)
+@kept
 def gas_path_model(
     gg: GasGenerator,
     *,
@@ -251,7 +251,7 @@ def gas_path_model(
 
 
 @dataclass(frozen=True, eq=False)
-class GasPathFilter:
+class GasPathFilter(Parametric):
     """A gas-path filter: model, sensors, prior; data are made ready by :meth:`recording`.
 
     Parameters
@@ -272,7 +272,7 @@ class GasPathFilter:
         """Whether the shaft power is measured."""
         return "PW" in self.model.u
 
-    @cached_property
+    @derived
     def gains(self) -> tuple[str, ...]:
         """Sensors whose gain error is a state."""
         return tuple(n[5:] for n in self.model.x.names if n.startswith("gain_"))

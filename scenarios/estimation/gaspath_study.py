@@ -21,7 +21,6 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -36,6 +35,7 @@ from apu_casadi.events import LoadChange
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.multirate import simulate_joint
+from apu_casadi.sharing import Parametric, derived, kept, once
 from apu_casadi.steadypoint import Limits
 from apu_casadi.trimming import trim_gas_generator
 from estimators.bounds import linearisations, posterior_bound, snapshot_bound
@@ -108,7 +108,7 @@ def variant(gg: GasGenerator, change: Mapping[str, Mapping[str, Any]]) -> GasGen
 # ------------------------------------------------------------------------------ truth
 
 
-@lru_cache(maxsize=8)
+@once
 def power_profile(drop: float = LOAD_DROP) -> np.ndarray:
     """Shaft power, W, in steps of 5 ms: 2 x 225 kW, then 2 x 100 kW from ``drop`` on.
 
@@ -198,19 +198,19 @@ def _run(call: Caller, carry: np.ndarray, inputs: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class MatchedTruth:
+class MatchedTruth(Parametric):
     """The filter's own model, with its own process noise, as truth."""
 
     gg: GasGenerator
 
-    @cached_property
+    @derived
     def _model(self) -> FilterModel:
         return gas_path_model(
             self.gg, gains=("J",), walks=(("N", N_WALK), *((n, HEALTH_WALK) for n in HEALTH)),
             governed=GovernorParameters(),
         )  # fmt: skip
 
-    @cached_property
+    @derived
     def _call(self) -> Caller:
         model = self._model
         gov, N_ref, nx = GovernorParameters(), self.gg.parameters.N, len(model.x)
@@ -254,12 +254,12 @@ class MatchedTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class EngineTruth:
+class EngineTruth(Parametric):
     """An engine that is not the filter's, with governor, in steps of 5 ms."""
 
     gg: GasGenerator
 
-    @cached_property
+    @derived
     def _call(self) -> Caller:
         gg, gov, dt = self.gg, GovernorParameters(), DT / FINE
         nz = len(gg.z)
@@ -423,7 +423,7 @@ def true_states(filt: GasPathFilter, truth: Truth, case: Case) -> np.ndarray:
     return np.array([values.get(n, zero) for n in filt.model.x.names])
 
 
-@lru_cache(maxsize=8)
+@kept
 def _all_estimated(model: FilterModel) -> FilterModel:
     # one model for all trajectories: what is built from it is kept with it
     return dataclasses.replace(model, consider=()) if model.consider else model

@@ -17,7 +17,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -29,6 +28,7 @@ from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.machine.ttsc import Ttsc
+from apu_casadi.sharing import kept, last
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.steadypoint import OperatingPoint
 from apu_casadi.trimming import trim_gas_generator
@@ -99,7 +99,7 @@ POWER_NOISES = (0.0025, 0.005, 0.01, 0.02, 0.05)
 # ---------------------------------------------------------------------- gas path
 
 
-@lru_cache(maxsize=16)
+@last(16)
 def _steady(point: str, gg: GasGenerator) -> OperatingPoint:
     if point not in POINTS:
         raise ParameterError(f"unknown point {point!r} {nearest(point, POINTS)}")
@@ -107,7 +107,7 @@ def _steady(point: str, gg: GasGenerator) -> OperatingPoint:
     return trim_gas_generator(gg, {"N": gg.parameters.N, "PW": conditions.pop("PW")}, **conditions)
 
 
-@lru_cache(maxsize=16)
+@last(16)
 def _derivatives(point: str, gg: GasGenerator) -> tuple[OperatingPoint, np.ndarray, np.ndarray]:
     """Return the point, dy/d unknown of every output and dPW/d unknown, own units."""
     at = _steady(point, gg)
@@ -637,7 +637,7 @@ class Severity:
     ratio: float
 
 
-@lru_cache(maxsize=4)
+@kept
 def _shunt(machine: Generator) -> ca.Function:
     """Function (log mu, log k_rf, kappa, V, w, t) -> current of the shunt, A, steady state.
 

@@ -11,12 +11,12 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apu_casadi.errors import ScenarioError
+from apu_casadi.sharing import last
 from scenarios import registry
 from scenarios.estimation.electrical.faults import ridge
 from scenarios.estimation.electrical.signals import PHASES
@@ -59,7 +59,7 @@ def truth(
     return _simulated(s, progress)
 
 
-@lru_cache(maxsize=1)
+@last(1)
 def _kept(name: str) -> xr.Dataset:
     return _simulated(registry.get(name), None)
 

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu
+from apu_casadi.sharing import Parametric, kept
 from apu_casadi.signals import Signal, Signals
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter
@@ -52,7 +52,7 @@ _FRESH = Signal("fresh", "1", "1 in the step before a fuel reading", default=0.0
 
 
 @dataclass(frozen=True, eq=False)
-class Monolithic:
+class Monolithic(Parametric):
     """The filter of the whole unit.
 
     Parameters
@@ -102,7 +102,7 @@ class Monolithic:
         return extended_kalman_filter(self.model, prior, data, full=True, backend=backend)
 
 
-@lru_cache(maxsize=4)
+@kept
 def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter) -> Monolithic:
     """Make the filter of the whole unit from its two parts.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from apu_casadi.errors import DataError, ParameterError, nearest
 from apu_casadi.machine.parameters import MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE
+from apu_casadi.sharing import Parametric, last
 from apu_casadi.terminalmodel import (
     FLUXES,
     INPUTS,
@@ -60,7 +60,7 @@ GAINS = ("none", "estimate", "consider")
 
 
 @dataclass(frozen=True, eq=False)
-class ElectricalFilter:
+class ElectricalFilter(Parametric):
     """The filter's model with what makes priors and recordings for it.
 
     Parameters
@@ -276,7 +276,7 @@ def _window_starts(t: np.ndarray, window: float, start: float | None) -> np.ndar
     return np.flatnonzero(np.diff(k, prepend=-np.inf))
 
 
-@lru_cache(maxsize=32)
+@last(32)
 def electrical_filter(
     machine: MachineParameters | None = None,
     *,

@@ -44,6 +44,7 @@ import numpy as np
 from apu_casadi.machine.parameters import MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE, Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.wrsg import Windings, currents, flux_rates
+from apu_casadi.sharing import remade
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.terminalmodel import (
     ANGLE,
@@ -137,6 +138,7 @@ def _exponential(z: Any) -> tuple[Any, Any, Any, Any]:
     return (ca.exp(z), *weights)
 
 
+@remade
 def electrical_model(
     p: MachineParameters,
     sensors: SensorSet,

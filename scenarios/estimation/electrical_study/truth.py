@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from apu_casadi.generator import Generator
 from apu_casadi.machine.load import Load
 from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.wrsg import Windings, currents, flux_rates
+from apu_casadi.sharing import last, once
 from apu_casadi.terminalmodel import FLUXES
 from scenarios.estimation.electrical.filter import ElectricalFilter
 from scenarios.estimation.electrical.model import held
@@ -71,7 +71,7 @@ class Truth:
         return s
 
 
-@lru_cache(maxsize=16)
+@last(16)
 def generator_truth(
     load: Load,
     duration: float,
@@ -109,7 +109,7 @@ def generator_truth(
     return Truth(grid - start, values)
 
 
-@lru_cache(maxsize=8)
+@last(8)
 def unit_truth(duration: float, events: tuple[Any, ...], *, load: Load = FULL) -> Truth:
     """Simulate the whole unit (speed moves, a ramp in each ``UNIT_STEP``) and sample a generator.
 
@@ -224,7 +224,7 @@ def chances(
     return Truth(truth.t, values)
 
 
-@lru_cache(maxsize=8)
+@once
 def _flux_matrix(w_r: float) -> np.ndarray:
     """d(d lambda/dt)/d lambda on the rotor's axes at a speed, 1/s, shape (6, 6)."""
     p = Generator().machine

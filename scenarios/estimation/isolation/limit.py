@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -11,6 +10,7 @@ import numpy as np
 from scipy import special
 
 from apu_casadi.gasgenerator import GasGenerator
+from apu_casadi.sharing import kept
 from apu_casadi.trimming import Limits, trim_gas_generator
 from estimators.detection.signatures import LinearFilter, linear_filter
 from estimators.model import FilterModel
@@ -52,7 +52,7 @@ def linear_problem(
     )  # fmt: skip
 
 
-@lru_cache(maxsize=4)
+@kept
 def _jacobians(model: FilterModel) -> ca.Function:
     x, u, p, w, dt = model.symbols()
     x1, y = model.transition(x, u, p, w, dt)[0], model.output(x, u, p, w)[0]

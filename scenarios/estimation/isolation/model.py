@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.gasgenerator import GasGenerator
+from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from estimators.belief import Belief
 from estimators.detection.signatures import Jump
@@ -30,7 +30,7 @@ JUMPS = (*(Jump("state", n) for n in FAULTS[:-1]), Jump("state", "size_1"))
 """One for each of ``FAULTS``; direction 1 is the loss."""
 
 
-@lru_cache(maxsize=4)
+@kept
 def jump_model(gg: GasGenerator) -> FilterModel:
     """The gas-path filter's model with two jumps of any direction, and the severity as an output.
 
@@ -76,7 +76,7 @@ def jump_model(gg: GasGenerator) -> FilterModel:
     )  # fmt: skip
 
 
-@lru_cache(maxsize=8)
+@kept
 def model_of(gg: GasGenerator, N_walk: float) -> FilterModel:
     """Return the model with process noise of the speed, rad/s/sqrt(s)."""
     return jump_model(gg).with_walk({"N": N_walk})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from apu_casadi.apu import Apu
 from apu_casadi.errors import ParameterError
 from apu_casadi.gasgenerator import GasGenerator
+from apu_casadi.sharing import once
 from scenarios.estimation.sensors import GAS_PATH, SensorSet
 
 __all__ = [
@@ -175,7 +175,7 @@ SNAPSHOT = Protocol(before=0.0, spread=0.0)
 """A fault that is there from the beginning: a unit of which no history is known."""
 
 
-@lru_cache(maxsize=1)
+@once
 def severity_of_loss() -> float:
     """Severity h of a TTSC whose loss, in both generators over their efficiency, is ``P_RATED``.
 

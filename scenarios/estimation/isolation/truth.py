@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -14,6 +13,7 @@ from apu_casadi.backend import backend_in_use, compiled, mapped
 from apu_casadi.control import GovernorParameters
 from apu_casadi.errors import EstimationError
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.sharing import kept
 from apu_casadi.trimming import Limits, trim_gas_generator
 from scenarios.estimation.isolation.problem import (
     CLASSES,
@@ -52,7 +52,7 @@ class Windows:
     ambient: np.ndarray
 
 
-@lru_cache(maxsize=4)
+@kept
 def _engine(gg: GasGenerator, _backend: str) -> Callable[..., tuple[np.ndarray, ...]]:
     """The engine for many windows at once: (z0, N, u, theta) -> (dN/dt, P3, T3, T5, z, check)."""
     c = gg.cycle
