@@ -275,6 +275,8 @@ def simulate_joint(
             if noise.N or hook is not None:
                 x = x + noise.N * rng.standard_normal(1)
                 if hook is not None:
+                    # a hook may simulate the same unit, and views of buffers would change
+                    means, w = means.copy(), w.copy()
                     x = np.asarray(hook(k, x), float).reshape(1)
                 y, z = gg.output(x, u, theta, z0=z)
         except SimulationError as error:

@@ -10,6 +10,7 @@ import contextlib
 import json
 import math
 import os
+import threading
 from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
@@ -164,7 +165,7 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     DataError : the file cannot be written there.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as f:

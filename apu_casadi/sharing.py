@@ -174,7 +174,7 @@ def _entered(store: Store, which: Hashable, key: Hashable, make: Callable[[], T]
     with _TABLES:
         table = store.results.setdefault(which, OrderedDict())
         if key in table:
-            return table[key]  # type: ignore[no-any-return]
+            return table[key]
     made = make()
     with _TABLES:
         made = table.setdefault(key, made)
