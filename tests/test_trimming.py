@@ -118,7 +118,7 @@ REFUSED = {
         r"off the compressor map by 0\.\d+ table spans, limit 0.25 \(relative corrected speed 1\.5",
     ),
     "cold and high": (
-        {"N": N_DESIGN, "PW": 2e3}, {"altitude": 12e3, "dT_isa": -30.0}, Status.OFF_MAP,
+        {"N": N_DESIGN, "PW": 2e3}, {"altitude": 14e3, "dT_isa": -45.0}, Status.OFF_MAP,
         r"off the compressor map by .* table 0\.400 to 1\.100",
     ),
     "power that the fuel cannot give": (
