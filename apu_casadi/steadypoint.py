@@ -158,6 +158,8 @@ class OperatingPoint:
     values : outputs by name (SI).
     residual : re-evaluated max-norm of all equations, specifications included.
     iterations : Newton steps, over all continuation steps.
+    second : another steady point with the same two quantities within the limits, if one was found;
+        only for pairs that leave the speed open (see :mod:`apu_casadi.trimbranch`).
     """
 
     x: np.ndarray
@@ -168,6 +170,7 @@ class OperatingPoint:
     values: dict[str, float]
     residual: float
     iterations: int
+    second: OperatingPoint | None = None
 
     def __getitem__(self, name: str) -> float:
         """Return an output by name."""

@@ -8,7 +8,8 @@ with the design point; where that fails, everything is moved there from the desi
 lies beyond a limit, or does not exist, is refused with its reason and the best point reached.
 
 Some pairs have two solutions: shaft power and fuel flow meet at two speeds where efficiency has a
-maximum between them.  The one found is the one that Newton's method reaches from the design speed.
+maximum between them.  The answer is the one on the design point's side of that maximum, and it
+holds the other one as ``second`` (:mod:`apu_casadi.trimbranch`).
 
 :func:`trim_gas_generator` solves one point, :func:`maximum_power` one at a temperature limit; for
 many points see :mod:`apu_casadi.trimbatch`.  What is asked and answered, and the solver, are in
@@ -41,6 +42,7 @@ from apu_casadi.steadypoint import (
     speed_text,
     stop_text,
 )
+from apu_casadi.trimbranch import Roots, may_fold, settle
 from apu_casadi.trimkernel import AMBIENT, N_FIRST, NZ
 from apu_casadi.trimsolver import (
     continue_one,
@@ -113,7 +115,14 @@ def trim_gas_generator(
             text = stop_text(gg, limits, status, there, reached)
             point = _point(gg, w, y, on_the_way(solver, p, reached), residual, total)
             _refuse(gg, names, fixed, status, text, point, reached)
-    point = _point(gg, w, y, p, residual, total)
+    second = None
+    if may_fold(spec):
+        one = Roots(w[:, None], y[:, None], np.array([residual]))
+        first, other = settle(solver, limits, one, p[:, None])
+        w, y, residual = first.w[:, 0], first.y[:, 0], float(first.residual[0])
+        if np.isfinite(other.residual[0]):
+            second = _point(gg, other.w[:, 0], other.y[:, 0], p, float(other.residual[0]), 0)
+    point = dataclasses.replace(_point(gg, w, y, p, residual, total), second=second)
     text = limit_text(gg, limits, named(gg, y, w))
     if text:
         _refuse(gg, names, fixed, limit_status(gg, limits, y[:, None])[0], text, point, 1.0)

@@ -30,6 +30,7 @@ LAYERS = (
     ("trimkernel",),
     ("steadypoint",),
     ("trimsolver",),
+    ("trimbranch",),
     ("trimming", "trimbatch", "propagation"),
     ("calibration", "meanstep"),
     ("control", "events"),

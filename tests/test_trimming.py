@@ -6,14 +6,24 @@ import threading
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from apu_casadi import backend
 from apu_casadi.errors import OperatingPointError, SignalError
 from apu_casadi.gasgenerator import RPM, GasGenerator
-from apu_casadi.steadypoint import MEANING, Limits, LoadLaw, Refusal, Status
+from apu_casadi.steadypoint import (
+    MEANING,
+    Limits,
+    LoadLaw,
+    Refusal,
+    Status,
+    limit_status,
+    specify,
+)
 from apu_casadi.trimbatch import performance_deck, trim_batch
 from apu_casadi.trimkernel import LAW, TrimKernel
 from apu_casadi.trimming import maximum_power, trim_gas_generator
+from apu_casadi.trimsolver import norms, solver_of
 from scenarios import trim_study
 
 N_DESIGN = 36050 * RPM
@@ -344,3 +354,82 @@ def test_the_map_tables_are_part_of_the_recipe(gg):
     )
     assert map_digest(changed) != map_digest(gg)
     assert map_digest(GasGenerator()) == map_digest(gg)
+
+
+TWO = [{"PW": 480e3, "Wf": 0.0483}, {"PW": 490e3, "T4": 1200.0}]
+
+
+@pytest.mark.parametrize("fixed", TWO)
+def test_two_steady_points_are_told_and_the_designs_side_counts(gg, fixed):
+    """Shaft power over speed has a maximum, scanned here with the speed fixed: the two speeds of
+    equal power are the two answers, and the first is on the design speed's side of the maximum.
+    """
+    held = next(n for n in fixed if n != "PW")
+    N = gg.parameters.N * np.linspace(0.8, 1.26, 93)
+    scan = trim_batch(gg, {"N": N, held: fixed[held]}, dT_isa=5.0)
+    gap = np.where(scan.ok, scan["PW"], np.nan) - fixed["PW"]
+    crossings = N[:-1][gap[:-1] * gap[1:] < 0]
+    point = trim_gas_generator(gg, fixed, dT_isa=5.0)
+    assert crossings.size == 2 and point.second is not None
+    speeds = sorted((point["N"], point.second["N"]))
+    assert_allclose(speeds, crossings + 0.5 * (N[1] - N[0]), atol=0.6 * (N[1] - N[0]))
+    top = N[np.nanargmax(gap)]
+    d = trim_batch(
+        gg, {"N": gg.parameters.N * np.array([0.999, 1.001]), held: gg.design.values.get(held)},
+        dT_isa=5.0,
+    )  # fmt: skip
+    design_rises = d["PW"][1] > d["PW"][0]
+    assert (point["N"] < top) == design_rises
+    for q in (point, point.second):
+        assert q.residual < 1e-9
+        for name, value in fixed.items():
+            assert q[name] == pytest.approx(value, rel=1e-9)
+    batch = trim_batch(gg, {k: np.full(3, v) for k, v in fixed.items()}, dT_isa=5.0)
+    assert_allclose(batch["N"], point["N"], rtol=1e-9)
+    assert_allclose(batch.N_second, point.second["N"], rtol=1e-9)
+    assert_allclose(batch.to_dataset()["N_second"], point.second["N"], rtol=1e-9)
+
+
+def test_the_second_point_counts_where_the_first_is_beyond_a_limit(gg):
+    """A least margin that only one of two points keeps, then one that none of two keeps."""
+    fixed = {"PW": 480e3, "Wf": 0.0483}
+    both = trim_gas_generator(gg, fixed, dT_isa=5.0)
+    assert both.second is not None and both["SM"] > both.second["SM"]
+    limits = Limits(SM_min=both["SM"] + 1e-3)
+    with pytest.raises(Refusal, match="beyond surge"):
+        trim_gas_generator(gg, fixed, dT_isa=5.0, limits=limits)
+    hot = trim_gas_generator(gg, {"PW": 490e3, "T4": 1200.0}, dT_isa=5.0)
+    assert hot.second is not None and hot.second["SM"] > hot["SM"]
+    wide = Limits(SM_min=hot["SM"] + 1e-3)
+    only = trim_gas_generator(gg, {"PW": 490e3, "T4": 1200.0}, dT_isa=5.0, limits=wide)
+    assert only["N"] == pytest.approx(hot.second["N"], rel=1e-9) and only.second is None
+
+
+def test_multiple_starts_give_one_point_or_the_answer_tells_of_two(gg):
+    """100 points for each pair from six starts around the root, over health, ambient and speed.
+
+    With N fixed there is one root: before the outermost speed line kept its shape, 1 to 2 % of
+    these had two.
+    """
+    n, rng = 100, np.random.default_rng(7)
+    ambient = {"altitude": rng.uniform(0, 9e3, n), "dT_isa": rng.uniform(-60, -20, n)}
+    theta = {k: rng.uniform(0.85, 1.1, n) for k in gg.THETA.names}
+    PW, N = rng.uniform(0, 3e5, n), N_DESIGN * rng.uniform(0.93, 1.04, n)
+    for fixed in (
+        {"N": N, "PW": PW}, {"N": N, "Wf": rng.uniform(0.01, 0.04, n)},
+        {"N": N, "T5": rng.uniform(450, 900, n)}, {"PW": PW, "Wf": rng.uniform(0.015, 0.04, n)},
+    ):  # fmt: skip
+        batch = trim_batch(gg, fixed, theta=theta, **ambient)
+        spec, _, _ = specify(gg, fixed)
+        solver = solver_of(gg, spec)
+        at = np.flatnonzero(batch.ok)
+        assert at.size > 10
+        p, s = batch.p[:, at], solver.kernel.sought(batch.w[:, at])
+        speed = len(gg.z)
+        for trial in range(6):
+            start = s + rng.normal(0, 0.05 * (1 + trial), s.shape)
+            w, y, r, _, _ = solver.many("warm", start, p, n_threads=1, compile=False)
+            good = (norms(r) < 1e-9) & (limit_status(gg, Limits(), y) == Status.SOLVED)
+            same = np.abs(y[gg.Y.index("T4")] / batch.y[gg.Y.index("T4"), at] - 1) < 1e-6
+            told = np.abs(w[speed] / batch.N_second[at] - 1) < 1e-6
+            assert np.all(~good | same | told), fixed
