@@ -127,7 +127,7 @@ class _March:
             held = next((n for n in WITH_SPEED if n in spec), next(n for n in spec if n != LAW))
         self.row = DIRECT["N"] if self.march == "N" else Z_NAMES.index("T4")
         self.open = next(n for n in spec if n != held)
-        self.aside = solver_of(solver.gg, tuple(sorted((self.march, held))))  # type: ignore[arg-type]
+        self.aside = solver_of(solver.gg, tuple(sorted((self.march, held))))
         self.march_first = self.aside.kernel.spec[0] == self.march
         self.at: dict[str, slice] = {}
         k = N_FIRST
@@ -136,11 +136,8 @@ class _March:
             k = self.at[n].stop
         self.held = p[self.at[held]]
         self.direction = direction
-        self.lo, self.hi, self.unit = (
-            _speeds(solver.gg, limits, p)
-            if self.march == "N"
-            else _temperatures(solver.gg, limits, p)
-        )
+        span = _speeds if self.march == "N" else _temperatures
+        self.lo, self.hi, self.unit = span(solver.gg, limits, p)
 
     def _solve(self, i: np.ndarray, x: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return w, the gap of the open quantity, and whether solved, at speeds or T4 ``x``."""
