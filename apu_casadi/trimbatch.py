@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi.checked import array
 from apu_casadi.errors import SignalError, nearest
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.steadypoint import (
@@ -199,7 +200,8 @@ def trim_batch(
     if wrong:
         raise SignalError("; ".join(wrong))
     try:
-        arrays = [np.asarray(v, dtype=float) for v in (*given, *values)]
+        labels = (*AMBIENT, *gg.THETA.names, *[", ".join(names)] * len(values))
+        arrays = [array(n, v) for n, v in zip(labels, (*given, *values), strict=True)]
         shape = np.broadcast_shapes(*(a.shape for a in arrays))
     except (TypeError, ValueError) as e:
         raise SignalError(f"batch of {', '.join(names)}: {e}") from None
@@ -323,7 +325,7 @@ def performance_deck(
     import xarray as xr
 
     axes = {"altitude": altitude, "Mach": Mach, "dT_isa": dT_isa, "PW": PW}
-    grid = {k: np.atleast_1d(np.asarray(v, dtype=float)) for k, v in axes.items()}
+    grid = {k: np.atleast_1d(array(k, v)) for k, v in axes.items()}
     mesh = dict(zip(grid, np.meshgrid(*grid.values(), indexing="ij", sparse=True), strict=True))
     N = gg.parameters.N if N is None else N
     batch = trim_batch(

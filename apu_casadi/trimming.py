@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.checked import number
 from apu_casadi.errors import SignalError
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator, GasGeneratorState
 from apu_casadi.steadypoint import (
@@ -81,15 +82,18 @@ def trim_gas_generator(
         reached.  It is an OperatingPointError.
     """
     limits = Limits() if limits is None else limits
+    try:
+        fixed = {
+            n: v if isinstance(v, LoadLaw) else number(f"fixed {n}", v) for n, v in fixed.items()
+        }
+    except SignalError as e:
+        raise SignalError(f"{e}; fixed values must be numbers") from None
     spec, values, names = specify(gg, fixed)
     th = gg.THETA.pack(theta)
     u = gg.U.pack({"Wf": gg.design.values["Wf"], "PW": 0.0, **ambient})
     if u.ndim > 1 or th.ndim > 1:
         raise SignalError("one point takes numbers; for arrays use trim_batch")
-    try:
-        asked = np.array([float(v) for v in values])
-    except (TypeError, ValueError):
-        raise SignalError(f"fixed values must be numbers, got {dict(fixed)}") from None
+    asked = np.array([float(v) for v in values])
     if not np.all(np.isfinite(asked)):
         raise SignalError(f"fixed values must be finite, got {dict(fixed)}")
     p = np.concatenate([u[2:], th, asked])

@@ -17,7 +17,7 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # Bottom first.  A module may import the layers below its own, and its neighbours only if NEIGHBOURS
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
-    ("errors",),
+    ("errors", "checked"),
     ("signals", "parameters"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above
@@ -41,6 +41,7 @@ LAYERS = (
     ("linearisation", "monolithic"),
 )
 NEIGHBOURS = {
+    "checked": {"errors"},
     "components": {"components"},
     "machine": {"machine"},
 }
@@ -71,7 +72,9 @@ ONLY = {
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 # apu_casadi/__init__.py is the front door: it names modules, and no module comes in through it.
 # Estimators know f, g and names; of the solvers only how to make a step of f and to compile it.
-ESTIMATORS = {"statespace", "signals", "results", "errors", "backend", "discretisation"}
+ESTIMATORS = {
+    "statespace", "signals", "results", "errors", "checked", "backend", "discretisation",
+}  # fmt: skip
 
 RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}
 
