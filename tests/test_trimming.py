@@ -433,3 +433,38 @@ def test_multiple_starts_give_one_point_or_the_answer_tells_of_two(gg):
             same = np.abs(y[gg.Y.index("T4")] / batch.y[gg.Y.index("T4"), at] - 1) < 1e-6
             told = np.abs(w[speed] / batch.N_second[at] - 1) < 1e-6
             assert np.all(~good | same | told), fixed
+
+
+@pytest.mark.parametrize(
+    ("N", "P3", "ambient", "health"),
+    [
+        (3350.677558, 736038.0158, (2830.130175, 0.6842347951, -31.97273157, 0.0),
+         (0.8901993396, 1.0818551427, 1.0471951976, 0.9366392366)),
+        (3482.645343, 634070.5808, (3242.741280, 0.8498429929, 15.54089503, 0.0),
+         (1.0165626904, 1.0068769105, 0.8998637637, 0.8806726125)),
+        (3775.147172, 737225.2348, (1100.928124, 0.0274476564, 34.27994341, 0.0312759814),
+         (0.9884228667, 1.0979316490, 0.8899573487, 0.9158323335)),
+    ],
+)  # fmt: skip
+def test_a_pressure_beyond_the_top_of_a_speed_line_is_no_balance(gg, N, P3, ambient, health):
+    """Three of 100 000 random points ended as "not converged": at the highest P3 of the speed line.
+
+    The scan over T4 at the place where the way ended shows the maximum; no other equation is asked.
+    """
+    names = ("altitude", "Mach", "dT_isa", "war")
+    given, theta = (
+        dict(zip(names, ambient, strict=True)),
+        dict(zip(gg.THETA.names, health, strict=True)),
+    )
+    with pytest.raises(Refusal, match="an extreme value near the best point") as e:
+        trim_gas_generator(gg, {"N": N, "P3": P3}, theta=theta, **given)
+    assert e.value.status == Status.NO_BALANCE
+    assert trim_batch(gg, {"N": N, "P3": P3}, theta=theta, **given).status[0] == Status.NO_BALANCE
+    end = e.value.point
+    factors = np.linspace(0.95, 1.05, 41)
+    scan = trim_batch(
+        gg, {"N": end["N"], "T4": factors * end["T4"]},
+        theta=dict(zip(gg.THETA.names, end.theta, strict=True)), limits=Limits.none(),
+        **dict(zip(names, end.u[2:], strict=True)),
+    )  # fmt: skip
+    assert abs(np.nanargmax(scan["P3"]) - 20) <= 1
