@@ -17,7 +17,7 @@ of a compressor rise with speed.
 **Surge line.**  ln PR over ln W by its neighbours, and rising.
 
 A strange map that is sound can be accepted knowingly: ``check=False`` in
-:func:`apu_casadi.mapfiles.read_map` or :class:`~apu_casadi.mapfiles.MapTable`.
+:func:`apu_casadi.mapfiles.read_map` or :class:`~apu_casadi.maptable.MapTable`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BETA_LINE = {"W": 0.05, "PR": 0.05, "eta": 0.06}  # of a beta line's mean
 SURGE = 0.1  # of the surge line's ln PR
 EDGE = 1.6  # a cell's tolerance is so many times larger at an edge, where predictions extrapolate
 EDGE_LINE = 2.5  # likewise a line's
-SCATTER = 5.0
+SCATTER = 6.0
 ORDER = 0.01  # of ln W or ln PR: a fall over speed that is no fall
 
 
@@ -102,7 +102,7 @@ def _predict(x: np.ndarray, v: np.ndarray, i: int, near: list[int]) -> np.ndarra
 
 
 def deviations(N: np.ndarray, beta: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smaller of the deviations along both axes, 0 where they disagree, and EDGE factors."""
+    """Return the smaller deviations of both axes, 0 where they disagree, and EDGE factors."""
     (dN, edge_N), (db, edge_b) = along(N, v), along(beta, v.T)
     db = db.T
     d = np.where(np.abs(dN) < np.abs(db), dN, db)

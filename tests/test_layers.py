@@ -18,11 +18,12 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
     ("errors", "checked"),
-    ("signals", "parameters"),
+    ("signals", "parameters", "mapcheck"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
-    ("gas", "mapfiles"),
+    ("gas", "maptable"),
+    ("mapfiles",),
     ("atmosphere", "maps"),
     ("components", "machine"),
     ("cycle",),
