@@ -29,6 +29,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi.checked import number
 from apu_casadi.cycle import reynolds_index
 from apu_casadi.errors import (
     ApuError,
@@ -102,7 +103,7 @@ class CalibrationPoint:
                 raise SignalError(
                     f"{self.name}: measured {n} must be (value, standard deviation), got {pair!r}"
                 )
-            value, sigma = pair
+            value, sigma = (number(f"{self.name}: measured {n}", v) for v in pair)
             if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0):
                 raise SignalError(
                     f"{self.name}: measured {n} = {value!r} with standard deviation {sigma!r}: "
@@ -111,7 +112,7 @@ class CalibrationPoint:
             if n in self.fixed:
                 raise SignalError(f"{self.name}: {n} is both held and measured")
         for n, v in {**self.fixed, **self.ambient, **self.health}.items():
-            if not math.isfinite(v):
+            if not math.isfinite(number(f"{self.name}: {n}", v)):
                 raise SignalError(f"{self.name}: {n} = {v!r} must be finite")
 
     def trim(self, gg: GasGenerator) -> OperatingPoint:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi import checked
 from apu_casadi.errors import ScenarioError, nearest
 
 if TYPE_CHECKING:
@@ -46,9 +47,10 @@ def number(
     ScenarioError : not a number (booleans are none), not finite, or outside the interval.
     """
     u = f" {unit}" if unit else ""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScenarioError(f"{what}: a number is expected, got {value!r}")
-    x = float(value)
+    try:
+        x = checked.number(what, value, error=ScenarioError)
+    except ScenarioError:
+        raise ScenarioError(f"{what}: a number is expected, got {value!r}") from None
     if not math.isfinite(x):
         raise ScenarioError(f"{what}: must be finite, got {x!r}")
     if x < lo or x > hi or (open_lo and x <= lo):
@@ -100,10 +102,14 @@ class Ambient:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        number(self.altitude, "altitude", lo=-500.0, hi=20000.0, unit="m")
-        number(self.Mach, "Mach", lo=0.0, hi=0.999)
-        number(self.dT_isa, "dT_isa", lo=-80.0, hi=60.0, unit="K")
-        number(self.war, "war", lo=0.0, hi=0.1)
+        values = {
+            "altitude": number(self.altitude, "altitude", lo=-500.0, hi=20000.0, unit="m"),
+            "Mach": number(self.Mach, "Mach", lo=0.0, hi=0.999),
+            "dT_isa": number(self.dT_isa, "dT_isa", lo=-80.0, hi=60.0, unit="K"),
+            "war": number(self.war, "war", lo=0.0, hi=0.1),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
 
 def _time(t: Any, what: str) -> None:

@@ -29,6 +29,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi import simulation
+from apu_casadi.checked import number
 from apu_casadi.errors import OperatingPointError, ParameterError, SignalError, nearest
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import ttsc, wrsg
@@ -96,7 +97,7 @@ class MeasurementNoise:
     def __post_init__(self) -> None:
         """Refuse standard deviations that are negative or not finite."""
         for name in ("sigma_i", "sigma_v", "sigma_V_fd"):
-            value = getattr(self, name)
+            value = number(f"MeasurementNoise.{name}", getattr(self, name), error=ParameterError)
             if not (math.isfinite(value) and value >= 0):
                 raise ParameterError(f"MeasurementNoise.{name} must be >= 0, got {value!r}")
 
@@ -303,7 +304,11 @@ class Generator(Parametric):
             residual above 1e-6 1/s.
         """
         p, e = self.machine, self.exciter
-        w_r = p.w_rated if w_r is None else w_r
+        w_r = p.w_rated if w_r is None else number("w_r", w_r, error=OperatingPointError)
+        V_t, V_ref = (
+            None if v is None else number(n, v, error=OperatingPointError)
+            for n, v in (("V_t", V_t), ("V_ref", V_ref))
+        )
         if not (math.isfinite(w_r) and w_r > 0):
             raise OperatingPointError(f"w_r must be > 0 rad/s (electrical), got {w_r!r}")
         if V_t is not None and V_ref is not None:

@@ -25,6 +25,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu, JointPoint
+from apu_casadi.checked import array
 from apu_casadi.errors import ApuError, OperatingPointError, SignalError
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator, GeneratorPoint
@@ -358,7 +359,7 @@ def linearise(
 
 
 def _vector(ss: StateSpace, label: str, signals: Signals, value: Any) -> np.ndarray:
-    a = np.asarray(value, dtype=float).reshape(-1)
+    a = array(f"{ss.name}: {label}", value).reshape(-1)
     if a.shape != (len(signals),):
         raise SignalError(
             f"{ss.name}: {label} must have shape ({len(signals)},) for {signals!r}, got "

@@ -36,169 +36,26 @@ PR = min + beta (max - min).  The Reynolds line is kept in the table's ``source`
 from __future__ import annotations
 
 import csv
+import dataclasses
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from apu_casadi.errors import DataError, MapError, nearest
-from apu_casadi.sharing import Parametric, once
+from apu_casadi.mapcheck import Finding
+from apu_casadi.maptable import GRID_COLUMNS, SURGE_COLUMNS, MapTable, fault, found_text
+from apu_casadi.sharing import once
 
-KINDS = ("compressor", "turbine")
-GRID_COLUMNS = ("N", "beta", "W", "PR", "eta")
-SURGE_COLUMNS = ("W_surge", "PR_surge")
 SHIPPED = ("axi5", "lpt2269")
-MIN_LINES = 4  # a natural cubic spline of fewer points says little about a map
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MapTable(Parametric):
-    """The table of a component map, checked on construction.  Tables compare by their content.
-
-    Parameters
-    ----------
-    kind : ``"compressor"`` or ``"turbine"``.
-    N : relative corrected speeds, shape (n,), n >= 4, > 0, rising; any unit.
-    beta : auxiliary coordinate, shape (m,), m >= 4, rising; any unit.
-    W : corrected flow, shape (n, m), > 0; any unit.
-    PR : pressure ratio, shape (n, m), > 1.
-    eta : isentropic efficiency, shape (n, m), in (0, 1].
-    surge_W, surge_PR : surge line, shape (k,) with k >= 4 and W rising; None for a turbine.
-    N_ref, beta_ref : the design point that the source gives, if it gives one.
-    name, source : text for messages and file headers.
-
-    Raises
-    ------
-    MapError : a shape, an order or a value is wrong; the message says where.
-    """
-
-    kind: str
-    N: np.ndarray
-    beta: np.ndarray
-    W: np.ndarray
-    PR: np.ndarray
-    eta: np.ndarray
-    surge_W: np.ndarray | None = None
-    surge_PR: np.ndarray | None = None
-    N_ref: float | None = None
-    beta_ref: float | None = None
-    name: str = "map"
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        """Copy the arrays, make them read-only, and check them."""
-        for name in (*GRID_COLUMNS, "surge_W", "surge_PR"):
-            value = getattr(self, name)
-            if value is not None:
-                try:
-                    a = np.array(value, dtype=float)
-                except (TypeError, ValueError):
-                    raise MapError(f"map {self.name!r}: {name} is not a table of numbers") from None
-                a.setflags(write=False)
-                object.__setattr__(self, name, a)
-        self._check()
-
-    def _content(self) -> tuple[object, ...]:
-        values = (getattr(self, f.name) for f in fields(self))
-        return tuple((v.shape, v.tobytes()) if isinstance(v, np.ndarray) else v for v in values)
-
-    def __eq__(self, other: object) -> bool:
-        """Whether all fields are the same, bit for bit."""
-        if self is other or not isinstance(other, MapTable):
-            return self is other
-        return hash(self) == hash(other) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        """Hash of the content, computed once."""
-        known: int | None = self.__dict__.get("_hash")
-        if known is None:
-            known = self.__dict__["_hash"] = hash(self._content())
-        return known
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take up the fields, arrays read-only again."""
-        for value in state.values():
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
-        self.__dict__.update(state)
-
-    def _check(self) -> None:
-        who = f"map {self.name!r}"
-        if self.kind not in KINDS:
-            raise MapError(f"{who}: kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
-        for name, what in (("N", "speed"), ("beta", "beta")):
-            _check_axis(f"{who}: {name}", getattr(self, name), f"{what} lines")
-        if self.N[0] <= 0:
-            raise MapError(f"{who}: speeds must be > 0, the lowest is {self.N[0]:g}")
-        shape = (self.N.size, self.beta.size)
-        for name in ("W", "PR", "eta"):
-            a = getattr(self, name)
-            if a.shape != shape:
-                raise MapError(f"{who}: {name} has shape {a.shape}, N and beta ask for {shape}")
-            for i, j in np.ndindex(shape):
-                if fault := _fault(name, a[i, j]):
-                    at = f"N = {self.N[i]:g}, beta = {self.beta[j]:g}"
-                    raise MapError(f"{who}: {name} = {a[i, j]:g} at {at}; {fault}")
-        if self.kind == "turbine":
-            if self.surge_W is not None or self.surge_PR is not None:
-                raise MapError(f"{who}: a turbine has no surge line; leave it out")
-        elif self.surge_W is None or self.surge_PR is None:
-            raise MapError(f"{who}: a compressor needs a surge line (surge_W and surge_PR)")
-        else:
-            _check_axis(f"{who}: surge_W", self.surge_W, "surge points")
-            if self.surge_PR.shape != self.surge_W.shape:
-                raise MapError(
-                    f"{who}: {self.surge_W.size} surge flows, {self.surge_PR.size} pressure ratios"
-                )
-            for k, (W, PR) in enumerate(zip(self.surge_W, self.surge_PR, strict=True), 1):
-                for name, value in (("W", W), ("PR", PR)):
-                    if fault := _fault(name, value):
-                        raise MapError(f"{who}: surge {name} = {value:g} at point {k}; {fault}")
-        for name, axis in (("N_ref", self.N), ("beta_ref", self.beta)):
-            ref = getattr(self, name)
-            if ref is not None and not axis[0] <= ref <= axis[-1]:
-                raise MapError(
-                    f"{who}: {name} = {ref:g} is outside the table, {axis[0]:g} to {axis[-1]:g}"
-                )
-
-
-def _fault(column: str, value: float) -> str | None:
-    """Say what is wrong with one map value and what to do, or None."""
-    if not math.isfinite(value):
-        return "it must be a finite number: fill the cell or remove the whole line"
-    if column == "N" and value <= 0:
-        return "speeds must be > 0: remove that speed line"
-    if column in ("W", "W_surge") and value <= 0:
-        return "flow must be > 0: correct the value or remove the line"
-    if column in ("PR", "PR_surge") and value <= 1:
-        return (
-            "pressure ratio must be > 1: remove the beta or speed lines that reach it "
-            "(read_map with trim=True does so for the GasTurb/GSP layout)"
-        )
-    if column == "eta" and not 0 < value <= 1:
-        return "efficiency must be in (0, 1], as a fraction, not per cent"
-    return None
-
-
-def _check_axis(where: str, axis: np.ndarray, what: str) -> None:
-    if axis.ndim != 1 or axis.size < MIN_LINES:
-        raise MapError(f"{where}: at least {MIN_LINES} {what} needed, got {axis.size}")
-    if not np.all(np.isfinite(axis)):
-        raise MapError(f"{where}: value {int(np.argmin(np.isfinite(axis))) + 1} is not finite")
-    if np.any(np.diff(axis) <= 0):
-        k = int(np.argmax(np.diff(axis) <= 0))
-        raise MapError(
-            f"{where} must rise, but {axis[k + 1]:g} follows {axis[k]:g}: sort the lines"
-        )
-
-
-def read_map(path: str | Path, *, trim: bool = False) -> MapTable:
+def read_map(path: str | Path, *, trim: bool = False, check: bool = True) -> MapTable:
     """Read a map file; the layout (CSV or GasTurb/GSP) is told from the content.
 
     Parameters
@@ -206,6 +63,8 @@ def read_map(path: str | Path, *, trim: bool = False) -> MapTable:
     path : the file.
     trim : leave out the edge lines of a GasTurb/GSP map that reach PR <= 1, as in
         :func:`read_map_gasturb`; without effect on CSV files, whose rows are easily removed.
+    check : False accepts numbers that do not go with their neighbours (:mod:`apu_casadi.mapcheck`);
+        the table's ``source`` says so.
 
     Raises
     ------
@@ -216,9 +75,9 @@ def read_map(path: str | Path, *, trim: bool = False) -> MapTable:
     words = [text.strip().lower() for text in lines]
     first = next((w for w in words if w and not w.startswith("#")), "")
     if re.match(r"99(\s|$)", first) or any(_section(w) for w in words):
-        return read_map_gasturb(path, trim=trim)
+        return read_map_gasturb(path, trim=trim, check=check)
     if "," in first or ";" in first:
-        return read_map_csv(path)
+        return read_map_csv(path, check=check)
     raise DataError(
         f"{path}: neither a CSV map (header {','.join(GRID_COLUMNS)}) nor the GasTurb/GSP layout "
         f"(title '99 ...', sections such as 'Mass Flow'); see apu_casadi.mapfiles for both"
@@ -253,20 +112,34 @@ def _number(text: str, where: str) -> float:
     return value
 
 
-def _table(path: str | Path, **fields: object) -> MapTable:
-    """Construct the table; its errors name the file."""
+def _table(
+    path: str | Path, check: bool, where: Callable[[Finding], str], **fields: object
+) -> MapTable:
+    """Construct the table; its errors name the file, and ``where`` the line of a finding."""
     try:
-        return MapTable(**fields)  # type: ignore[arg-type]
+        table = MapTable(**fields, check=False)  # type: ignore[arg-type]
     except MapError as e:
         raise MapError(f"{path}: {e}") from None
+    found = table.implausible()
+    if not found:
+        return dataclasses.replace(table, check=True)
+    if check:
+        f = found[0]
+        raise MapError(f"{path}{where(f)}, {table.place(f)}: {found_text(table, f)}")
+    note = f"accepted with check=False: {len(found)} implausible values or lines, the worst at "
+    note += table.place(found[0])
+    source = "; ".join(t for t in (table.source, note) if t)
+    return dataclasses.replace(table, source=source)
 
 
 # ---------------------------------------------------------------------------------------------
 # CSV
 
 
-def read_map_csv(path: str | Path) -> MapTable:
+def read_map_csv(path: str | Path, *, check: bool = True) -> MapTable:
     """Read a map from the plain CSV layout that the module's text describes.
+
+    ``check`` as in :func:`read_map`.
 
     Raises
     ------
@@ -303,8 +176,8 @@ def read_map_csv(path: str | Path) -> MapTable:
         values = {}
         for name, cell in zip(columns, row, strict=True):
             values[name] = _number(cell, f"{path}, line {k}, column {name}")
-            if fault := _fault(name, values[name]):
-                raise MapError(f"{path}, line {k}, column {name}: {cell}; {fault}")
+            if wrong := fault(name, values[name]):
+                raise MapError(f"{path}, line {k}, column {name}: {cell}; {wrong}")
         wanted = GRID_COLUMNS if rows is grid else SURGE_COLUMNS
         rows.append((k, [values[name] for name in wanted]))
     if not grid:
@@ -323,8 +196,24 @@ def read_map_csv(path: str | Path) -> MapTable:
     for key in ("N_ref", "beta_ref"):
         text, k = meta.get(key.lower(), ("", 0))
         ref[key] = _number(text, f"{path}, line {k}, {key}") if text else None
+
+    def where(f: Finding) -> str:
+        if f.name == "PR_surge":
+            return f", line {surge[f.i][0]}"
+        first, last = max(f.i, 0) * beta.size + max(f.j, 0), -1
+        if f.j < 0:
+            last = first + beta.size - 1
+        elif f.i < 0:
+            last = first + (N.size - 1) * beta.size
+        lines = (
+            f"line {grid[first][0]}" if last < 0 else f"lines {grid[first][0]} to {grid[last][0]}"
+        )
+        return f", {lines}, column {f.name}"
+
     return _table(
         path,
+        check,
+        where,
         kind=meta["kind"][0].lower(),
         N=N,
         beta=beta,
@@ -459,7 +348,7 @@ class _Block:
         return self.lines[i * self.array.shape[1] + j]
 
 
-def read_map_gasturb(path: str | Path, *, trim: bool = False) -> MapTable:
+def read_map_gasturb(path: str | Path, *, trim: bool = False, check: bool = True) -> MapTable:
     """Read a map from the GasTurb/GSP text layout that the module's text describes.
 
     The file with a surge line and a pressure ratio table is a compressor, the one with minimum and
@@ -473,6 +362,7 @@ def read_map_gasturb(path: str | Path, *, trim: bool = False) -> MapTable:
         operating point of an engine needs and the surface cannot hold.  True leaves out the
         outermost speed or beta lines, each time the one with the largest share of such points,
         until none is left, and says so in the table's ``source``; False raises.
+    check : as in :func:`read_map`.
 
     Raises
     ------
@@ -547,8 +437,25 @@ def read_map_gasturb(path: str | Path, *, trim: bool = False) -> MapTable:
             surge_W, surge_PR = surge_W[1:], surge_PR[1:]
     rows, columns, note = _trimmed(N, beta, PR) if trim else (slice(None), slice(None), "")
     title = re.sub(r"^99\s*", "", head[0]) if head else ""
+
+    def place(f: Finding) -> str:
+        title = {"W": "Mass Flow", "eta": "Efficiency", "PR_surge": "Surge Line"}.get(
+            f.name, "Max Pressure Ratio" if turbine else "Pressure Ratio"
+        )
+        b = blocks[title]
+        if f.name == "PR_surge":
+            row, column = 1, b.array.shape[1] - surge_W.size + f.i if surge_W is not None else 1
+        elif title == "Max Pressure Ratio":
+            row, column = 1, 1 + (rows.start or 0) + max(f.i, 0)
+        else:
+            row = 1 + (rows.start or 0) + max(f.i, 0)
+            column = 1 + (columns.start or 0) + max(f.j, 0)
+        return f", line {b.where(row, column)}, section {title!r}"
+
     return _table(
         path,
+        check,
+        place,
         kind="turbine" if turbine else "compressor",
         N=N[rows],
         beta=beta[columns],
@@ -637,10 +544,10 @@ def _same_axis(
 
 def _check_values(path: str | Path, block: _Block, name: str) -> None:
     for i, j in np.ndindex(block.array.shape):
-        if i and j and (fault := _fault(name, float(block.array[i, j]))):
+        if i and j and (wrong := fault(name, float(block.array[i, j]))):
             raise MapError(
                 f"{path}, line {block.where(i, j)}, section {block.title!r}, row {i + 1}, column "
-                f"{j + 1}: {block.array[i, j]:g}; {fault}"
+                f"{j + 1}: {block.array[i, j]:g}; {wrong}"
             )
 
 

@@ -2,14 +2,20 @@
 
 **Surface.**  The logarithms of W, PR - 1 and eta are interpolated by a tensor product of natural
 cubic splines (de Boor, A Practical Guide to Splines, 2001, ch. IV) in N and beta, which passes
-through every table point and is twice continuously differentiable.  Outside the table the natural
-spline goes on as the straight line that it ends with, so all three change at a constant relative
-rate there: W and eta stay above 0 and PR above 1 wherever a solver looks, and no derivative up to
-the second jumps at the table's edge.  The continuation is a defined answer, not a measured one: how
-far outside a point lies is the output ``off``.
+through every table point and is twice continuously differentiable.  Outside the table W and eta
+stay above 0 and PR above 1 wherever a solver looks, and no derivative up to the second jumps at the
+table's edge.  The continuation is a defined answer, not a measured one: how far outside a point
+lies is the output ``off``.
 
-A natural spline with its straight continuation is itself a cubic spline on the table's knots plus
-one far knot on each side, so one B-spline holds table and continuation, without branches.  The far
+*In beta* each speed line goes on as the straight line that its logarithms end with.  *In N* the
+outermost speed line keeps its shape: the mean of its logarithms over the beta lines goes on
+straight, and what each beta line has above or below the mean turns level within one interval of the
+table.  If every beta line went on straight by itself, lines that approach each other towards high
+speed would cross a little outside; pressure ratio would then fall and rise again along one speed
+line, and one speed and power would have two steady points.
+
+A natural spline with such a continuation is itself a cubic spline on the table's knots plus a few
+outer knots on each side, so one B-spline holds table and continuation, without branches.  The far
 knots lie ``REACH`` table spans away (at 5 % of the lowest speed below the table's speeds, since
 speeds are positive); beyond them everything is held at its value there.
 
@@ -100,6 +106,41 @@ def spline_operator(x: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np
     return knots, np.linalg.solve(A, np.eye(n + 4)[:, :n])
 
 
+def level_operator(
+    x: np.ndarray, lo: float, hi: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return knots and the matrices to the coefficients of two continuations of a natural spline.
+
+    Parameters
+    ----------
+    x, lo, hi : as in :func:`spline_operator`.
+
+    Returns
+    -------
+    knots, shape (n + 12,): x, two more sites on each side, and lo and hi fourfold.
+    straight, level, shape (n + 8, n): coefficients are ``straight @ data`` or ``level @ data``.
+        Both are the natural spline between x[0] and x[-1].  The first goes on straight; the second
+        turns level within the width of the outermost interval, with continuous second derivative.
+
+    S'' is piecewise linear.  It is 0 at x[0], x[-1] and beyond the outer of the two sites; at the
+    inner one it is 0 for the straight continuation, and such that S' = 0 at the outer one for the
+    level continuation.
+    """
+    a = min(float(x[1] - x[0]), 0.5 * (float(x[0]) - lo))
+    b = min(float(x[-1] - x[-2]), 0.5 * (hi - float(x[-1])))
+    inner, outer = [x[0] - a / 2, x[-1] + b / 2], [x[0] - a, x[-1] + b]
+    knots = np.concatenate([[lo] * 4, [outer[0], inner[0]], x, [inner[1], outer[1]], [hi] * 4])
+    n = x.size
+    basis = BSpline(knots, np.eye(n + 8), 3)
+    slope, curvature = basis.derivative(1), basis.derivative(2)
+    common = [basis(x), curvature(np.array([lo, outer[0], x[0], x[-1], outer[1], hi]))]
+    made = []
+    for condition in (curvature(np.array(inner)), slope(np.array(outer))):
+        A = np.vstack([*common, condition])
+        made.append(np.linalg.solve(A, np.eye(n + 8)[:, :n]))
+    return knots, made[0], made[1]
+
+
 def _ends(x: np.ndarray) -> tuple[float, float]:
     reach = REACH * float(x[-1] - x[0])
     return float(x[0]) - reach, float(x[-1]) + reach
@@ -152,10 +193,12 @@ def _surface(table: MapTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     interval in N, interval in beta.
     """
     lo, hi = _ends(table.N)
-    knots_N, P_N = spline_operator(table.N, max(lo, LOWEST * float(table.N[0])), hi)
+    knots_N, straight, level = level_operator(table.N, max(lo, LOWEST * float(table.N[0])), hi)
     knots_b, P_b = spline_operator(table.beta, *_ends(table.beta))
     logs = np.log(np.stack([table.W, table.PR - 1, table.eta]))
-    C = np.einsum("ai,kij,bj->abk", P_N, logs, P_b)
+    mean = logs.mean(axis=2, keepdims=True)
+    along = np.einsum("ai,kij->akj", level, logs) + np.einsum("ai,kij->akj", straight - level, mean)
+    C = np.einsum("akj,bj->abk", along, P_b)
     breaks_N, along_N = local_cubics(knots_N, C)  # (power, i, b, k)
     breaks_b, both = local_cubics(knots_b, np.moveaxis(along_N, 2, 0))  # (power, j, power, i, k)
     cells = np.einsum("ljpik->kplij", both)

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.apu import Apu
+from apu_casadi.checked import number
 from apu_casadi.control import governor
 from apu_casadi.errors import ScenarioError, SignalError, SimulationError, nearest
 from apu_casadi.events import (
@@ -109,7 +110,7 @@ class Noise:
                     f"Noise.gas: unknown {name!r} {nearest(name, GasGenerator.Y.names)}"
                 )
         for name, s in {"N": self.N, "w1": self.w1, "w2": self.w2, **self.gas}.items():
-            if not (math.isfinite(s) and s >= 0):
+            if not 0 <= number(f"Noise.{name}", s) < math.inf:
                 raise SignalError(f"Noise.{name} must be a standard deviation >= 0, got {s!r}")
 
 
@@ -195,6 +196,12 @@ def simulate_joint(
     if exchange not in EXCHANGES:
         raise ScenarioError(f"exchange {exchange!r} {nearest(exchange, EXCHANGES)}")
     way = EXCHANGES[exchange]
+    duration, dt, rtol, atol = (
+        number(n, v, error=ScenarioError)
+        for n, v in (("duration", duration), ("dt", dt), ("rtol", rtol), ("atol", atol))
+    )
+    if waveform_dt is not None:
+        waveform_dt = number("waveform_dt", waveform_dt, error=ScenarioError)
     if solver not in SOLVERS:
         raise ScenarioError(f"solver {solver!r} {nearest(solver, SOLVERS)}")
     ambient = Ambient() if ambient is None else ambient

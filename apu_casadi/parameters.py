@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Self
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError, nearest
 
 
@@ -39,8 +40,10 @@ class Parameters:
                 continue
             value = getattr(self, f.name)
             where = f"{type(self).__name__}.{f.name} [{f.metadata['unit']}]"
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ParameterError(f"{where} must be a number, got {value!r}")
+            x = number(where, value, error=ParameterError)
+            if not isinstance(value, int | float):
+                value = x
+                object.__setattr__(self, f.name, value)
             if not math.isfinite(value):
                 raise ParameterError(f"{where} must be finite, got {value!r}")
             lo, hi = f.metadata["lo"], f.metadata["hi"]

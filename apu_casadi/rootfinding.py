@@ -139,3 +139,12 @@ def solve_bordered(A: Any, B: Any, k: int) -> Any:
     W_border, W_B = W[:, : n - k], W[:, n - k :]
     last = ca.solve(D - ca.mtimes(C, W_border), B[k:, :] - ca.mtimes(C, W_B))
     return ca.vertcat(W_B - ca.mtimes(W_border, last), last)
+
+
+def schur_sign(A: Any, k: int) -> Any:
+    """Return the sign of det(A) over det of its triangular block, for A as in `solve_bordered`.
+
+    That is the sign of the determinant of the Schur complement, an expression.
+    """
+    lower, border, C, D = A[:k, :k], A[:k, k:], A[k:, :k], A[k:, k:]
+    return ca.sign(ca.det(ca.densify(D - ca.mtimes(C, ca.solve(lower, border)))))

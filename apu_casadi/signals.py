@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi.checked import array
 from apu_casadi.errors import SignalError, nearest
 
 
@@ -142,12 +143,8 @@ class Signals(Sequence[Signal]):
             raise SignalError("; ".join(wrong))
         columns = []
         for s in self._signals:
-            try:
-                a = np.asarray(given.get(s.name, s.default), dtype=float)
-            except (TypeError, ValueError):
-                raise SignalError(
-                    f"{s.name} [{s.unit}] must be a number or a 1-D array, got {given[s.name]!r}"
-                ) from None
+            value = given.get(s.name, s.default)
+            a = array(f"{s.name} [{s.unit}]", value, what="a number or a 1-D array")
             if a.ndim > 1:
                 raise SignalError(f"{s.name}: scalar or 1-D array expected, got shape {a.shape}")
             if not np.all(np.isfinite(a)):

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.calling import Buffers
+from apu_casadi.checked import array
 from apu_casadi.errors import SignalError, SimulationError, nearest
 from apu_casadi.sharing import PerThread, Rebuilt, building, keep, twin
 from apu_casadi.statespace import StateSpace
@@ -278,7 +279,7 @@ def _reraise_interrupt(error: RuntimeError) -> None:
 
 
 def _vector(model: str, label: str, values: Any, n: int) -> np.ndarray:
-    a = np.asarray(values, dtype=float)
+    a = array(f"{model}: {label}", values)
     if a.shape != (n,):
         raise SignalError(f"{model}: {label} must have shape ({n},), got {a.shape}")
     if not np.all(np.isfinite(a)):
@@ -368,7 +369,7 @@ def simulate(
     ------
     SimulationError : the integration failed, or a switch lies outside the grid.
     """
-    t = np.asarray(t_grid, dtype=float)
+    t = array("t_grid", t_grid, error=SimulationError)
     if t.ndim != 1 or t.size < 2 or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
         raise SimulationError("t_grid must be a 1-D array of at least two increasing instants")
     plan = sorted(switches, key=lambda s: s.t)

@@ -6,6 +6,7 @@ Everything here speaks of one engine and of named quantities; how points are sol
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.checked import number
 from apu_casadi.errors import OperatingPointError, SignalError
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.trimkernel import AMBIENT, LAW, N_FIRST, NZ
@@ -42,6 +44,8 @@ class LoadLaw:
 
     def __post_init__(self) -> None:
         """Refuse values that are no law."""
+        for name in ("PW_ref", "N_ref", "exponent"):
+            object.__setattr__(self, name, number(f"load law: {name}", getattr(self, name)))
         if not all(map(math.isfinite, (self.PW_ref, self.N_ref, self.exponent))) or self.N_ref <= 0:
             raise SignalError(f"load law needs finite numbers and N_ref > 0, got {self!r}")
 
@@ -62,6 +66,8 @@ class Limits:
     Mach8_max : the fixed exit is modelled subsonic only.
     Wf_min : smallest fuel flow, kg/s; None is 0.5 % of the design value, where no flame burns any
         more: such a point is driven, not fired; *assumed*.
+    eta_max : highest efficiency of compressor and turbine, health factors included; above 1 a
+        component would be better than a reversible one.
     """
 
     off_map: float = 0.25
@@ -70,10 +76,22 @@ class Limits:
     T5_max: float = math.inf
     Mach8_max: float = 1.0
     Wf_min: float | None = None
+    eta_max: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no number, and NaN, which no point would break."""
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            if value is None and f.default is None:
+                continue
+            x = number(f"limit {f.name}", value)
+            if math.isnan(x):
+                raise SignalError(f"limit {f.name} must be a number, got nan")
+            object.__setattr__(self, f.name, x)
 
     @classmethod
     def none(cls) -> Limits:
-        """No limits but the model's own: a subsonic exit and fuel to burn."""
+        """No limits but the model's own: a subsonic exit, fuel to burn, efficiencies up to 1."""
         return cls(off_map=math.inf, SM_min=-math.inf, T4_max=math.inf, Wf_min=0.0)
 
     def rows(self, gg: GasGenerator) -> list[tuple[Status, str, float, float]]:
@@ -87,6 +105,8 @@ class Limits:
             (Status.SURGE, "SM", -1.0, self.SM_min),
             (Status.TEMPERATURE, "T4", 1.0, T4),
             (Status.TEMPERATURE, "T5", 1.0, self.T5_max),
+            (Status.EFFICIENCY, "eta_c", 1.0, self.eta_max),
+            (Status.EFFICIENCY, "eta_t", 1.0, self.eta_max),
             (Status.FUEL, "Wf", -1.0, Wf),
         ]
 
@@ -133,6 +153,7 @@ class Status(IntEnum):
     NO_BALANCE = 6
     UNEXPLAINED = 7
     INPUT = 8
+    EFFICIENCY = 9
 
 
 MEANING = {
@@ -145,6 +166,7 @@ MEANING = {
     Status.NO_BALANCE: "no power balance",
     Status.UNEXPLAINED: "not converged",
     Status.INPUT: "input out of range",
+    Status.EFFICIENCY: "efficiency above 1",
 }
 
 
@@ -158,6 +180,8 @@ class OperatingPoint:
     values : outputs by name (SI).
     residual : re-evaluated max-norm of all equations, specifications included.
     iterations : Newton steps, over all continuation steps.
+    second : another steady point with the same two quantities within the limits, if one was found;
+        only for pairs that leave the speed open (see :mod:`apu_casadi.trimbranch`).
     """
 
     x: np.ndarray
@@ -168,6 +192,7 @@ class OperatingPoint:
     values: dict[str, float]
     residual: float
     iterations: int
+    second: OperatingPoint | None = None
 
     def __getitem__(self, name: str) -> float:
         """Return an output by name."""
@@ -240,6 +265,12 @@ def _words(
         return f"beyond surge: SM = {y[name]:.4f}{bound}"
     if s == Status.TEMPERATURE:
         return f"temperature limit: {name} = {y[name]:.1f}{unit}{bound}"
+    if s == Status.EFFICIENCY:
+        factor = "f_" + name
+        return (
+            f"{name} = {y[name]:.4f}{bound}: no component is better than a reversible one; lower "
+            f"{factor}, or calibrate the map to a lower efficiency there"
+        )
     if s == Status.CHOKED:
         return f"exhaust exit choked: Mach {y[name]:.3f} at station 8"
     return f"needs no fuel: Wf = {y[name]:.3g}{unit}{bound}"

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi.checked import array
 from apu_casadi.errors import SignalError, nearest
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.steadypoint import (
@@ -28,7 +29,8 @@ from apu_casadi.steadypoint import (
     specify,
     stop_text,
 )
-from apu_casadi.trimkernel import AMBIENT, NZ
+from apu_casadi.trimbranch import Roots, may_fold, settle
+from apu_casadi.trimkernel import AMBIENT, DIRECT, NZ
 from apu_casadi.trimsolver import (
     COMPILE_FROM,
     FLOORS,
@@ -67,6 +69,8 @@ class TrimBatch:
     reached : share of the way from the design point that has solutions, shape (n,); 1 if solved.
     iterations : Newton steps, shape (n,), -1 where continuation was needed.
     shape : shape of the arrays that were given.
+    N_second : speed of another point within the limits with the same two quantities, rad/s, shape
+        (n,); NaN where none was found, as for all pairs with N (:mod:`apu_casadi.trimbranch`).
     """
 
     y: np.ndarray
@@ -79,6 +83,7 @@ class TrimBatch:
     reached: np.ndarray
     iterations: np.ndarray
     shape: tuple[int, ...]
+    N_second: np.ndarray
     _gg: GasGenerator = field(repr=False)
     _limits: Limits = field(repr=False)
     _stop: dict[int, tuple[np.ndarray, np.ndarray]] = field(repr=False)
@@ -138,6 +143,15 @@ class TrimBatch:
                 "flag_meanings": " ".join(MEANING[s].replace(" ", "_") for s in Status),
             },
         )
+        if "N" not in self.fixed:
+            data["N_second"] = (
+                dims,
+                self.N_second.reshape(shape),
+                {
+                    "units": "rad/s",
+                    "long_name": "rotor speed of a second steady point, NaN if none",
+                },
+            )
         data["trim_residual"] = (dims, self.residual.reshape(shape), {"units": "1"})
         attrs = {"fixed": " ".join(self.fixed), "points": len(self)}
         return xr.Dataset(data, attrs=attrs)
@@ -186,7 +200,8 @@ def trim_batch(
     if wrong:
         raise SignalError("; ".join(wrong))
     try:
-        arrays = [np.asarray(v, dtype=float) for v in (*given, *values)]
+        labels = (*AMBIENT, *gg.THETA.names, *[", ".join(names)] * len(values))
+        arrays = [array(n, v) for n, v in zip(labels, (*given, *values), strict=True)]
         shape = np.broadcast_shapes(*(a.shape for a in arrays))
     except (TypeError, ValueError) as e:
         raise SignalError(f"batch of {', '.join(names)}: {e}") from None
@@ -200,7 +215,7 @@ def trim_batch(
         _solve_chunk(solver, limits, p[:, k : k + CHUNK], rows, k, out, n_threads, M)
     return TrimBatch(
         out.y, keep, out.w, p, names, out.status, out.residual, out.reached, out.iterations, shape,
-        gg, limits, out.stop,
+        out.N_second, gg, limits, out.stop,
     )  # fmt: skip
 
 
@@ -212,6 +227,7 @@ class _Arrays:
         self.status = np.full(M, Status.INPUT, dtype=np.int8)
         self.residual, self.reached = np.full(M, np.inf), np.zeros(M)
         self.iterations = np.full(M, -1, dtype=np.int32)
+        self.N_second = np.full(M, np.nan)
         self.stop: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
 
@@ -266,6 +282,11 @@ def _solve_chunk(
                 status[j] = stop_status(solver, limits, y_l[:, one], s_l[:, one], q[:, k], t_l[k])
                 out.stop[first + int(index[j])] = (y_l[:, k].copy(), w_l[:, k].copy())
     solved = residual <= RESIDUAL_TOL
+    if may_fold(solver.kernel.spec) and solved.any():
+        found = Roots(w[:, solved], y[:, solved], residual[solved])
+        a, b = settle(solver, limits, found, p[:, solved], compile=compile)
+        w[:, solved], y[:, solved], residual[solved] = a
+        out.N_second[first + index[solved]] = b.w[DIRECT["N"]]
     status[solved] = limit_status(gg, limits, y[:, solved])
     for j in np.flatnonzero(solved & (status != Status.SOLVED)):
         out.stop[first + int(index[j])] = (y[:, j].copy(), w[:, j].copy())
@@ -304,7 +325,7 @@ def performance_deck(
     import xarray as xr
 
     axes = {"altitude": altitude, "Mach": Mach, "dT_isa": dT_isa, "PW": PW}
-    grid = {k: np.atleast_1d(np.asarray(v, dtype=float)) for k, v in axes.items()}
+    grid = {k: np.atleast_1d(array(k, v)) for k, v in axes.items()}
     mesh = dict(zip(grid, np.meshgrid(*grid.values(), indexing="ij", sparse=True), strict=True))
     N = gg.parameters.N if N is None else N
     batch = trim_batch(

@@ -29,7 +29,7 @@ from apu_casadi.cycle import (
     U,
     Y,
 )
-from apu_casadi.rootfinding import solve_bordered
+from apu_casadi.rootfinding import schur_sign, solve_bordered
 from apu_casadi.sharing import Rebuilt, derived
 
 NZ = len(Z_NAMES)
@@ -316,10 +316,32 @@ class TrimKernel(Rebuilt):
         a = self._ambient(p)
         return self._function("trim_equations", args, s, p, a, lambda e: {"r": e.r, "J": e.J})
 
+    @derived
+    def side(self) -> ca.Function:
+        """(s, p) -> sign of the determinant of the Jacobian, which changes at a fold.
+
+        That of the equations of the stations, each of which gives one temperature, is left out: its
+        sign never changes but with the branch of the static temperature at 3, which no other
+        equation contains.
+        """
+        n = len(self.free)
+        s, p, _ = self._symbols()
+        rows = [*ORDER, *range(NZ, n)]
+        return self._function(
+            f"trim_side_{self.label}", {"s": s, "p": p}, s, p, self._ambient(p),
+            lambda e: {"side": schur_sign(e.J[rows, :], N_ORDERED)},
+        )  # fmt: skip
+
     @property
     def label(self) -> str:
         """The specification as an identifier."""
         return "_".join("law" if n == LAW else n for n in self.spec)
+
+    def sought(self, w: np.ndarray) -> np.ndarray:
+        """Return s from w = (z, N, Wf, PW), by columns."""
+        s = (w.T / self.nominal).T
+        s[self.log] = np.log(s[self.log])
+        return s[self.free]
 
     def design_start(self) -> np.ndarray:
         """Return s at the design point, shape (n,)."""
@@ -328,7 +350,4 @@ class TrimKernel(Rebuilt):
             self.cycle.cmap.beta_des,
             self.cycle.tmap.beta_des,
         ]
-        w = np.array([*z, self.cycle.p.N, d.values["Wf"], self.PW_design])
-        s = w / self.nominal
-        s[self.log] = np.log(s[self.log])
-        return s[self.free]
+        return self.sought(np.array([*z, self.cycle.p.N, d.values["Wf"], self.PW_design]))

@@ -8,7 +8,8 @@ with the design point; where that fails, everything is moved there from the desi
 lies beyond a limit, or does not exist, is refused with its reason and the best point reached.
 
 Some pairs have two solutions: shaft power and fuel flow meet at two speeds where efficiency has a
-maximum between them.  The one found is the one that Newton's method reaches from the design speed.
+maximum between them.  The answer is the one on the design point's side of that maximum, and it
+holds the other one as ``second`` (:mod:`apu_casadi.trimbranch`).
 
 :func:`trim_gas_generator` solves one point, :func:`maximum_power` one at a temperature limit; for
 many points see :mod:`apu_casadi.trimbatch`.  What is asked and answered, and the solver, are in
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.checked import number
 from apu_casadi.errors import SignalError
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator, GasGeneratorState
 from apu_casadi.steadypoint import (
@@ -41,6 +43,7 @@ from apu_casadi.steadypoint import (
     speed_text,
     stop_text,
 )
+from apu_casadi.trimbranch import Roots, may_fold, settle
 from apu_casadi.trimkernel import AMBIENT, N_FIRST, NZ
 from apu_casadi.trimsolver import (
     continue_one,
@@ -79,15 +82,18 @@ def trim_gas_generator(
         reached.  It is an OperatingPointError.
     """
     limits = Limits() if limits is None else limits
+    try:
+        fixed = {
+            n: v if isinstance(v, LoadLaw) else number(f"fixed {n}", v) for n, v in fixed.items()
+        }
+    except SignalError as e:
+        raise SignalError(f"{e}; fixed values must be numbers") from None
     spec, values, names = specify(gg, fixed)
     th = gg.THETA.pack(theta)
     u = gg.U.pack({"Wf": gg.design.values["Wf"], "PW": 0.0, **ambient})
     if u.ndim > 1 or th.ndim > 1:
         raise SignalError("one point takes numbers; for arrays use trim_batch")
-    try:
-        asked = np.array([float(v) for v in values])
-    except (TypeError, ValueError):
-        raise SignalError(f"fixed values must be numbers, got {dict(fixed)}") from None
+    asked = np.array([float(v) for v in values])
     if not np.all(np.isfinite(asked)):
         raise SignalError(f"fixed values must be finite, got {dict(fixed)}")
     p = np.concatenate([u[2:], th, asked])
@@ -113,7 +119,14 @@ def trim_gas_generator(
             text = stop_text(gg, limits, status, there, reached)
             point = _point(gg, w, y, on_the_way(solver, p, reached), residual, total)
             _refuse(gg, names, fixed, status, text, point, reached)
-    point = _point(gg, w, y, p, residual, total)
+    second = None
+    if may_fold(spec):
+        one = Roots(w[:, None], y[:, None], np.array([residual]))
+        first, other = settle(solver, limits, one, p[:, None])
+        w, y, residual = first.w[:, 0], first.y[:, 0], float(first.residual[0])
+        if np.isfinite(other.residual[0]):
+            second = _point(gg, other.w[:, 0], other.y[:, 0], p, float(other.residual[0]), 0)
+    point = dataclasses.replace(_point(gg, w, y, p, residual, total), second=second)
     text = limit_text(gg, limits, named(gg, y, w))
     if text:
         _refuse(gg, names, fixed, limit_status(gg, limits, y[:, None])[0], text, point, 1.0)

@@ -214,6 +214,21 @@ def _fold(solver: Solver, s: np.ndarray, p: np.ndarray) -> float:
     return _sigma(solver, s, p) / max(_sigma(solver, s0, origin), 1e-300)
 
 
+def _determinant_left(solver: Solver, s: np.ndarray, p: np.ndarray, reached: float) -> float:
+    """Determinant of the Jacobian over that a little before on the way; 0 at a fold.
+
+    It falls like the root of the distance to the fold.  The smallest singular value tells less for
+    pairs such as (N, P3), whose equations are ill-conditioned at the design point already.
+    """
+    before = on_the_way(solver, p, max(reached - 0.02, 0.0))
+    _, _, r, s_before, _ = solver.one("warm", s, before)
+    there = solver.kernel.equations(s, on_the_way(solver, p, reached))[1].full()
+    then = solver.kernel.equations(s_before, before)[1].full()
+    if norm(r) > RESIDUAL_TOL or not (np.isfinite(there).all() and np.isfinite(then).all()):
+        return math.inf
+    return float(np.exp(np.linalg.slogdet(there)[1] - np.linalg.slogdet(then)[1]))
+
+
 def _sigma(solver: Solver, s: np.ndarray, p: np.ndarray) -> float:
     J = solver.kernel.equations(s, p)[1].full()
     # rows to unit size: a row's scale says nothing about a fold
@@ -251,5 +266,7 @@ def stop_status(
     if max(v[gg.Y.index("off_c")], v[gg.Y.index("off_t")]) > 0:
         return Status.OFF_MAP
     if _fold(solver, s[:, 0], on_the_way(solver, p, reached)) < 0.2:
+        return Status.NO_BALANCE
+    if _determinant_left(solver, s[:, 0], p, reached) < 0.2:
         return Status.NO_BALANCE
     return Status.UNEXPLAINED

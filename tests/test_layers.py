@@ -17,12 +17,13 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # Bottom first.  A module may import the layers below its own, and its neighbours only if NEIGHBOURS
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
-    ("errors", "sharing"),
-    ("signals", "parameters", "cachefolder", "calling"),
+    ("errors", "checked", "sharing"),
+    ("signals", "parameters", "mapcheck", "cachefolder", "calling"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
-    ("gas", "mapfiles"),
+    ("gas", "maptable"),
+    ("mapfiles",),
     ("atmosphere", "maps"),
     ("components", "machine"),
     ("cycle",),
@@ -30,6 +31,7 @@ LAYERS = (
     ("trimkernel",),
     ("steadypoint",),
     ("trimsolver",),
+    ("trimbranch",),
     ("trimming", "trimbatch", "propagation"),
     ("calibration", "meanstep"),
     ("control", "events"),
@@ -40,6 +42,7 @@ LAYERS = (
     ("linearisation", "monolithic"),
 )
 NEIGHBOURS = {
+    "checked": {"errors"},
     "components": {"components"},
     "machine": {"machine"},
 }
@@ -71,7 +74,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 # apu_casadi/__init__.py is the front door: it names modules, and no module comes in through it.
 # Estimators know f, g and names; of the solvers only how to make a step of f and to compile it.
 ESTIMATORS = {
-    "statespace", "signals", "results", "errors", "sharing", "backend", "discretisation",
+    "statespace", "signals", "results", "errors", "checked", "sharing", "backend", "discretisation",
 }  # fmt: skip
 
 RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}

@@ -83,15 +83,48 @@ def test_surface_is_the_tensor_product_of_natural_splines(table):
             assert_allclose(got, want, rtol=1e-11)
 
 
-def test_exponential_map_is_reproduced_inside_and_outside():
+def test_exponential_map_is_reproduced_inside_and_beside():
     """Closed form: natural splines reproduce straight lines, so logs linear in N, beta are exact.
 
-    Holds off the table too, up to the reach; 1e-9 since far logs are of order 10.
+    Holds off the table too along beta, up to the reach; 1e-9 since far logs are of order 10.
     """
     f = map_function(power_law_table())
-    for N in (0.1, 0.5, 0.73, 1.1, 1.9):
+    for N in (0.5, 0.73, 1.1):
         for beta in (-1.5, 0.0, 0.31, 1.0, 2.7):
             assert_allclose([float(v) for v in f(N, beta)], power_law(N, beta), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("edge", "width", "Ns"), [(1.1, 0.2, (1.3, 1.9)), (0.5, 0.1, (0.4, 0.1))])
+def test_the_outermost_speed_line_keeps_its_shape(edge, width, Ns):
+    """Closed form: the mean over beta goes on straight, deviations turn level over one interval.
+
+    S'' is a symmetric hat there, so that half of what the straight line would have gained is
+    gained; 1e-9 since far logs are of order 10.
+    """
+    table = power_law_table()
+    f, side = map_function(table), np.sign(edge - 0.8)
+
+    def logs(N, beta):
+        W, PR, eta = power_law(N, beta)
+        return np.log([W, PR - 1, eta])
+
+    for N in Ns:
+        for beta in (-0.4, 0.0, 0.31, 1.0, 1.2):
+            mean = np.mean([logs(N, b) for b in table.beta], axis=0)
+            half = edge + side * width / 2
+            deviation = logs(half, beta) - np.mean([logs(half, b) for b in table.beta], axis=0)
+            W, PR, eta = (float(v) for v in f(N, beta))
+            assert_allclose(np.log([W, PR - 1, eta]), mean + deviation, rtol=1e-9)
+
+
+def test_pressure_ratio_falls_along_every_speed_line_off_the_map():
+    """Beta lines may not cross: one point of a line for one pressure ratio, up to a span off."""
+    t = shipped("axi5")
+    f, span = map_function(t), float(np.ptp(t.N))
+    beta = np.linspace(t.beta[0] - 0.4, t.beta[-1] + 0.4, 60).reshape(1, -1)
+    for N in np.linspace(t.N[-1], t.N[-1] + span, 30):
+        PR = np.asarray(f(float(N), beta)[1]).ravel()
+        assert np.all(np.diff(PR) < 0), N
 
 
 def test_two_derivatives_are_continuous_at_the_table_edge(table):

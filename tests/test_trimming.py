@@ -6,14 +6,24 @@ import threading
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from apu_casadi import backend
 from apu_casadi.errors import OperatingPointError, SignalError
 from apu_casadi.gasgenerator import RPM, GasGenerator
-from apu_casadi.steadypoint import MEANING, Limits, LoadLaw, Refusal, Status
+from apu_casadi.steadypoint import (
+    MEANING,
+    Limits,
+    LoadLaw,
+    Refusal,
+    Status,
+    limit_status,
+    specify,
+)
 from apu_casadi.trimbatch import performance_deck, trim_batch
 from apu_casadi.trimkernel import LAW, TrimKernel
 from apu_casadi.trimming import maximum_power, trim_gas_generator
+from apu_casadi.trimsolver import norms, solver_of
 from scenarios import trim_study
 
 N_DESIGN = 36050 * RPM
@@ -118,7 +128,7 @@ REFUSED = {
         r"off the compressor map by 0\.\d+ table spans, limit 0.25 \(relative corrected speed 1\.5",
     ),
     "cold and high": (
-        {"N": N_DESIGN, "PW": 2e3}, {"altitude": 12e3, "dT_isa": -30.0}, Status.OFF_MAP,
+        {"N": N_DESIGN, "PW": 2e3}, {"altitude": 14e3, "dT_isa": -45.0}, Status.OFF_MAP,
         r"off the compressor map by .* table 0\.400 to 1\.100",
     ),
     "power that the fuel cannot give": (
@@ -344,3 +354,117 @@ def test_the_map_tables_are_part_of_the_recipe(gg):
     )
     assert map_digest(changed) != map_digest(gg)
     assert map_digest(GasGenerator()) == map_digest(gg)
+
+
+TWO = [{"PW": 480e3, "Wf": 0.0483}, {"PW": 490e3, "T4": 1200.0}]
+
+
+@pytest.mark.parametrize("fixed", TWO)
+def test_two_steady_points_are_told_and_the_designs_side_counts(gg, fixed):
+    """Shaft power over speed has a maximum, scanned here with the speed fixed: the two speeds of
+    equal power are the two answers, and the first is on the design speed's side of the maximum.
+    """
+    held = next(n for n in fixed if n != "PW")
+    N = gg.parameters.N * np.linspace(0.8, 1.26, 93)
+    scan = trim_batch(gg, {"N": N, held: fixed[held]}, dT_isa=5.0)
+    gap = np.where(scan.ok, scan["PW"], np.nan) - fixed["PW"]
+    crossings = N[:-1][gap[:-1] * gap[1:] < 0]
+    point = trim_gas_generator(gg, fixed, dT_isa=5.0)
+    assert crossings.size == 2 and point.second is not None
+    speeds = sorted((point["N"], point.second["N"]))
+    assert_allclose(speeds, crossings + 0.5 * (N[1] - N[0]), atol=0.6 * (N[1] - N[0]))
+    top = N[np.nanargmax(gap)]
+    d = trim_batch(
+        gg, {"N": gg.parameters.N * np.array([0.999, 1.001]), held: gg.design.values.get(held)},
+        dT_isa=5.0,
+    )  # fmt: skip
+    design_rises = d["PW"][1] > d["PW"][0]
+    assert (point["N"] < top) == design_rises
+    for q in (point, point.second):
+        assert q.residual < 1e-9
+        for name, value in fixed.items():
+            assert q[name] == pytest.approx(value, rel=1e-9)
+    batch = trim_batch(gg, {k: np.full(3, v) for k, v in fixed.items()}, dT_isa=5.0)
+    assert_allclose(batch["N"], point["N"], rtol=1e-9)
+    assert_allclose(batch.N_second, point.second["N"], rtol=1e-9)
+    assert_allclose(batch.to_dataset()["N_second"], point.second["N"], rtol=1e-9)
+
+
+def test_the_second_point_counts_where_the_first_is_beyond_a_limit(gg):
+    """A least margin that only one of two points keeps, then one that none of two keeps."""
+    fixed = {"PW": 480e3, "Wf": 0.0483}
+    both = trim_gas_generator(gg, fixed, dT_isa=5.0)
+    assert both.second is not None and both["SM"] > both.second["SM"]
+    limits = Limits(SM_min=both["SM"] + 1e-3)
+    with pytest.raises(Refusal, match="beyond surge"):
+        trim_gas_generator(gg, fixed, dT_isa=5.0, limits=limits)
+    hot = trim_gas_generator(gg, {"PW": 490e3, "T4": 1200.0}, dT_isa=5.0)
+    assert hot.second is not None and hot.second["SM"] > hot["SM"]
+    wide = Limits(SM_min=hot["SM"] + 1e-3)
+    only = trim_gas_generator(gg, {"PW": 490e3, "T4": 1200.0}, dT_isa=5.0, limits=wide)
+    assert only["N"] == pytest.approx(hot.second["N"], rel=1e-9) and only.second is None
+
+
+def test_multiple_starts_give_one_point_or_the_answer_tells_of_two(gg):
+    """100 points for each pair from six starts around the root, over health, ambient and speed.
+
+    With N fixed there is one root: before the outermost speed line kept its shape, 1 to 2 % of
+    these had two.
+    """
+    n, rng = 100, np.random.default_rng(7)
+    ambient = {"altitude": rng.uniform(0, 9e3, n), "dT_isa": rng.uniform(-60, -20, n)}
+    theta = {k: rng.uniform(0.85, 1.1, n) for k in gg.THETA.names}
+    PW, N = rng.uniform(0, 3e5, n), N_DESIGN * rng.uniform(0.93, 1.04, n)
+    for fixed in (
+        {"N": N, "PW": PW}, {"N": N, "Wf": rng.uniform(0.01, 0.04, n)},
+        {"N": N, "T5": rng.uniform(450, 900, n)}, {"PW": PW, "Wf": rng.uniform(0.015, 0.04, n)},
+    ):  # fmt: skip
+        batch = trim_batch(gg, fixed, theta=theta, **ambient)
+        spec, _, _ = specify(gg, fixed)
+        solver = solver_of(gg, spec)
+        at = np.flatnonzero(batch.ok)
+        assert at.size > 10
+        p, s = batch.p[:, at], solver.kernel.sought(batch.w[:, at])
+        speed = len(gg.z)
+        for trial in range(6):
+            start = s + rng.normal(0, 0.05 * (1 + trial), s.shape)
+            w, y, r, _, _ = solver.many("warm", start, p, n_threads=1, compile=False)
+            good = (norms(r) < 1e-9) & (limit_status(gg, Limits(), y) == Status.SOLVED)
+            same = np.abs(y[gg.Y.index("T4")] / batch.y[gg.Y.index("T4"), at] - 1) < 1e-6
+            told = np.abs(w[speed] / batch.N_second[at] - 1) < 1e-6
+            assert np.all(~good | same | told), fixed
+
+
+@pytest.mark.parametrize(
+    ("N", "P3", "ambient", "health"),
+    [
+        (3350.677558, 736038.0158, (2830.130175, 0.6842347951, -31.97273157, 0.0),
+         (0.8901993396, 1.0818551427, 1.0471951976, 0.9366392366)),
+        (3482.645343, 634070.5808, (3242.741280, 0.8498429929, 15.54089503, 0.0),
+         (1.0165626904, 1.0068769105, 0.8998637637, 0.8806726125)),
+        (3775.147172, 737225.2348, (1100.928124, 0.0274476564, 34.27994341, 0.0312759814),
+         (0.9884228667, 1.0979316490, 0.8899573487, 0.9158323335)),
+    ],
+)  # fmt: skip
+def test_a_pressure_beyond_the_top_of_a_speed_line_is_no_balance(gg, N, P3, ambient, health):
+    """Three of 100 000 random points ended as "not converged": at the highest P3 of the speed line.
+
+    The scan over T4 at the place where the way ended shows the maximum; no other equation is asked.
+    """
+    names = ("altitude", "Mach", "dT_isa", "war")
+    given, theta = (
+        dict(zip(names, ambient, strict=True)),
+        dict(zip(gg.THETA.names, health, strict=True)),
+    )
+    with pytest.raises(Refusal, match="an extreme value near the best point") as e:
+        trim_gas_generator(gg, {"N": N, "P3": P3}, theta=theta, **given)
+    assert e.value.status == Status.NO_BALANCE
+    assert trim_batch(gg, {"N": N, "P3": P3}, theta=theta, **given).status[0] == Status.NO_BALANCE
+    end = e.value.point
+    factors = np.linspace(0.95, 1.05, 41)
+    scan = trim_batch(
+        gg, {"N": end["N"], "T4": factors * end["T4"]},
+        theta=dict(zip(gg.THETA.names, end.theta, strict=True)), limits=Limits.none(),
+        **dict(zip(names, end.u[2:], strict=True)),
+    )  # fmt: skip
+    assert abs(np.nanargmax(scan["P3"]) - 20) <= 1

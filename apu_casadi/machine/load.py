@@ -11,13 +11,15 @@ import math
 from dataclasses import dataclass, field
 from typing import Self
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError
 
 KINDS = ("resistive", "inductive", "constant_power")
 
 
 def _check(where: str, value: object, *, above: float | None = None) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    value = number(where, value, error=ParameterError)
+    if not math.isfinite(value):
         raise ParameterError(f"{where} must be a finite number, got {value!r}")
     if above is None and value < 0:
         raise ParameterError(f"{where} = {value:g} must be >= 0")

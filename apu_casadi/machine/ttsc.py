@@ -29,6 +29,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError
 from apu_casadi.machine.parameters import MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE
@@ -60,9 +61,9 @@ class Ttsc:
         if self.kappa is None:
             object.__setattr__(self, "kappa", self.mu)
         for name in ("mu", "k_rf", "kappa"):
-            value = getattr(self, name)
-            bad = isinstance(value, bool) or not isinstance(value, int | float)
-            if bad or not math.isfinite(value):
+            value = number(f"Ttsc.{name}", getattr(self, name), error=ParameterError)
+            object.__setattr__(self, name, value)
+            if not math.isfinite(value):
                 raise ParameterError(f"Ttsc.{name} must be a finite number, got {value!r}")
         if not 0 < self.mu < 1:
             raise ParameterError(

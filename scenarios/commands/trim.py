@@ -144,6 +144,7 @@ def _fixed(texts: list[str], PW_design: float, N_design: float) -> dict[str, Any
 
 
 def _gas(args: argparse.Namespace, mode: str) -> int:
+    from apu_casadi.cycle import Y
     from apu_casadi.trimming import maximum_power, trim_gas_generator
 
     ambient = {
@@ -195,12 +196,22 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
             "outputs": values, "generator": extra, "residual": point.residual,
             "iterations": point.iterations, "inputs": {**ambient, "health": health},
         }  # fmt: skip
+        if point.second is not None:
+            report["second"] = point.second.values
         print(json.dumps(report, indent=2, allow_nan=False))
         return 0
     print(_table(values, list(values) if args.all else ["N_rpm", *SHOWN]))
     if extra:
         print("\neach generator\n" + _table(extra, list(extra)))
     print(f"\nresidual {point.residual:.1e}, {point.iterations} Newton steps")
+    if point.second is not None:
+        other = {k: point.second[k] for k in ("N", "PW", "Wf", "T4", "SM")}
+        print(
+            "there is a second steady point with the same fixed quantities: "
+            + ", ".join(f"{k} = {v:.6g} {Y[k].unit}" for k, v in other.items())
+            + "; the one above is on the design point's side of the extreme value between them, "
+            "unless that side is beyond a limit"
+        )
     return 0
 
 
