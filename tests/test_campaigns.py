@@ -9,7 +9,7 @@ import pytest
 
 from apu_casadi import results
 from apu_casadi.errors import ScenarioError
-from scenarios import campaigns, registry
+from scenarios import campaigns, registry, workers
 from scenarios.campaigns import RUNS, counts, random_faults, run_campaign
 from scenarios.cli import main
 from scenarios.schema import FaultSpec, Scenario
@@ -186,7 +186,7 @@ def test_a_dead_process_costs_one_run(base, monkeypatch):
         def shutdown(self, **_):
             pass
 
-    monkeypatch.setattr(campaigns, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
     ds = run_campaign(runs, workers=2)
     assert counts(ds)["done"] == 3 and counts(ds)["crashed"] == 1
     assert str(ds["reason"].values[1]).startswith("the process ended")

@@ -18,7 +18,8 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
     ("errors",),
-    ("signals", "parameters"),
+    ("signals", "parameters", "filearrays"),
+    ("netcdf3", "runstorage"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
