@@ -211,6 +211,13 @@ class RowFile:
             raise DataError(f"row {name}: elements {start} to {start + a.size} of {n}")
         self.file.write(at + 8 * start, memoryview(a).cast("B") if a.size else b"")
 
+    def add(self, name: str, values: np.ndarray) -> Any:
+        """Write one more row at the end of the file; return it as a lazy array."""
+        self._rows[name] = (self.size, values.size)
+        self.size += 8 * values.size
+        self.write(name, 0, values)
+        return self.array(name)
+
     def array(self, name: str) -> Any:
         """Return a row as a lazy array."""
         at, n = self._rows[name]

@@ -58,7 +58,7 @@ from apu_casadi.machinestep import (
     ramped,
 )
 from apu_casadi.results import dataset
-from apu_casadi.runstorage import PIECE, RowFile, place
+from apu_casadi.runstorage import PIECE, RowFile, place, row_file
 from apu_casadi.signals import Signal
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ __all__ = [
 
 SOLVERS = ("cvodes", "idas", "propagator")
 _HEALTHY = (0.0, math.nan, math.nan)
+_WAVE_ROWS = ("time_w", *(f"{n} waveform" for n in WAVEFORMS))  # P_total is a mean as well
 
 
 @dataclass(frozen=True)
@@ -317,24 +318,31 @@ class _Book:
         storage: str | os.PathLike[str] = "memory",
     ) -> None:
         self.gg, self.grid = gg, grid
-        K, rows = grid.size, len(gg.Y) + means + len(gg.THETA) + 3
-        where = place(8 * (rows * K + (1 + len(WAVEFORMS)) * samples), storage)
-        steps, width = (K, samples) if where is None else (min(K, PIECE), min(samples, PIECE))
-        self.Y = np.zeros((len(gg.Y), steps))
-        self.means = np.zeros((means, steps))
-        self.factors = np.empty((len(gg.THETA), steps))
-        self.severity = np.empty((3, steps))
-        self.t_w = np.empty(width)
-        self.waves = np.empty((len(WAVEFORMS), width))
+        n_slow = len(gg.Y) + means + len(gg.THETA) + 3
+        size = 8 * (n_slow * grid.size + (1 + len(WAVEFORMS)) * samples)
         self._first = self._end = 0  # instants in the arrays
         self._first_w = self._n = 0  # samples before those in the arrays, and in them
         self._residual = 0.0
         self.file: RowFile | None = None
-        if where is not None:
-            with np.errstate(all="ignore"):  # of the names alone
-                self._names = [*gg.Y.names, *self.slow()]
-            waves = ("time_w", *WAVEFORMS) if samples else ()
-            self.file = RowFile(dict.fromkeys(self._names, K) | dict.fromkeys(waves, samples), where)
+        where = place(size, storage)
+        self._allocate(means, *((grid.size, samples) if where is None else (1, 1)))
+        if where is None:
+            return
+        with np.errstate(all="ignore"):  # of the names alone
+            self._names = [*gg.Y.names, *self.slow()]
+        rows = dict.fromkeys(self._names, grid.size)
+        waves = dict.fromkeys(_WAVE_ROWS if samples else (), samples)
+        self.file = row_file({**rows, **waves}, where, needed=storage != "auto")
+        piece = PIECE if self.file is not None else size
+        self._allocate(means, min(grid.size, piece), min(samples, piece))
+
+    def _allocate(self, means: int, steps: int, samples: int) -> None:
+        self.Y = np.zeros((len(self.gg.Y), steps))
+        self.means = np.zeros((means, steps))
+        self.factors = np.empty((len(self.gg.THETA), steps))
+        self.severity = np.empty((3, steps))
+        self.t_w = np.empty(samples)
+        self.waves = np.empty((len(WAVEFORMS), samples))
 
     def put(
         self,
@@ -394,7 +402,7 @@ class _Book:
 
     def _flush_waves(self) -> None:
         assert self.file is not None
-        for name, row in zip(("time_w", *WAVEFORMS), (self.t_w, *self.waves), strict=True):
+        for name, row in zip(_WAVE_ROWS, (self.t_w, *self.waves), strict=True):
             self.file.write(name, self._first_w, row[: self._n])
         self._first_w, self._n = self._first_w + self._n, 0
 
@@ -402,6 +410,10 @@ class _Book:
         """Largest scaled residual of the gas path equations so far."""
         now = self.Y[self.gg.Y.index("residual"), : self._end - self._first]
         return max(self._residual, float(now.max()))
+
+    def keep(self, name: str, values: np.ndarray) -> Any:
+        """Keep more values, where the others are."""
+        return values if self.file is None else self.file.add(name, values)
 
     def instants(self) -> dict[str, Any]:
         """All that is kept of the exchange instants, by name."""
@@ -417,7 +429,8 @@ class _Book:
         if self.file is None:
             return self.t_w, dict(zip(WAVEFORMS, self.waves, strict=True))
         self._flush_waves()
-        return np.asarray(self.file.array("time_w")), {n: self.file.array(n) for n in WAVEFORMS}
+        t, *waves = (self.file.array(n) for n in _WAVE_ROWS)
+        return np.asarray(t), dict(zip(WAVEFORMS, waves, strict=True))
 
     def slow(self) -> dict[str, np.ndarray]:
         """Means, rms values, phasors, health and severity by name."""
@@ -469,7 +482,9 @@ def _collect(
     gg, grid = apu.gas_generator, book.grid
     kept = book.instants()
     measured = {
-        f"{n}_meas": np.asarray(kept[n]) + s * rng.standard_normal(grid.size)
+        f"{n}_meas": book.keep(
+            f"{n}_meas", np.asarray(kept[n]) + s * rng.standard_normal(grid.size)
+        )
         for n, s in noise.gas.items()
     }
     signals = [*gg.Y, *_phasor_signals()]
@@ -485,8 +500,8 @@ def _collect(
         w["P_inst"] = w.pop("P_total")
         if noise.terminal is not None:
             y_sg = apu.generator.state_space().y
-            for n, a in noise.terminal.measure(w, rng).items():
-                w[f"{n}_meas"] = a
+            for n, a in noise.terminal.each(dict(w), rng):
+                w[f"{n}_meas"] = book.keep(f"{n}_meas", a)
                 signals.append(
                     dataclasses.replace(y_sg[n], name=f"{n}_meas", doc=f"measured: {y_sg[n].doc}")
                 )
