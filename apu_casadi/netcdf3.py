@@ -29,6 +29,7 @@ LARGEST = 2**32 - 4
 _TYPES = {"f8": 6, "f4": 5}
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 8}  # bytes of nc_byte, char, short, int, float, double
 _DTYPES = {1: ">i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8"}
+_STREAMING = 2**32 - 1  # "number of records unknown"
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
 #: What a dataset that was read remembers of its file, and what a variable may carry along.
 _HARMLESS = {"source", "original_shape", "dtype", "_FillValue", "chunksizes", "preferred_chunks"}
@@ -194,8 +195,10 @@ class _Reader:
 def _parsed(raw: bytes) -> _Header:
     """Return what stands in a header."""
     r = _Reader(raw)
-    r.number()
+    records = r.number()
     dims = {r.name(): r.number() for _ in r.items(_DIMENSION)}
+    if records not in (0, _STREAMING) and 0 not in dims.values():
+        raise ValueError(f"{records} records without a dimension that grows")
     order = list(dims)
     attributes, variables = r.attributes(), []
     for _ in r.items(_VARIABLE):

@@ -268,6 +268,7 @@ _MEANS = (
     ("P_loss_fault", "P_loss_fault", 1.0),
 )
 _HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
+_HEALTHY_NAN = ("k_rf", "kappa")
 
 
 class _Columns:
@@ -277,7 +278,14 @@ class _Columns:
         self.ds = ds
 
     def __getitem__(self, name: str) -> np.ndarray:
-        values: np.ndarray = self.ds[name].values
+        v = self.ds[name]
+        if v.dims != ("time",) or v.dtype.kind not in "fiu":
+            where = ", ".join(map(str, v.dims)) or "no dimension"
+            raise DataError(f"{name}: numbers on time are expected, {v.dtype} on {where} found")
+        values: np.ndarray = v.values
+        if name not in _HEALTHY_NAN and not np.isfinite(values).all():
+            k = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise DataError(f"{name} = {values[k]:g} at t = {self.ds['time'].values[k]:g} s")
         return values
 
 
@@ -293,7 +301,7 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
 
     Raises
     ------
-    DataError : a variable is missing, or a phase holds no sample.
+    DataError : a variable is missing, is not finite or no number, or a phase holds no sample.
     """
     needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
     missing = [v for v in needed if v not in ds]

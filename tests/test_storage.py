@@ -107,9 +107,27 @@ def test_damaged_files_are_refused(ds, tmp_path):
         for how in (False, True):
             with pytest.raises(DataError, match=r"damaged netCDF file of \d+ bytes"):
                 results.load(path, lazy=how)
-    path.write_bytes(b"CDF\x05" + raw[4:])
-    with pytest.raises(DataError, match="not known"):
-        results.load(path)
+    for other, message in (
+        (b"CDF\x05" + raw[4:], "not known"),
+        (raw[:4] + b"\x7f\xff\xff\xff" + raw[8:], "records without a dimension"),
+    ):
+        path.write_bytes(other)
+        with pytest.raises(DataError, match=message):
+            results.load(path)
+
+
+def test_a_summary_of_what_is_no_run_is_refused(in_memory):
+    """Wrong kinds of variables, which a damaged or edited file may hold."""
+    n = in_memory.sizes["time"]
+    for T4, message in (
+        (("time", np.full(n, np.nan)), "T4 = nan at t = 0 s"),
+        (("time", np.array(["ab"] * n)), "numbers on time are expected, <U2 on time found"),
+        ((("time", "k"), np.ones((n, 2))), "float64 on time, k found"),
+        ((), "T4"),
+    ):
+        ds = in_memory.assign(T4=T4) if T4 else in_memory.drop_vars("T4")
+        with pytest.raises(DataError, match=message):
+            results.phase_summary(ds)
 
 
 def test_a_file_with_a_growing_dimension_is_read(tmp_path):
