@@ -44,13 +44,11 @@ class File:
         data = bytearray(size)
         view, done = memoryview(data), 0
         try:
-            with self._lock:
-                self._f.seek(offset)
-                while done < size:
-                    n = self._f.readinto(view[done:])  # type: ignore[attr-defined]
-                    if not n:
-                        break
-                    done += n
+            while done < size:
+                n = self._read_at(offset + done, view[done:])
+                if not n:
+                    break
+                done += n
         except OSError as e:
             raise DataError(f"{self.name}: cannot be read: {e.strerror or e}") from e
         if done < size:
@@ -62,13 +60,28 @@ class File:
     def write(self, offset: int, data: bytes | memoryview) -> None:
         """Write at ``offset``; :class:`DataError` where that is impossible."""
         try:
-            with self._lock:
-                self._f.seek(offset)
-                view = memoryview(data)
-                while len(view):
-                    view = view[self._f.write(view) :]
+            view = memoryview(data)
+            while len(view):
+                n = self._write_at(offset, view)
+                offset, view = offset + n, view[n:]
         except OSError as e:
             raise DataError(f"{self.name}: cannot be written: {e.strerror or e}") from e
+
+    # a place of its own for each call: threads and forked processes share that of the file
+
+    def _read_at(self, offset: int, view: memoryview) -> int:
+        if hasattr(os, "preadv"):
+            return os.preadv(self._f.fileno(), [view], offset)
+        with self._lock:
+            self._f.seek(offset)
+            return int(self._f.readinto(view))  # type: ignore[attr-defined]
+
+    def _write_at(self, offset: int, view: memoryview) -> int:
+        if hasattr(os, "pwrite"):
+            return os.pwrite(self._f.fileno(), view, offset)
+        with self._lock:
+            self._f.seek(offset)
+            return self._f.write(view)
 
     def __del__(self) -> None:
         """Close the file."""

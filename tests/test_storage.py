@@ -1,10 +1,13 @@
 """Results in files: written in pieces, read on demand, the same bits as in memory."""
 
+import contextlib
 import copy
 import io
 import os
 import pickle
 import tracemalloc
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -82,6 +85,28 @@ def test_lazy_values_are_those_asked_for(ds, tmp_path):
         found["a"][LONG]
     for other in (copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
         xr.testing.assert_identical(other, found.load())
+
+
+def test_threads_and_forked_processes_read_the_same_file(ds, tmp_path):
+    """They share the place at which a file is read; each reads its own all the same."""
+    found = results.load(results.save(ds, tmp_path / "a.nc"), lazy=True)
+    right = {n: ds[n].values.tobytes() for n in ("a", "holes", "single", "table")}
+
+    def wrong():
+        return [n for _ in range(20) for n, v in right.items() if found[n].values.tobytes() != v]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12: "... is multi-threaded"
+        pid = os.fork() if hasattr(os, "fork") else None
+    if pid == 0:
+        status = 1
+        with contextlib.suppress(BaseException):
+            status = len(wrong())
+        os._exit(status)
+    with ThreadPoolExecutor(4) as pool:
+        assert [f.result() for f in [pool.submit(wrong) for _ in range(4)]] == [[]] * 4
+    if pid is not None:
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
 def test_writing_and_reading_need_little_more_than_the_data(tmp_path):
