@@ -102,15 +102,15 @@ def stoppable() -> Iterator[Callable[[], None]]:
     """Let SIGTERM end the block as Ctrl-C does, with KeyboardInterrupt.
 
     Yields a function that raises it if either has come: to be called where an integrator may have
-    turned the first one into an error of its own.  A signal that is ignored stays so, the caller's
-    own handler of Ctrl-C is called first, and outside the main thread nothing changes.
+    turned the first one into an error of its own.  A signal that is ignored stays so, a handler
+    of the caller's own is called first, and outside the main thread nothing changes.
     """
     asked = threading.Event()
     before: dict[int, Any] = {}
 
     def handler(number: int, frame: FrameType | None) -> None:
         asked.set()
-        if number == signal.SIGINT and callable(before[number]):
+        if callable(before[number]):
             before[number](number, frame)
         raise KeyboardInterrupt
 
@@ -119,12 +119,11 @@ def stoppable() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():
-        if callable(signal.getsignal(signal.SIGINT)):
-            before[signal.SIGINT] = signal.getsignal(signal.SIGINT)
-        if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-            before[signal.SIGTERM] = signal.SIG_DFL
-        for number in before:
-            signal.signal(number, handler)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            old = signal.getsignal(number)
+            if callable(old) or old == signal.SIG_DFL:
+                before[number] = old
+                signal.signal(number, handler)
     try:
         yield check
     finally:

@@ -116,6 +116,10 @@ def test_ignored_signals_and_own_handlers_are_respected():
             signal.raise_signal(signal.SIGTERM)
             signal.raise_signal(signal.SIGINT)
         assert seen == ["own"]
+        signal.signal(signal.SIGTERM, lambda *a: seen.append("own too"))
+        with pytest.raises(KeyboardInterrupt), workers.stoppable():
+            signal.raise_signal(signal.SIGTERM)
+        assert seen == ["own", "own too"]
     finally:
         signal.signal(signal.SIGINT, before)
         signal.signal(signal.SIGTERM, term)
