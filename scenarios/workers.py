@@ -127,5 +127,5 @@ def stoppable() -> Iterator[Callable[[], None]]:
     try:
         yield check
     finally:
-        for number, old in before.items():
-            signal.signal(number, old)
+        for n, handled in before.items():
+            signal.signal(n, handled)
