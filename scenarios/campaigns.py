@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import os
 import time
@@ -28,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.errors import ApuError, ScenarioError, SimulationError, nearest
+from apu_casadi.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
 from scenarios import campaign_records, registry
 from scenarios.campaign_records import COLUMNS, RUNS, STATUS
 from scenarios.locking import locked
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 DATASET = "campaign.nc"
 LOCK = "campaign.lock"
+_log = logging.getLogger("apu_casadi")
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished runs and of all."""
@@ -227,6 +229,7 @@ def run_campaign(
                 write(record)
 
             done = _run_all(tasks, done, workers, progress, keep_it)
+        _sweep(folder / "runs")  # of processes that were killed meanwhile
         ds = _dataset(scenarios, [done[t.key] for t in tasks], solver)
         from apu_casadi.results import save
 
@@ -357,10 +360,24 @@ def _finished(folder: Path, tasks: Sequence[_Task], keep: str | None) -> dict[st
     for key, record in campaign_records.read(folder / RUNS, asked).items():
         here = record["status"] != "crashed"
         if here and keep is not None and record["status"] == "done":
-            here = (Path(keep) / f"{record['name']}.nc").exists()
+            here = _whole(Path(keep) / f"{record['name']}.nc")
         if here:
             found[key] = record
     return found
+
+
+def _whole(path: Path) -> bool:
+    """Whether a run's own file is there, with all its bytes; one that is damaged is told."""
+    from apu_casadi.results import load
+
+    if not path.exists():
+        return False
+    try:
+        load(path, lazy=True)
+    except DataError as e:
+        _log.warning("%s", e)
+        return False
+    return True
 
 
 # ------------------------------------------------------------------------------ result

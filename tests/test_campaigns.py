@@ -150,11 +150,18 @@ def test_a_changed_scenario_runs_again(base, tmp_path):
     assert len((tmp_path / RUNS).read_text().splitlines()) == 2
 
 
-def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path):
+def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path, caplog):
     (run,) = random_faults(1, base=base.change(waveform_dt=1e-3))
     run_campaign([run], workers=1, out=tmp_path, summary_only=False)
     ds = results.load(tmp_path / "runs" / f"{run.name}.nc")
     assert abs(ds.sizes["time_w"] - 401) <= 1
+    path = tmp_path / "runs" / f"{run.name}.nc"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])  # a file that lost its end is made again, and told
+    (tmp_path / "runs" / ".x.nc.7.part").write_bytes(b"of a killed process")
+    run_campaign([run], workers=1, out=tmp_path, summary_only=False)
+    assert path.read_bytes() == whole and "damaged netCDF file" in caplog.text
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
     with pytest.raises(ScenarioError, match="need a folder"):
         run_campaign([run], summary_only=False)
 
