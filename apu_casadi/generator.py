@@ -21,7 +21,7 @@ are the effective currents.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -109,14 +109,21 @@ class MeasurementNoise:
         y : true values by name; a Dataset, or ``ss.y.unpack(step.y)``.
         rng : the caller's generator; nothing is seeded here.
         """
+        return dict(self.each(y, rng))
+
+    def each(
+        self, y: Mapping[str, Any], rng: np.random.Generator
+    ) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield name and noisy values of :meth:`measure` one after the other."""
         sigmas = dict.fromkeys(("i_a", "i_b", "i_c"), self.sigma_i)
         sigmas |= dict.fromkeys(("v_a", "v_b", "v_c"), self.sigma_v)
         sigmas["V_fd"] = self.sigma_V_fd
         missing = [n for n in sigmas if n not in y]
         if missing:
             raise SignalError(f"to be measured but absent: {', '.join(missing)}")
-        true = {n: np.asarray(y[n], dtype=float) for n in sigmas}
-        return {n: v + sigmas[n] * rng.standard_normal(v.shape) for n, v in true.items()}
+        for n, sigma in sigmas.items():
+            v = np.asarray(y[n], dtype=float)
+            yield n, v + sigma * rng.standard_normal(v.shape)
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,11 @@ machine's price.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -57,6 +59,7 @@ from apu_casadi.machinestep import (
     ramped,
 )
 from apu_casadi.results import dataset
+from apu_casadi.runstorage import PIECE, RowFile, place, row_file
 from apu_casadi.signals import Signal
 
 if TYPE_CHECKING:
@@ -79,6 +82,7 @@ __all__ = [
 
 SOLVERS = ("cvodes", "idas", "propagator")
 _HEALTHY = (0.0, math.nan, math.nan)
+_WAVE_ROWS = ("time_w", *(f"{n} waveform" for n in WAVEFORMS))  # P_total is a mean as well
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,7 @@ def simulate_joint(
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
     attrs: Mapping[str, Any] | None = None,
+    storage: str | os.PathLike[str] = "auto",
 ) -> xr.Dataset:
     """Simulate gas generator, two generators and governor together.
 
@@ -181,6 +186,10 @@ def simulate_joint(
         than real time with a C compiler; CVODES takes over by itself where it does not hold).
     progress : called with (done, total) seconds after every exchange step.
     attrs : more attributes for the dataset.
+    storage : where the results are: ``"memory"``; a folder, for a temporary file in it that
+        vanishes with the dataset, whose values are then read when they are asked for, each time
+        anew; ``"auto"``: in memory up to :data:`~apu_casadi.runstorage.IN_MEMORY` bytes, beyond
+        that in a file of the system's folder of temporary files where there is room.
 
     Returns
     -------
@@ -190,6 +199,7 @@ def simulate_joint(
     Raises
     ------
     ScenarioError : impossible times or events.
+    DataError : ``storage`` is a folder without room for the file.
     OperatingPointError : no steady start.
     SimulationError : an integration or a cycle solution failed; says when and why.
     """
@@ -225,7 +235,7 @@ def simulate_joint(
     y, z = gg.output(x, u, theta, z0=point.gas.z)
     Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
     hot = gg.stepper if solver == "propagator" else None
-    book = _Book(gg, grid, machine.samples(grid), len(machine.quad))
+    book = _Book(gg, grid, machine.samples(grid), len(machine.quad), storage)
     book.put(0, y, machine.means_at_rest(point.generator), factors, None)
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
@@ -296,25 +306,52 @@ def simulate_joint(
     status = {
         "solver": solver, "rtol": rtol, "atol": atol, "dt": dt, "exchange": exchange,
         "nsteps_generator": machine.nsteps, "steps_propagated": machine.propagated,
-        "residual_max": float(book.Y[gg.Y.index("residual")].max()), "seed": seed,
+        "residual_max": book.residual_max(), "seed": seed,
         "V_ref": machine.V_ref,
     }  # fmt: skip
     return _collect(apu, book, noise, rng, attrs, status)
 
 
 class _Book:
-    """What a run keeps: outputs per exchange, means, health, severity, waveforms."""
+    """What a run keeps: outputs per exchange, means, health, severity, waveforms.
 
-    def __init__(self, gg: GasGenerator, grid: np.ndarray, samples: int, means: int) -> None:
+    The arrays hold the whole run, or the piece of it that has not gone to ``file`` yet.
+    """
+
+    def __init__(
+        self,
+        gg: GasGenerator,
+        grid: np.ndarray,
+        samples: int,
+        means: int,
+        storage: str | os.PathLike[str] = "memory",
+    ) -> None:
         self.gg, self.grid = gg, grid
-        K = grid.size
-        self.Y = np.empty((len(gg.Y), K))
-        self.means = np.empty((means, K))
-        self.factors = np.empty((len(gg.THETA), K))
-        self.severity = np.empty((3, K))
+        n_slow = len(gg.Y) + means + len(gg.THETA) + 3
+        size = 8 * (n_slow * grid.size + (1 + len(WAVEFORMS)) * samples)
+        self._first = self._end = 0  # instants in the arrays
+        self._first_w = self._n = 0  # samples before those in the arrays, and in them
+        self._residual = 0.0
+        self.file: RowFile | None = None
+        where = place(size, storage)
+        self._allocate(means, *((grid.size, samples) if where is None else (1, 1)))
+        if where is None:
+            return
+        with np.errstate(all="ignore"):  # of the names alone
+            self._names = [*gg.Y.names, *self.slow()]
+        rows = dict.fromkeys(self._names, grid.size)
+        waves = dict.fromkeys(_WAVE_ROWS if samples else (), samples)
+        self.file = row_file({**rows, **waves}, where, needed=storage != "auto")
+        piece = PIECE if self.file is not None else size
+        self._allocate(means, min(grid.size, piece), min(samples, piece))
+
+    def _allocate(self, means: int, steps: int, samples: int) -> None:
+        self.Y = np.zeros((len(self.gg.Y), steps))
+        self.means = np.zeros((means, steps))
+        self.factors = np.empty((len(self.gg.THETA), steps))
+        self.severity = np.empty((3, steps))
         self.t_w = np.empty(samples)
         self.waves = np.empty((len(WAVEFORMS), samples))
-        self._n = 0
 
     def put(
         self,
@@ -325,28 +362,84 @@ class _Book:
         fault: Ttsc | None,
     ) -> None:
         """Enter exchange instant k."""
-        self.Y[:, k] = y
-        self.means[:, k] = means
-        self.factors[:, k] = tuple(factors.values())
-        self.severity[:, k] = _severity(fault)
+        at = self._columns(k, 1).start
+        self.Y[:, at] = y
+        self.means[:, at] = means
+        self.factors[:, at] = tuple(factors.values())
+        self.severity[:, at] = _severity(fault)
 
     def put_block(
         self, k: int, done: BlockResult, factors: Mapping[str, float], fault: Ttsc | None
     ) -> None:
         """Enter a block of exchange instants, the first of which is k."""
-        at = slice(k, k + BLOCK)
+        at = self._columns(k, BLOCK)
         self.Y[:, at] = done.y
         self.means[:, at] = done.means
         self.factors[:, at] = np.array(tuple(factors.values()))[:, None]
         self.severity[:, at] = np.array(_severity(fault))[:, None]
 
+    def _columns(self, k: int, n: int) -> slice:
+        """Return where instants k to k + n - 1 go, after making room for them."""
+        if k + n - self._first > self.Y.shape[1]:
+            self._flush()
+            self._first = k
+        self._end = k + n
+        return slice(k - self._first, self._end - self._first)
+
     def wave(self, t: np.ndarray, w: np.ndarray) -> None:
         """Append waveform samples, where any are kept."""
         if self.t_w.size:
             n = t.size
+            if self._n + n > self.t_w.size:
+                self._flush_waves()
+                if n > self.t_w.size:  # a long step
+                    self.t_w, self.waves = np.empty(n), np.empty((len(WAVEFORMS), n))
             self.t_w[self._n : self._n + n] = t
             self.waves[:, self._n : self._n + n] = w
             self._n += n
+
+    def _flush(self) -> None:
+        """Write the instants in the arrays to the file."""
+        assert self.file is not None
+        n = self._end - self._first
+        part = copy.copy(self)
+        part.Y, part.means = self.Y[:, :n], self.means[:, :n]
+        part.factors, part.severity = self.factors[:, :n], self.severity[:, :n]
+        for name, row in {**dict(zip(self.gg.Y.names, part.Y, strict=True)), **part.slow()}.items():
+            self.file.write(name, self._first, row)
+        self._residual = self.residual_max()
+
+    def _flush_waves(self) -> None:
+        assert self.file is not None
+        for name, row in zip(_WAVE_ROWS, (self.t_w, *self.waves), strict=True):
+            self.file.write(name, self._first_w, row[: self._n])
+        self._first_w, self._n = self._first_w + self._n, 0
+
+    def residual_max(self) -> float:
+        """Largest scaled residual of the gas path equations so far."""
+        now = self.Y[self.gg.Y.index("residual"), : self._end - self._first]
+        return max(self._residual, float(now.max()))
+
+    def keep(self, name: str, values: np.ndarray) -> Any:
+        """Keep more values, where the others are."""
+        return values if self.file is None else self.file.add(name, values)
+
+    def instants(self) -> dict[str, Any]:
+        """All that is kept of the exchange instants, by name."""
+        if self.file is None:
+            return {**dict(zip(self.gg.Y.names, self.Y, strict=True)), **self.slow()}
+        self._flush()
+        return {n: self.file.array(n) for n in self._names}
+
+    def samples(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """Times of the waveform samples, and the waveforms by name; empty where none are kept."""
+        if not self.t_w.size:
+            return self.t_w, {}
+        if self.file is None:
+            return self.t_w, dict(zip(WAVEFORMS, self.waves, strict=True))
+        self._flush_waves()
+        t, *waves = (self.file.array(n) for n in _WAVE_ROWS)
+        return np.asarray(t), dict(zip(WAVEFORMS, waves, strict=True))
 
     def slow(self) -> dict[str, np.ndarray]:
         """Means, rms values, phasors, health and severity by name."""
@@ -396,9 +489,12 @@ def _collect(
 ) -> xr.Dataset:
     """Put the run into a labelled dataset."""
     gg, grid = apu.gas_generator, book.grid
-    gas = dict(zip(gg.Y.names, book.Y, strict=True))
+    kept = book.instants()
     measured = {
-        f"{n}_meas": gas[n] + s * rng.standard_normal(grid.size) for n, s in noise.gas.items()
+        f"{n}_meas": book.keep(
+            f"{n}_meas", np.asarray(kept[n]) + s * rng.standard_normal(grid.size)
+        )
+        for n, s in noise.gas.items()
     }
     signals = [*gg.Y, *_phasor_signals()]
     signals += [
@@ -406,15 +502,15 @@ def _collect(
         for n in noise.gas
     ]
     times = {"time": grid}
-    values: dict[str, dict[str, Any]] = {"time": {**gas, **book.slow(), **measured}}
-    if book.t_w.size:
-        times["time_w"] = book.t_w
-        w = dict(zip(WAVEFORMS, book.waves, strict=True))
+    values: dict[str, dict[str, Any]] = {"time": {**kept, **measured}}
+    t_w, w = book.samples()
+    if w:
+        times["time_w"] = t_w
         w["P_inst"] = w.pop("P_total")
         if noise.terminal is not None:
             y_sg = apu.generator.state_space().y
-            for n, a in noise.terminal.measure(w, rng).items():
-                w[f"{n}_meas"] = a
+            for n, a in noise.terminal.each(dict(w), rng):
+                w[f"{n}_meas"] = book.keep(f"{n}_meas", a)
                 signals.append(
                     dataclasses.replace(y_sg[n], name=f"{n}_meas", doc=f"measured: {y_sg[n].doc}")
                 )

@@ -12,13 +12,14 @@ import math
 import os
 import threading
 from collections.abc import Iterable, Mapping
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import netcdf3
 from apu_casadi.errors import DataError, SignalError, nearest
+from apu_casadi.filearrays import is_lazy
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -104,7 +105,8 @@ def dataset(
     Parameters
     ----------
     times : time coordinates [s] by name, each strictly increasing, shape (n,).
-    values : per time coordinate, arrays of shape (n,) or scalars by variable name.
+    values : per time coordinate, arrays of shape (n,), also lazy ones of
+        :mod:`apu_casadi.filearrays`, or scalars by variable name.
     signals : units and meanings; they come before those of :data:`CHANNELS`.
     attrs : attributes of the dataset; text or numbers.
 
@@ -145,7 +147,7 @@ def dataset(
                 raise SignalError(f"unit of {name!r} unknown {nearest(name, known)}")
             if name in variables:
                 raise SignalError(f"{name}: given on {variables[name][0]} and on {dim}")
-            a = np.asarray(value, dtype=float)
+            a = value if is_lazy(value) else np.asarray(value, dtype=float)
             if a.shape not in ((), (n,)):
                 raise SignalError(f"{name}: shape ({n},) as {dim} expected, got {a.shape}")
             unit, doc = known[name]
@@ -158,18 +160,19 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     """Write a dataset as netCDF 3 and return the path; attributes survive.
 
     The file is written under a temporary name beside ``path`` and renamed when it is complete: an
-    interrupted write never leaves a damaged file under the final name.
+    interrupted write never leaves a damaged file under the final name.  Long variables are written
+    in pieces of a few MiB.
 
     Raises
     ------
-    DataError : the file cannot be written there.
+    DataError : the file cannot be written there, or a variable has 4 GiB or more.
     """
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as f:
-            f.write(bytes(ds.to_netcdf(engine="scipy", format="NETCDF3_64BIT")))
+            netcdf3.write(ds, f)
             f.flush()
             os.fsync(f.fileno())
         os.replace(partial, path)
@@ -181,28 +184,33 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def load(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Read a dataset that :func:`save` wrote, wholly into memory.
+def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
+    """Read a dataset that :func:`save` wrote.
+
+    Parameters
+    ----------
+    path : of the file.
+    lazy : read values when they are asked for, each time anew, so that a file larger than memory
+        can be looked at; the file stays open with the dataset.  Otherwise all are read now.
 
     Raises
     ------
     DataError : the file is missing, is no netCDF 3 file, or is damaged.
     """
-    import xarray as xr
-
     path = Path(path)
     try:
-        raw = path.read_bytes()
+        with path.open("rb") as f:
+            start, size = f.read(8), os.fstat(f.fileno()).st_size
     except OSError as e:
         raise DataError(f"{path}: cannot be read: {e.strerror or e}") from e
-    if raw[:3] != b"CDF":
-        raise DataError(f"{path}: not a netCDF 3 file (it begins with {raw[:8]!r})")
+    if start[:3] != b"CDF":
+        raise DataError(f"{path}: not a netCDF 3 file (it begins with {start!r})")
     try:
-        with xr.open_dataset(BytesIO(raw), engine="scipy", decode_times=False) as ds:
-            return ds.load()
+        ds = netcdf3.open_lazily(path)
+        return ds if lazy else ds.load()
     except Exception as e:  # a damaged file fails anywhere inside the reader, with any type
         raise DataError(
-            f"{path}: damaged netCDF file of {len(raw)} bytes ({type(e).__name__}: {e}); "
+            f"{path}: damaged netCDF file of {size} bytes ({type(e).__name__}: {e}); "
             "run the scenario again"
         ) from e
 
@@ -261,6 +269,25 @@ _MEANS = (
     ("P_loss_fault", "P_loss_fault", 1.0),
 )
 _HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
+_HEALTHY_NAN = ("k_rf", "kappa")
+
+
+class _Columns:
+    """Values of a dataset by name; those in a file are read anew each time, not all are held."""
+
+    def __init__(self, ds: xr.Dataset) -> None:
+        self.ds = ds
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        v = self.ds[name]
+        if v.dims != ("time",) or v.dtype.kind not in "fiu":
+            where = ", ".join(map(str, v.dims)) or "no dimension"
+            raise DataError(f"{name}: numbers on time are expected, {v.dtype} on {where} found")
+        values: np.ndarray = v.values
+        if name not in _HEALTHY_NAN and not np.isfinite(values).all():
+            k = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise DataError(f"{name} = {values[k]:g} at t = {self.ds['time'].values[k]:g} s")
+        return values
 
 
 def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
@@ -275,7 +302,7 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
 
     Raises
     ------
-    DataError : a variable is missing, or a phase holds no sample.
+    DataError : a variable is missing, is not finite or no number, or a phase holds no sample.
     """
     needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
     missing = [v for v in needed if v not in ds]
@@ -283,7 +310,7 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         raise DataError(f"the dataset lacks {', '.join(missing)}")
     t = ds["time"].values
     tol = 1e-9
-    col = {v: ds[v].values for v in needed}
+    col = _Columns(ds)
     rows = []
     for k, p in enumerate(phases(ds)):
         # a sample is the end of a step: the one at a boundary belongs to the earlier phase

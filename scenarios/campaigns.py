@@ -16,14 +16,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import math
-import multiprocessing
 import os
-import signal
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,23 +30,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
-from scenarios import registry
+from scenarios import campaign_records, registry
+from scenarios.campaign_records import COLUMNS, RUNS, STATUS
+from scenarios.locking import locked
 from scenarios.schema import FaultSpec, Scenario
+from scenarios.workers import pool, stoppable
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-RUNS = "runs.jsonl"
 DATASET = "campaign.nc"
-STATUS = ("done", "refused", "failed", "invalid", "crashed")
-"""What became of a run: refused, no steady start; failed, the simulation stopped; invalid, a wrong
-scenario or parameter; crashed, an unforeseen error or the loss of the process."""
-
-THREADS = (
-    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-)  # fmt: skip
+LOCK = "campaign.lock"
+_log = logging.getLogger("apu_casadi")
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished runs and of all."""
@@ -144,23 +138,23 @@ def _run_one(task: _Task) -> dict[str, Any]:
 
     t = time.perf_counter()
     record: dict[str, Any] = {"key": task.key, "name": task.table["name"], "reason": ""}
+    ds = None
     try:
         s = Scenario.from_dict(task.table)
         ds = registry.run(s, solver=task.solver)
-        record["phases"] = phase_summary(ds)
+        record["phases"] = [{k: row[k] for k in ("name", *COLUMNS)} for row in phase_summary(ds)]
         solver = json.loads(ds.attrs["solver"])
         record["residual"] = float(solver["residual_max"])
-        if task.keep is not None:
-            save(ds, Path(task.keep) / f"{s.name}.nc")
         record["status"] = "done"
-    except DataError:
-        raise  # nothing wrong with the run: its file cannot be written, nor could the next
     except ApuError as e:
         kinds = {OperatingPointError: "refused", SimulationError: "failed"}
         record["status"] = next((v for k, v in kinds.items() if isinstance(e, k)), "invalid")
         record["reason"] = " ".join(str(e).split())
     except Exception as e:
         record["status"], record["reason"] = "crashed", f"{type(e).__name__}: {e}"
+    if record["status"] == "done" and task.keep is not None:
+        # a file that cannot be written is no fault of the run, nor could the next: DataError
+        save(ds, Path(task.keep) / f"{task.table['name']}.nc")
     record["seconds"] = time.perf_counter() - t
     return record
 
@@ -177,8 +171,13 @@ def run_campaign(
     progress: Progress | None = None,
     resume: bool = True,
     solver: str = "propagator",
+    wait: bool = True,
+    say: Callable[[str], None] | None = None,
 ) -> xr.Dataset:
     """Run scenarios over processes; return one row of summary quantities for each.
+
+    Ctrl-C and SIGTERM end it with KeyboardInterrupt, and its processes with it; so does its own
+    end by any other cause.  Two campaigns in one folder run one after the other.
 
     Parameters
     ----------
@@ -191,6 +190,9 @@ def run_campaign(
     resume : take runs from ``runs.jsonl`` that the same scenario gave with the same program
         before, crashed ones excepted; False begins anew.
     solver : as for :func:`scenarios.registry.run`.
+    wait : wait while another campaign works in the folder; what it has done is not done again.
+        False refuses instead.
+    say : called with a sentence that names the process waited for; by default the log is.
 
     Returns
     -------
@@ -201,11 +203,43 @@ def run_campaign(
     Raises
     ------
     ScenarioError : no runs, two of one name, workers < 1, or an unknown solver.
-    DataError : ``out`` cannot be read or written.
+    DataError : ``out`` cannot be read or written, or another campaign works there.
     """
+    scenarios = list(scenarios)
+    _check(scenarios, workers, solver)
+    if out is None and not summary_only:
+        raise ScenarioError("the datasets of all runs need a folder: give out")
+    if summary_only:
+        scenarios = [s if s.waveform_dt is None else s.change(waveform_dt=None) for s in scenarios]
+    if out is None:
+        tasks = [_task(s, solver, None) for s in scenarios]
+        with stoppable() as check:
+            done = _run_all(tasks, {}, workers, progress, lambda record: check())
+        return _dataset(scenarios, [done[t.key] for t in tasks], solver)
+    folder = registry.prepare(out)
+    with stoppable() as check, locked(folder, LOCK, wait=wait, say=say):
+        keep = None if summary_only else str(registry.prepare(folder / "runs"))
+        tasks = [_task(s, solver, keep) for s in scenarios]
+        _sweep(folder, folder / "runs")
+        done = _finished(folder, tasks, keep) if resume else {}
+        with campaign_records.appending(folder / RUNS, fresh=not resume) as write:
+
+            def keep_it(record: Mapping[str, Any]) -> None:
+                check()  # what an interrupted run says of itself is not true
+                write(record)
+
+            done = _run_all(tasks, done, workers, progress, keep_it)
+        _sweep(folder / "runs")  # of processes that were killed meanwhile
+        ds = _dataset(scenarios, [done[t.key] for t in tasks], solver)
+        from apu_casadi.results import save
+
+        save(ds, folder / DATASET)
+    return ds
+
+
+def _check(scenarios: Sequence[Scenario], workers: int | None, solver: str) -> None:
     from apu_casadi.multirate import SOLVERS
 
-    scenarios = list(scenarios)
     if not scenarios:
         raise ScenarioError("a campaign needs at least one scenario")
     names = [s.name for s in scenarios]
@@ -216,31 +250,34 @@ def run_campaign(
         raise ScenarioError(f"workers must be >= 1, got {workers}")
     if solver not in SOLVERS:
         raise ScenarioError(f"solver {solver!r} {nearest(solver, SOLVERS)}")
-    if out is None and not summary_only:
-        raise ScenarioError("the datasets of all runs need a folder: give out")
-    folder = None if out is None else registry.prepare(out)
-    keep = None
-    if folder is not None and not summary_only:
-        keep = str(registry.prepare(folder / "runs"))
-    if summary_only:
-        scenarios = [s if s.waveform_dt is None else s.change(waveform_dt=None) for s in scenarios]
-    tasks = [_task(s, solver, keep) for s in scenarios]
-    done = _finished(folder, tasks, keep) if folder is not None and resume else {}
+
+
+def _run_all(
+    tasks: Sequence[_Task],
+    done: dict[str, dict[str, Any]],
+    workers: int | None,
+    progress: Progress | None,
+    write: Callable[[Mapping[str, Any]], None],
+) -> dict[str, dict[str, Any]]:
+    """Run the tasks that are not done; return the records of all by key."""
     open_ = [t for t in tasks if t.key not in done]
     if progress is not None:
         progress(len(done), len(tasks))
-    with _log(folder, fresh=not resume) as write:
-        for record in _records(open_, workers):
+    with contextlib.closing(_records(open_, workers)) as records:
+        for record in records:
             write(record)
             done[record["key"]] = record
             if progress is not None:
                 progress(len(done), len(tasks))
-    ds = _dataset(scenarios, [done[t.key] for t in tasks], solver)
-    if folder is not None:
-        from apu_casadi.results import save
+    return done
 
-        save(ds, folder / DATASET)
-    return ds
+
+def _sweep(*folders: Path) -> None:
+    """Remove what killed processes left half written; nobody else works here now."""
+    for folder in folders:
+        for path in folder.glob(".*.part"):
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
@@ -252,7 +289,9 @@ def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
     return _Task(hashlib.sha256(content.encode()).hexdigest()[:32], table, solver, keep)
 
 
-def _records(tasks: Sequence[_Task], workers: int | None) -> Iterator[dict[str, Any]]:
+def _records(
+    tasks: Sequence[_Task], workers: int | None
+) -> Generator[dict[str, Any], None, None]:  # fmt: skip
     """Yield the records of all tasks, in the order in which they end."""
     from apu_casadi.backend import available_threads
 
@@ -281,7 +320,7 @@ def _pooled(
     waiting = tasks[::-1]
     fruitless = 0
     while waiting:
-        with _plain_children(), _pool(workers) as pool:
+        with pool(workers) as executor:
             under_way: dict[Future[dict[str, Any]], _Task] = {}
             broken = False
             fruitless += 1
@@ -291,7 +330,7 @@ def _pooled(
                 # few under way, so that an interrupt is answered within a run or two
                 while waiting and len(under_way) < 2 * workers and not broken:
                     try:
-                        under_way[pool.submit(_run_one, waiting[-1])] = waiting[-1]
+                        under_way[executor.submit(_run_one, waiting[-1])] = waiting[-1]
                         waiting.pop()
                     except BrokenProcessPool:
                         broken = True
@@ -308,104 +347,37 @@ def _pooled(
             suspects.extend(under_way.values())
 
 
-@contextlib.contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool that an exception ends as soon as the runs under way have ended."""
-    pool = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_ignore_interrupt
-    )
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _ignore_interrupt() -> None:
-    """Ctrl-C reaches all processes of a terminal; the first one decides."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-@contextlib.contextmanager
-def _plain_children() -> Iterator[None]:
-    """Let processes started inside the block use one thread each, and not run our main script.
-
-    The latter is what spawning does, for functions that the script may define; ours are here.
-    """
-    before = {k: os.environ.get(k) for k in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    main = sys.modules["__main__"]
-    held: dict[str, Any] = {
-        k: vars(main).pop(k) for k in ("__file__", "__spec__") if k in vars(main)
-    }
-    main.__spec__ = None
-    try:
-        yield
-    finally:
-        vars(main).update(held)
-        for k, v in before.items():
-            if v is None:
-                os.environ.pop(k, None)
-            else:
-                os.environ[k] = v
-
-
 # ------------------------------------------------------------------------------ kept on disk
-
-
-def _line(record: Mapping[str, Any]) -> str:
-    text = json.dumps(record, sort_keys=True)
-    return f"{hashlib.sha256(text.encode()).hexdigest()[:16]} {text}\n"
 
 
 def _finished(folder: Path, tasks: Sequence[_Task], keep: str | None) -> dict[str, dict[str, Any]]:
     """Return the records of these tasks that stand whole in the folder; crashed ones do not count.
 
-    A line that was cut short or changed fails its sum, and its run is done again.
+    A damaged record is told, and its run is done again.
     """
-    try:
-        text = (folder / RUNS).read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        return {}
-    except OSError as e:
-        raise DataError(f"{folder / RUNS}: cannot be read: {e.strerror or e}") from None
-    asked = {t.key for t in tasks}
+    asked = {t.key: (t.table["name"], len(t.table["phase"])) for t in tasks}
     found = {}
-    for line in text.splitlines():
-        total, _, body = line.partition(" ")
-        if hashlib.sha256(body.encode()).hexdigest()[:16] != total:
-            continue
-        record = json.loads(body)
-        here = record["key"] in asked and record["status"] != "crashed"
+    for key, record in campaign_records.read(folder / RUNS, asked).items():
+        here = record["status"] != "crashed"
         if here and keep is not None and record["status"] == "done":
-            here = (Path(keep) / f"{record['name']}.nc").exists()
+            here = _whole(Path(keep) / f"{record['name']}.nc")
         if here:
-            found[record["key"]] = record
+            found[key] = record
     return found
 
 
-@contextlib.contextmanager
-def _log(folder: Path | None, *, fresh: bool) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Yield a function that appends a record to the folder's file, or does nothing."""
-    if folder is None:
-        yield lambda record: None
-        return
-    path = folder / RUNS
+def _whole(path: Path) -> bool:
+    """Whether a run's own file is there, with all its bytes; one that is damaged is told."""
+    from apu_casadi.results import load
+
+    if not path.exists():
+        return False
     try:
-        f = path.open("w" if fresh else "a+", encoding="utf-8", newline="\n")
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from None
-
-    def write(record: Mapping[str, Any]) -> None:
-        try:
-            f.write(_line(record))
-            f.flush()
-        except OSError as e:
-            raise DataError(f"{path}: cannot be written: {e.strerror or e}") from None
-
-    with f:
-        if not fresh and path.stat().st_size and not path.read_bytes().endswith(b"\n"):
-            f.write("\n")  # the rest of a line that was cut short stays alone
-        yield write
+        load(path, lazy=True)
+    except DataError as e:
+        _log.warning("%s", e)
+        return False
+    return True
 
 
 # ------------------------------------------------------------------------------ result

@@ -1,17 +1,24 @@
 """Campaigns: reproducible draws, nothing lost, resumed where they stopped."""
 
+import contextlib
 import json
 import os
+import signal
+import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
 
 from apu_casadi import results
-from apu_casadi.errors import ScenarioError
-from scenarios import campaigns, registry
+from apu_casadi.errors import DataError, ScenarioError, SimulationError
+from scenarios import campaign_records, campaigns, registry, workers
+from scenarios.campaign_records import COLUMNS
 from scenarios.campaigns import RUNS, counts, random_faults, run_campaign
 from scenarios.cli import main
+from scenarios.locking import locked
 from scenarios.schema import FaultSpec, Scenario
 
 BASE = {
@@ -143,11 +150,18 @@ def test_a_changed_scenario_runs_again(base, tmp_path):
     assert len((tmp_path / RUNS).read_text().splitlines()) == 2
 
 
-def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path):
+def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path, caplog):
     (run,) = random_faults(1, base=base.change(waveform_dt=1e-3))
     run_campaign([run], workers=1, out=tmp_path, summary_only=False)
     ds = results.load(tmp_path / "runs" / f"{run.name}.nc")
     assert abs(ds.sizes["time_w"] - 401) <= 1
+    path = tmp_path / "runs" / f"{run.name}.nc"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])  # a file that lost its end is made again, and told
+    (tmp_path / "runs" / ".x.nc.7.part").write_bytes(b"of a killed process")
+    run_campaign([run], workers=1, out=tmp_path, summary_only=False)
+    assert path.read_bytes() == whole and "damaged netCDF file" in caplog.text
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
     with pytest.raises(ScenarioError, match="need a folder"):
         run_campaign([run], summary_only=False)
 
@@ -186,10 +200,187 @@ def test_a_dead_process_costs_one_run(base, monkeypatch):
         def shutdown(self, **_):
             pass
 
-    monkeypatch.setattr(campaigns, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
     ds = run_campaign(runs, workers=2)
     assert counts(ds)["done"] == 3 and counts(ds)["crashed"] == 1
     assert str(ds["reason"].values[1]).startswith("the process ended")
+
+
+def sealed(record):
+    """A line as it stands in the file, whatever the record is."""
+    return campaign_records.line(record).decode()
+
+
+def test_records_hold_every_number_of_a_summary(base):
+    """The columns that are kept and checked are those that a summary has."""
+    ds = registry.run(base.change(waveform_dt=None), solver="propagator")
+    for row in results.phase_summary(ds):
+        numbers = {k for k, v in row.items() if v is None or isinstance(v, int | float)}
+        assert set(COLUMNS) == numbers
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda r: [],
+        lambda r: 1,
+        lambda r: {},
+        lambda r: {"key": r["key"]},
+        lambda r: {"key": 1},
+        lambda r: {**r, "name": "another"},
+        lambda r: {**r, "status": "fine"},
+        lambda r: {**r, "status": ["done"]},
+        lambda r: {**r, "reason": None},
+        lambda r: {**r, "seconds": "1"},
+        lambda r: {**r, "residual": float("nan")},
+        lambda r: {**r, "phases": r["phases"][:2]},
+        lambda r: {**r, "phases": {"0": 1}},
+        lambda r: {**r, "phases": [*r["phases"][:2], 3]},
+        lambda r: {**r, "phases": [{**row, "T4": "1200"} for row in r["phases"]]},
+        lambda r: {**r, "phases": [{**row, "T4": True} for row in r["phases"]]},
+        lambda r: {**r, "phases": [{**row, "T4": None} for row in r["phases"]]},
+        lambda r: {**r, "phases": [{**row, "h": float("inf")} for row in r["phases"]]},
+        lambda r: {**r, "phases": [{k: row[k] for k in ("name", "T4")} for row in r["phases"]]},
+    ],
+)
+def test_a_wrong_record_with_a_right_sum_is_told_and_left_out(kept, damage, tmp_path, caplog):
+    """The file loses it; lines of other campaigns stay."""
+    record, asked = kept
+    path = tmp_path / RUNS
+    other = sealed({"key": "of another campaign", "name": "x"})
+    path.write_text(sealed(damage(record)) + other)
+    assert campaign_records.read(path, asked) == {}
+    assert "1 damaged line left out (line 1: " in caplog.text
+    assert path.read_text() == other
+    path.write_text(sealed(record))
+    assert campaign_records.read(path, asked) == {record["key"]: record}
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A record, and what it is asked for by."""
+    folder = tmp_path_factory.mktemp("kept")
+    (run,) = random_faults(1, base=Scenario.from_dict(BASE))
+    run_campaign([run], workers=1, out=folder)
+    record = json.loads((folder / RUNS).read_text().partition(" ")[2])
+    return record, {record["key"]: (run.name, 3)}
+
+
+def test_damaged_bytes_are_made_again(base, tmp_path, caplog):
+    """Zeros, other line ends, a mark at the beginning, a text without end."""
+    runs = random_faults(2, base=base)
+    whole = run_campaign(runs, workers=1, out=tmp_path)
+    raw = (tmp_path / RUNS).read_bytes()
+    deep = b"[" * 100_000
+    for damaged in (
+        b"\xef\xbb\xbf" + raw,
+        raw.replace(b"\n", b"\r\n"),
+        raw[:100] + bytes(50) + raw[150:],
+        raw + campaign_records._sum(deep) + b" " + deep + b"\n",
+        raw + raw,
+        b"",
+    ):
+        (tmp_path / RUNS).write_bytes(damaged)
+        assert same(run_campaign(runs, workers=1, out=tmp_path), whole)
+        caplog.clear()
+        ran = run_campaign(runs, workers=1, out=tmp_path)
+        assert same(ran, whole) and not caplog.records  # told once: the file is clean
+
+
+def test_a_full_disk_keeps_what_was_there(tmp_path):
+    """Half a line finds room; it is taken back, and the error says what is kept."""
+
+    class Full:
+        def __init__(self, f):
+            self.f, self.room = f, 20
+
+        def write(self, data):
+            if not self.room:
+                raise OSError(28, "No space left on device")
+            n, self.room = self.f.write(data[: self.room]), 0
+            return n
+
+        def __getattr__(self, name):
+            return getattr(self.f, name)
+
+    path = tmp_path / RUNS
+    path.write_bytes(b"what was there\n")
+    with (
+        path.open("r+b", buffering=0) as f,
+        pytest.raises(DataError, match=r"No space left on device; the runs in it are kept"),
+    ):
+        f.seek(0, 2)
+        campaign_records._append(Full(f), path, b"a line of more than twenty bytes\n")
+    assert path.read_bytes() == b"what was there\n"
+
+
+def test_an_interruption_that_looks_like_a_failure_is_not_recorded(base, tmp_path, monkeypatch):
+    """Ctrl-C inside an integrator comes out as an error of the run."""
+
+    def interrupted(*_, **__):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise SimulationError("cvodes failed")
+
+    monkeypatch.setattr(registry, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(random_faults(2, base=base), workers=1, out=tmp_path)
+    assert (tmp_path / RUNS).read_bytes() == b""
+
+
+def test_two_campaigns_in_one_folder_share_what_is_done(base, tmp_path):
+    """The second waits, says for whom, and finds everything done; or it refuses."""
+    runs = random_faults(2, base=base)
+    said, got = [], []
+    second = threading.Thread(
+        target=lambda: got.append(run_campaign(runs, workers=1, out=tmp_path, say=said.append))
+    )
+    with locked(tmp_path, campaigns.LOCK):
+        second.start()
+        with pytest.raises(DataError, match=f"in use by process {os.getpid()}"):
+            run_campaign(runs, workers=1, out=tmp_path, wait=False)
+        while not said:
+            time.sleep(0.01)
+        assert not (tmp_path / RUNS).exists()
+    second.join()
+    assert counts(got[0])["done"] == 2 and "waiting until it ends" in said[0]
+    assert len((tmp_path / RUNS).read_text().splitlines()) == 2
+
+
+def test_what_a_killed_process_left_half_written_goes(base, tmp_path):
+    (tmp_path / ".campaign.nc.123.part").write_bytes(b"CDF")
+    run_campaign(random_faults(1, base=base), workers=1, out=tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [campaigns.DATASET, RUNS]
+
+
+def test_an_interrupted_command_says_what_is_kept(tmp_path, monkeypatch, capsys):
+    def stopped(*_, progress, **__):
+        progress(3, 7)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(campaigns, "run_campaign", stopped)
+    assert main(["campaign", "--runs", "7", "--out", str(tmp_path)]) == 130
+    assert f"3 of 7 runs are kept in {tmp_path}; the same command goes" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # two campaigns over processes, each with the start of its interpreters
+@pytest.mark.skipif(os.name == "nt", reason="no SIGTERM there")
+def test_sigterm_ends_a_campaign_as_ctrl_c_does(tmp_path):
+    """Status, words, what is kept; and the same command gives what an undisturbed one gives."""
+    line = [sys.executable, "-m", "scenarios.cli", "campaign", "--runs", "6", "--workers", "2",
+            "--quiet", "--out", str(tmp_path)]  # fmt: skip
+    p = subprocess.Popen(line, stderr=subprocess.PIPE, text=True)
+    path = tmp_path / RUNS
+    while not (path.exists() and path.stat().st_size):
+        assert p.poll() is None
+        time.sleep(0.05)
+    p.terminate()
+    _, err = p.communicate(timeout=30)
+    assert p.returncode in (130, 143) and "runs are kept in" in err and "Traceback" not in err
+    assert not (tmp_path / campaigns.DATASET).exists()
+    subprocess.run(line, check=True)
+    again = results.load(tmp_path / campaigns.DATASET)
+    assert same(again, run_campaign(random_faults(6), workers=1))
 
 
 @pytest.mark.parametrize(

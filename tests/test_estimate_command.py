@@ -7,7 +7,9 @@ checked against the dataset itself.
 import argparse
 import dataclasses
 import json
+import os
 import signal
+import threading
 
 import casadi as ca
 import numpy as np
@@ -19,12 +21,13 @@ from apu_casadi.results import dataset
 from apu_casadi.signals import Signal
 from scenarios import cli
 from scenarios.commands import estimate as command
-from scenarios.estimation import fingerprint, jointrun, studies
+from scenarios.estimation import fingerprint, jointrun, page, studies
 from scenarios.estimation.correctness import correctness
 from scenarios.estimation.electrical.tuning import FAULT_LEVEL
 from scenarios.estimation.gaspath_study import FRESH
 from scenarios.estimation.joint import GAIN_SHARE
 from scenarios.estimation.reports import REPORTS
+from scenarios.locking import locked
 from scenarios.schema import Scenario
 
 ONSET_HEALTH, ONSET_H = 1.0, 2.0
@@ -285,6 +288,53 @@ def test_wrong_studies_and_files(tmp_path):
     (tmp_path / "speed.json").write_text("{")
     with pytest.raises(DataError, match="cannot be read"):
         studies.read(studies.get("speed"), tmp_path)
+
+
+def test_a_damaged_part_is_told_and_run_again(toy, tmp_path, caplog):
+    """One number, one type, one name changed in the file: that part alone is made again."""
+    study, ran, _ = toy
+    whole = studies.run("correctness", tmp_path, n_seeds=40)
+    path = tmp_path / "correctness.json"
+    for part, key, value in (
+        ("a", "result", {"n": 41, "x": [0.333333, None]}),
+        ("b", "seeds", "1000"),
+        ("b", "seeds", [1000, 4.0]),
+        ("c", "versions", None),
+    ):
+        ran.clear(), caplog.clear()
+        record = json.loads(path.read_text())
+        record["parts"][part][key] = value
+        path.write_text(json.dumps(record))
+        assert studies.pending(study, tmp_path, 40) == [part]
+        again = studies.run("correctness", tmp_path, n_seeds=40)
+        assert ran == [part] and f"part {part!r} is left out" in caplog.text
+        assert {k: p["result"] for k, p in again["parts"].items()} == {
+            k: p["result"] for k, p in whole["parts"].items()
+        }
+    path.write_text(json.dumps({"study": "correctness", "parts": {}}))
+    with pytest.raises(DataError, match="no table 'fixed'"):
+        studies.run("correctness", tmp_path, n_seeds=40)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["correctness.json"]  # no lock is left
+
+
+def test_what_no_report_can_read_is_an_error_with_a_remedy():
+    part = {"seeds": [1, 9], "result": 3}
+    with pytest.raises(DataError, match=r"study shaft-power: .* --again makes it anew"):
+        page.claims({"shaft-power": {"parts": {"filter": part}}})
+
+
+def test_two_processes_do_not_run_a_study_twice(toy, tmp_path, caplog):
+    """The second waits for the first, here one that has ended but for its lock."""
+    _, ran, _ = toy
+    with locked(tmp_path, "correctness.lock"):
+        began = threading.Thread(
+            target=studies.run, args=("correctness", tmp_path), kwargs={"n_seeds": 40}
+        )
+        began.start()
+        began.join(0.5)
+        assert began.is_alive() and ran == []
+    began.join()
+    assert ran == ["a", "b", "c"] and f"in use by process {os.getpid()}" in caplog.text
 
 
 def test_names_on_the_command_line_are_the_studies():

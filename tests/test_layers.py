@@ -18,7 +18,8 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
     ("errors", "checked", "sharing"),
-    ("signals", "parameters", "mapcheck", "cachefolder", "calling"),
+    ("signals", "parameters", "mapcheck", "cachefolder", "calling", "filearrays"),
+    ("netcdf3", "runstorage"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),

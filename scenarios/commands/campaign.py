@@ -2,7 +2,8 @@
 
 Health factors, severity (mu, k_rf, kappa), phase and time of the short circuit are drawn at random.
 Each finished run is kept in DIR/runs.jsonl at once: after an interruption the same command goes on.
-The result is DIR/campaign.nc, with the reason of every run that was refused.
+The result is DIR/campaign.nc, with the reason of every run that was refused.  While another
+campaign works in DIR this one waits, and takes over what that one has done.
 
   apu campaign --runs 1000 --seed 1 --out results/campaign
 """
@@ -36,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--waveforms", action="store_true", help="keep the full dataset of each run (large)"
     )
+    parser.add_argument(
+        "--no-wait", action="store_true", help="refuse when another campaign works in DIR"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -48,11 +52,26 @@ def run(args: argparse.Namespace) -> int:
 
     runs = campaigns.random_faults(args.runs, args.seed, base=registry.get(args.base))
     t = time.perf_counter()
-    with _bar(args.runs, show=not args.quiet and sys.stderr.isatty()) as progress:
-        ds = campaigns.run_campaign(
-            runs, workers=args.workers, out=args.out, summary_only=not args.waveforms,
-            progress=progress, resume=not args.fresh,
-        )  # fmt: skip
+    kept = 0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal kept
+        kept = done
+        move(done, total)
+
+    def say(sentence: str) -> None:
+        print(f"apu: {sentence}", file=sys.stderr, flush=True)
+
+    try:
+        with _bar(args.runs, show=not args.quiet and sys.stderr.isatty()) as move:
+            ds = campaigns.run_campaign(
+                runs, workers=args.workers, out=args.out, summary_only=not args.waveforms,
+                progress=progress, resume=not args.fresh, wait=not args.no_wait, say=say,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        again = "the same command without --fresh" if args.fresh else "the same command"
+        say(f"{kept} of {args.runs} runs are kept in {args.out}; {again} goes on with them")
+        raise
     t = time.perf_counter() - t
     n = campaigns.counts(ds)
     reasons = {
@@ -75,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _bar(total: int, *, show: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Yield a callback that moves a progress bar on stderr; None where none is shown."""
+def _bar(total: int, *, show: bool) -> Iterator[Callable[[int, int], None]]:
+    """Yield a callback that moves a progress bar on stderr, or does nothing."""
     if not show:
-        yield None
+        yield lambda done, total: None
         return
     from tqdm import tqdm
 

@@ -127,6 +127,7 @@ def _study(args: argparse.Namespace) -> int:
     from apu_casadi.errors import ParameterError, nearest
     from scenarios import registry
     from scenarios.estimation import studies
+    from scenarios.estimation.kept import understood
     from scenarios.estimation.reports import REPORTS
 
     known = [*studies.STUDIES, "all"]
@@ -147,7 +148,8 @@ def _study(args: argparse.Namespace) -> int:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _interruptible(), _study_bar(name, show=show) as progress:
             record = studies.run(name, folder, n_seeds=n, again=args.again, progress=progress)
-        found[name] = REPORTS[name].claims(studies.results(record))
+        with understood(name):
+            found[name] = REPORTS[name].claims(studies.results(record))
         if not args.json:
             remark = studies.other_code(studies.get(name), record)
             if remark:

@@ -12,6 +12,7 @@ from typing import Any
 
 from apu_casadi.errors import DataError
 from scenarios.estimation import studies
+from scenarios.estimation.kept import understood
 from scenarios.estimation.reports import JOINT, REPORTS, Claim, Pictures
 from scenarios.estimation.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from scenarios.pages import markdown_table, write_text
@@ -100,7 +101,10 @@ def load(folder: str | Path) -> dict[str, dict[str, Any]]:
 
 def claims(records: Mapping[str, Mapping[str, Any]]) -> list[Claim]:
     """Return all claims, sorted by goal."""
-    every = [c for name, r in records.items() for c in REPORTS[name].claims(studies.results(r))]
+    every: list[Claim] = []
+    for name, r in records.items():
+        with understood(name):
+            every += REPORTS[name].claims(studies.results(r))
     return sorted(every, key=lambda c: 9 if c.goal == JOINT else int(c.goal))
 
 
@@ -229,7 +233,8 @@ def _study(name: str, record: Mapping[str, Any], figures: Pictures) -> list[str]
     study, report = studies.STUDIES[name], REPORTS[name]
     parts = record["parts"]
     blocks = [f"## {study.title}", f"Goal: {study.goal}", report.intro]
-    blocks += report.section(studies.results(record))
+    with understood(name):
+        blocks += report.section(studies.results(record))
     blocks += [f"![{text}]({IMAGES}/{file})" for text, (file, _) in figures.items()]
     absent = [p for p in study.parts if p not in parts]
     if absent:
@@ -258,7 +263,11 @@ def _durations(records: Mapping[str, Mapping[str, Any]]) -> str:
 
 def pictures(records: Mapping[str, Mapping[str, Any]]) -> dict[str, Pictures]:
     """Return the figures of all records by study, not drawn yet."""
-    return {name: REPORTS[name].figures(studies.results(r)) for name, r in records.items()}
+    found = {}
+    for name, r in records.items():
+        with understood(name):
+            found[name] = REPORTS[name].figures(studies.results(r))
+    return found
 
 
 def write(path: str | os.PathLike[str], records: Mapping[str, Mapping[str, Any]]) -> list[Path]:
@@ -267,8 +276,10 @@ def write(path: str | os.PathLike[str], records: Mapping[str, Mapping[str, Any]]
     out = path.parent / IMAGES
     out.mkdir(parents=True, exist_ok=True)
     made = [write_text(path, page(records))]
-    for group in pictures(records).values():
+    for name, group in pictures(records).items():
         for file, figure in group.values():
-            figure().savefig(out / file, dpi=DPI)
+            with understood(name):
+                drawn = figure()
+            drawn.savefig(out / file, dpi=DPI)
             made.append(out / file)
     return made

@@ -26,8 +26,10 @@ from pkgutil import iter_modules
 from typing import Any
 
 from apu_casadi.errors import DataError, ParameterError, nearest
+from scenarios.estimation import kept
 from scenarios.estimation.fingerprint import digest
 from scenarios.estimation.gaspath_study import FRESH, TUNED, TUNED_LONG
+from scenarios.locking import locked
 from scenarios.pages import write_text
 
 __all__ = [
@@ -515,22 +517,14 @@ def path_of(study: Study, folder: str | Path) -> Path:
 def read(study: Study, folder: str | Path) -> dict[str, Any]:
     """Return the kept record of a study: ``fixed`` constants, and by part settings and ``result``.
 
-    An empty record if there is none.
+    An empty record if there is none; damaged parts are left out, and told.
 
     Raises
     ------
     DataError : the file cannot be read, or is none of ours.
     """
-    path = path_of(study, folder)
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {"study": study.name, "fixed": {}, "parts": {}}
-    except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be read as a study: {e}") from None
-    if not isinstance(record, dict) or record.get("study") != study.name:
-        raise DataError(f"{path} does not hold the study {study.name!r}")
-    return record
+    record = kept.read(path_of(study, folder), study.name)
+    return {"study": study.name, "fixed": {}, "parts": {}} if record is None else record
 
 
 @dataclass(frozen=True)
@@ -628,6 +622,8 @@ def run(
 ) -> dict[str, Any]:
     """Run what is pending of a study, write each part when it is done, return the record.
 
+    While another process runs the study in the folder this one waits, and takes over its parts.
+
     Parameters
     ----------
     name : of the study.
@@ -644,7 +640,14 @@ def run(
     n = study.seeds if n_seeds is None else n_seeds
     if n < 2:
         raise ParameterError(f"a study of {n} seeds says nothing: 2 at least")
-    fixed = study.fixed()
+    with locked(Path(folder), f"{name}.lock"):
+        return _run(study, folder, n, again=again, progress=progress)
+
+
+def _run(
+    study: Study, folder: str | Path, n: int, *, again: bool, progress: Progress | None
+) -> dict[str, Any]:
+    name, fixed = study.name, study.fixed()
     todo = list(study.parts) if again else pending(study, folder, n)
     record = read(study, folder)
     if record["fixed"] != fixed:
@@ -661,13 +664,13 @@ def run(
         tell(0, 1)
         began = time.perf_counter()
         result = _plain(part.run(part.seeds(n), study.seed0, tell))
-        record["parts"][key] = {
+        record["parts"][key] = kept.signed({
             "seeds": _settings(study, part, n),
             "seconds": round(time.perf_counter() - began, 1),
             "versions": versions(),
             "code": digest(study.name),
             "result": result,
-        }
+        })  # fmt: skip
         ordered = {k: record["parts"][k] for k in study.parts if k in record["parts"]}
         record = {"study": name, "title": study.title, "goal": study.goal, "tuned": study.tuned,
                   "fixed": fixed, "parts": ordered}  # fmt: skip

@@ -33,7 +33,7 @@ from apu_casadi.gasgenerator import RPM, GasGenerator
 from apu_casadi.maps import MapCalibration
 from apu_casadi.steadypoint import OperatingPoint
 from apu_casadi.trimming import trim_gas_generator
-from scenarios.peers.process import run_script
+from scenarios.peers.process import end_all, run_script
 from scenarios.validation import Row, SkippedError, relative, section
 
 VARIABLE = "APU_PYCYCLE_PYTHON"
@@ -120,7 +120,11 @@ def run_pycycle(gg: GasGenerator, *interpolations: str) -> list[dict[str, Any]]:
     python = interpreter()
     cases = [pycycle_case(gg, i) for i in interpolations]
     with ThreadPoolExecutor(len(cases)) as pool:
-        return list(pool.map(lambda c: run_script(python, "pycycle_run.py", c), cases))
+        try:
+            return list(pool.map(lambda c: run_script(python, "pycycle_run.py", c), cases))
+        except BaseException:
+            end_all()  # or leaving the block would wait for them
+            raise
 
 
 def trimmed(gg: GasGenerator) -> list[OperatingPoint]:

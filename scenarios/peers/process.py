@@ -11,6 +11,7 @@ from typing import Any
 from apu_casadi.errors import SimulationError
 
 TIMEOUT = 900.0  # s; the slowest takes one minute
+_RUNNING: list[subprocess.Popen[str]] = []
 
 
 def run_script(python: str, script: str, case: dict[str, Any]) -> dict[str, Any]:
@@ -34,20 +35,30 @@ def run_script(python: str, script: str, case: dict[str, Any]) -> dict[str, Any]
     path = Path(__file__).parent / script
     with tempfile.TemporaryDirectory() as folder:
         try:
-            done = subprocess.run(
-                [python, "-I", "-W", "ignore", str(path)],
-                input=json.dumps(case),
-                capture_output=True,
-                text=True,
-                cwd=folder,
-                timeout=TIMEOUT,
-                check=False,
-            )
+            status, out, err = _run([python, "-I", "-W", "ignore", str(path)], case, folder)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise SimulationError(f"{script} under {python}: {error}") from None
-    if done.returncode:
-        raise SimulationError(
-            f"{script} under {python} ended with {done.returncode}: {done.stderr.strip()[-800:]}"
-        )
-    answer: dict[str, Any] = json.loads(done.stdout)
+    if status:
+        raise SimulationError(f"{script} under {python} ended with {status}: {err.strip()[-800:]}")
+    answer: dict[str, Any] = json.loads(out)
     return answer
+
+
+def _run(command: list[str], case: dict[str, Any], folder: str) -> tuple[int, str, str]:
+    """Run a command; return its status and what it wrote.  It never outlives this call."""
+    pipe = subprocess.PIPE
+    p = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=folder)
+    _RUNNING.append(p)
+    try:
+        out, err = p.communicate(json.dumps(case), timeout=TIMEOUT)
+        return p.returncode, out, err
+    finally:
+        _RUNNING.remove(p)
+        with p:
+            p.kill()  # nothing where it has ended
+
+
+def end_all() -> None:
+    """End the scripts that other threads are waiting for: an interrupt reaches the main thread."""
+    for p in list(_RUNNING):
+        p.kill()

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 
 import pytest
 
@@ -29,6 +30,21 @@ def test_the_answer_is_json_and_the_folder_a_temporary_one(tmp_path, monkeypatch
     case, folder = process.run_script(sys.executable, "echo.py", {"a": 1.5})
     assert case == {"a": 1.5}
     assert folder != str(tmp_path)
+
+
+def test_scripts_that_run_side_by_side_end_when_one_fails_or_the_caller_is_interrupted(
+    tmp_path, monkeypatch
+):
+    """One script fails at once, the other would sleep for five minutes."""
+    script = "import json, sys, time; time.sleep(300) if json.load(sys.stdin) else sys.exit('no')"
+    (tmp_path / "pycycle_run.py").write_text(script)
+    monkeypatch.setattr(process, "__file__", str(tmp_path / "process.py"))
+    monkeypatch.setattr(cycle, "interpreter", lambda: sys.executable)
+    monkeypatch.setattr(cycle, "pycycle_case", lambda gg, i: {"sleep": 1} if i == "slow" else {})
+    began = time.monotonic()
+    with pytest.raises(SimulationError, match="ended with 1: no"):
+        cycle.run_pycycle(None, "fails", "slow")
+    assert time.monotonic() - began < 100 and not process._RUNNING  # s; of 300
 
 
 def test_validate_reports_a_skipped_section(capsys, monkeypatch):
