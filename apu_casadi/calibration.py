@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.cycle import reynolds_index
 from apu_casadi.errors import (
     ApuError,
@@ -472,11 +474,9 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
             rows += [(p.name, role, n, repr(float(v)), "") for n, v in getattr(p, role).items()]
         rows += [(p.name, "measured", n, repr(float(v)), repr(float(s)))
                  for n, (v, s) in p.measured.items()]  # fmt: skip
-    try:
-        with Path(path).open("w", encoding="utf-8", newline="") as f:
-            csv.writer(f, lineterminator="\n").writerows(rows)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from e
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    files.write_text(path, text.getvalue())
 
 
 def _number(text: str, where: str) -> float:

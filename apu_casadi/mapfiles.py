@@ -47,6 +47,7 @@ from pathlib import Path
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import DataError, MapError, nearest
 
 KINDS = ("compressor", "turbine")
@@ -390,10 +391,7 @@ def write_map_csv(table: MapTable, path: str | Path) -> None:
         out.append(",".join(SURGE_COLUMNS))
         for W, PR in zip(table.surge_W, table.surge_PR, strict=True):
             out.append(f"{float(W)!r},{float(PR)!r}")
-    try:
-        Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
-    except OSError as e:
-        raise DataError(f"{path}: cannot write the map file: {e.strerror}") from None
+    files.write_text(path, "\n".join(out) + "\n")
 
 
 def _one_line(text: str) -> str:

@@ -28,6 +28,7 @@ import scipy.sparse as sp
 
 from apu_casadi.backend import compiled
 from apu_casadi.errors import EstimationError
+from apu_casadi.interrupts import watched
 from estimators.belief import Belief
 from estimators.lifting import Lifted
 from estimators.model import CHECK_TOL
@@ -488,7 +489,8 @@ class Transcription:
         given = {"x0": z0, "p": data, "lbx": lower, "ubx": upper, "lbg": 0.0, "ubg": 0.0}
         if start is not None:
             given |= {"lam_g0": start.lam_g, "lam_x0": start.lam_z}
-        out = solver(**given)
+        with watched():  # IPOPT would report an interrupt as a solution that was not found
+            out = solver(**given)
         stats = solver.stats()
         s = Solution(
             z=np.array(out["x"]).ravel(),

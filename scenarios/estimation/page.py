@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from apu_casadi import files
 from apu_casadi.errors import DataError
 from scenarios.estimation import studies
 from scenarios.estimation.reports import JOINT, REPORTS, Claim, Pictures
@@ -265,10 +266,8 @@ def write(path: str | os.PathLike[str], records: Mapping[str, Mapping[str, Any]]
     """Write page and figures (in ``docs/images`` beside it); return the paths."""
     path = Path(path)
     out = path.parent / IMAGES
-    out.mkdir(parents=True, exist_ok=True)
     made = [write_text(path, page(records))]
     for group in pictures(records).values():
         for file, figure in group.values():
-            figure().savefig(out / file, dpi=DPI)
-            made.append(out / file)
+            made.append(files.save_figure(figure(), out / file, dpi=DPI))
     return made
