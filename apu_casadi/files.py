@@ -77,6 +77,58 @@ def folder(path: str | os.PathLike[str]) -> Path:
     return place
 
 
+def read_bytes(path: str | os.PathLike[str], what: str = "file", limit: int = 1 << 32) -> bytes:
+    """Return the bytes of a regular file; a device or a pipe might never end.
+
+    Parameters
+    ----------
+    path : the file; ``what`` : what it should be, for the message.
+    limit : largest size, bytes.
+
+    Raises
+    ------
+    DataError : it cannot be read; says which, why, and what to do.
+    """
+    try:
+        with open(path, "rb", opener=_without_waiting) as f:
+            status = os.fstat(f.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise DataError(f"{path}: {what} cannot be read: no regular file")
+            if status.st_size > limit:
+                raise DataError(
+                    f"{path}: {what} cannot be read: {status.st_size} bytes, {limit} at most"
+                )
+            return f.read()
+    except (OSError, ValueError) as e:
+        if isinstance(e, DataError):
+            raise
+        raise DataError(f"{path}: {what} cannot be read: {reason(e)}") from None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    # opening a pipe would wait for its writer
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_text(path: str | os.PathLike[str], what: str = "file", limit: int = 1 << 28) -> str:
+    """Return the text of a UTF-8 file, without a byte-order mark; line ends become ``\\n``.
+
+    Raises
+    ------
+    DataError : as :func:`read_bytes`, or no UTF-8, with the place of the first wrong byte.
+    """
+    raw = read_bytes(path, what, limit)
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as e:
+        line = raw[: e.start].count(b"\n") + 1
+        raise DataError(
+            f"{path}: {what} cannot be read: not UTF-8 text (byte {raw[e.start]:#04x} in line "
+            f"{line}); save it as UTF-8"
+        ) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 @contextlib.contextmanager
 def whole(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator[Path]:
     """Yield the name under which to write; it becomes ``path`` when the block has ended well.

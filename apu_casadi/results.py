@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import DataError, SignalError, nearest
 
 if TYPE_CHECKING:
@@ -190,20 +191,28 @@ def load(path: str | os.PathLike[str]) -> xr.Dataset:
     import xarray as xr
 
     path = Path(path)
-    try:
-        raw = path.read_bytes()
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror or e}") from e
+    raw = files.read_bytes(path, "netCDF file", limit=1 << 40)
     if raw[:3] != b"CDF":
         raise DataError(f"{path}: not a netCDF 3 file (it begins with {raw[:8]!r})")
     try:
         with xr.open_dataset(BytesIO(raw), engine="scipy", decode_times=False) as ds:
-            return ds.load()
+            ds.load()
     except Exception as e:  # a damaged file fails anywhere inside the reader, with any type
         raise DataError(
             f"{path}: damaged netCDF file of {len(raw)} bytes ({type(e).__name__}: {e}); "
             "run the scenario again"
         ) from e
+    # the number of records counts for nothing where no dimension can grow
+    if raw[4:8] != bytes(4) and not ds.encoding.get("unlimited_dims"):
+        raise DataError(f"{path}: damaged netCDF file: its header tells of records that it lacks")
+    ds.encoding["source"] = str(path)
+    return ds
+
+
+def _source(ds: xr.Dataset) -> str:
+    """Return the file that a dataset was read from, as the beginning of a message."""
+    source = ds.encoding.get("source")
+    return f"{source}: " if source else ""
 
 
 def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
@@ -216,8 +225,12 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
     DataError : no ``time`` coordinate, or an attribute that holds something else.
     """
     if "time" not in ds.coords or ds.sizes["time"] < 2:
-        raise DataError("the dataset lacks a 'time' coordinate of at least two samples")
+        raise DataError(
+            f"{_source(ds)}the dataset lacks a 'time' coordinate of at least two samples"
+        )
     t = ds["time"].values
+    if t.ndim != 1 or t.dtype.kind not in "fiu" or not np.all(np.diff(t) > 0):
+        raise DataError(f"{_source(ds)}'time' does not increase from sample to sample")
     text = ds.attrs.get("phases")
     if text is None:
         return [{"name": "run", "start": float(t[0]), "end": float(t[-1])}]
@@ -228,12 +241,16 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
             for r in rows
         ]
     except (TypeError, ValueError, KeyError) as e:
-        raise DataError(f"attribute 'phases' is not a list of name, start and end: {e!r}") from e
+        raise DataError(
+            f"{_source(ds)}attribute 'phases' is not a list of name, start and end: {e!r}"
+        ) from e
     if not rows:
-        raise DataError("attribute 'phases' is an empty list")
+        raise DataError(f"{_source(ds)}attribute 'phases' is an empty list")
     for r in rows:
         if not r["end"] > r["start"]:
-            raise DataError(f"phase {r['name']!r} ends at {r['end']:g} s, before it starts")
+            raise DataError(
+                f"{_source(ds)}phase {r['name']!r} ends at {r['end']:g} s, before it starts"
+            )
     return rows
 
 
@@ -279,12 +296,20 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
     missing = [v for v in needed if v not in ds]
     if missing:
-        raise DataError(f"the dataset lacks {', '.join(missing)}")
+        raise DataError(f"{_source(ds)}the dataset lacks {', '.join(missing)}")
+    spans = phases(ds)
     t = ds["time"].values
     tol = 1e-9
     col = {v: ds[v].values for v in needed}
+    for v, a in col.items():
+        if a.shape != t.shape or a.dtype.kind not in "fiu":
+            raise DataError(f"{_source(ds)}{v}: one number at each time is expected")
+        # only what does not exist in a healthy machine may be left open
+        if v not in ("k_rf", "kappa") and not np.isfinite(a).all():
+            k = int(np.argmin(np.isfinite(a)))
+            raise DataError(f"{_source(ds)}{v} = {a[k]} at {t[k]:g} s is no finite number")
     rows = []
-    for k, p in enumerate(phases(ds)):
+    for k, p in enumerate(spans):
         # a sample is the end of a step: the one at a boundary belongs to the earlier phase
         before_end = t <= p["end"] + tol
         whole = ((t > p["start"] + tol) | ((k == 0) & (t >= p["start"] - tol))) & before_end
@@ -292,8 +317,8 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         tail = (t > p["end"] - window + tol) & before_end
         if not tail.any():
             raise DataError(
-                f"phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no sample; "
-                f"time runs from {t[0]:g} to {t[-1]:g} s"
+                f"{_source(ds)}phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no "
+                f"sample; time runs from {t[0]:g} to {t[-1]:g} s"
             )
         row: dict[str, Any] = {**p, "window": window}
         for key, v, scale in _MEANS:

@@ -6,11 +6,25 @@ file; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by a closed terminal.
 
 from __future__ import annotations
 
+import _signal
+import os
 import sys
 
-from scenarios import guard
 
-# anything else is imported when the guard stands: an interrupt may come during imports
+def _early(signum: int, frame: object) -> None:
+    """Answer Ctrl-C while the guard itself is being imported."""
+    os.write(2, b"apu: interrupted; nothing was written; run the same command again\n")
+    os._exit(128 + signum)
+
+
+if (__name__ == "__main__" or os.path.basename(sys.argv[0]) in ("apu", "apu.exe")) and (
+    _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler
+):
+    _signal.signal(_signal.SIGINT, _early)
+
+from scenarios import guard  # noqa: E402 - after what answers an interrupt
+
+# anything else is imported when the guard stands
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from argparse import ArgumentParser
@@ -39,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     may end the process, and an unforeseen error becomes a sentence.  With ``argv``, from Python,
     the signal handlers come back afterwards, and an unforeseen error is raised.
     """
-    with guard.Guard(own=argv is None) as g:
+    with guard.Guard(own=argv is None, early=_early) as g:
         from scenarios import streams
 
         with streams.tolerant():
@@ -83,6 +97,8 @@ def _run(argv: Sequence[str] | None, g: guard.Guard) -> int:
         args = parser().parse_args(argv)
     except SystemExit as e:  # argparse has printed the message
         return e.code if isinstance(e.code, int) else 2
+    if g.own and "MPLBACKEND" in os.environ:
+        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever screens there are
     resume = getattr(args, "resume", None)
     if resume is not None:
         guard.note(resume(args))

@@ -26,6 +26,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
+    from typing import Any
 
 GRACE = 0.8
 """Seconds between a signal and the end of the process at the latest."""
@@ -49,8 +50,7 @@ def note(text: str) -> None:
 
 def line(signum: int) -> str:
     """Return the line on the end of the command by a signal."""
-    files = sys.modules.get("apu_casadi.files")
-    written = list(files.WRITTEN) if files is not None else []
+    written = list(_of("files", "WRITTEN") or ())
     kept = ""
     if written:
         more = f" and {len(written) - 3} more" if len(written) > 3 else ""
@@ -60,6 +60,17 @@ def line(signum: int) -> str:
     return f"apu: {_WORDS.get(signum, f'ended by signal {signum}')}; {kept}{_note or AGAIN}"
 
 
+def _of(module: str, name: str) -> Any:
+    """Return a name of a module of apu_casadi; None while that is not wholly imported."""
+    return getattr(sys.modules.get(f"apu_casadi.{module}"), name, None)
+
+
+def _record(signum: int) -> None:
+    record = _of("interrupts", "record")
+    if record is not None:
+        record(signum)
+
+
 class Guard:
     """The context in which a command runs.
 
@@ -67,11 +78,12 @@ class Guard:
     ----------
     own : the process is the command's own: it may be ended, and also SIGTERM and SIGHUP count.
         Otherwise (a call of ``main`` with arguments, from Python) the former handler comes back.
+    early : the handler that was in force before, to be replaced.
     """
 
-    def __init__(self, own: bool) -> None:
+    def __init__(self, own: bool, early: object = None) -> None:
         """Install nothing yet."""
-        self.own = own
+        self.own, self._early = own, early
         self.raising = not own
         self._came = False
         self._before: dict[int, object] = {}
@@ -89,7 +101,7 @@ class Guard:
         for s in signals:
             before = _signal.getsignal(s)
             # ignored by who started us (nohup, a shell's background), or somebody else's: stays
-            if before not in (_signal.SIG_DFL, _signal.default_int_handler):
+            if before not in (_signal.SIG_DFL, _signal.default_int_handler, self._early):
                 continue
             try:
                 _signal.signal(s, self._handler)
@@ -121,10 +133,8 @@ class Guard:
                 _signal.signal(s, _signal.SIG_IGN)
 
     def _handler(self, signum: int, frame: FrameType | None) -> None:
-        interrupts = sys.modules.get("apu_casadi.interrupts")
         again, self._came = self._came, True
-        if interrupts is not None:
-            interrupts.record(signum)
+        _record(signum)
         if self.own:
             if again or not self.raising or _importing(frame):
                 end(signum)
@@ -134,8 +144,7 @@ class Guard:
 
 def end(signum: int) -> None:
     """End the process now; temporary files and started processes are cleared away."""
-    files = sys.modules.get("apu_casadi.files")
-    for path in list(files.PARTIAL) if files is not None else ():
+    for path in list(_of("files", "PARTIAL") or ()):
         _try(os.unlink, path)
     _end_children()
     tell(signum)
@@ -232,9 +241,7 @@ def _watch(fd: int) -> None:
     while signum not in _WORDS:
         came = os.read(fd, 1)
         signum = came[0] if came else 0
-    interrupts = sys.modules.get("apu_casadi.interrupts")
-    if interrupts is not None:
-        interrupts.record(signum)  # also where the handler waits for compiled code to return
+    _record(signum)  # also where the handler waits for compiled code to return
     _quiet()
     time.sleep(CHILDREN)
     _end_children()

@@ -86,7 +86,10 @@ def _axis(option: str, text: str) -> list[float]:
                 raise ScenarioError(
                     f"{option}: {int(count)} points asked for, {LARGEST} at most in a deck"
                 )
-            values = np.linspace(float(first), float(last), int(count))
+            ends = float(first), float(last)
+            if not math.isfinite(ends[1] - ends[0]):
+                raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
+            values = np.linspace(*ends, int(count))
         else:
             values = np.array([float(v) for v in text.split(",")])
     except ValueError:

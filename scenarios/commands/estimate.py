@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from scenarios import guard, jsontext
+from scenarios import jsontext
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def resume(args: argparse.Namespace) -> str:
     """Tell what an interruption leaves."""
     if args.action is not _study:
-        return guard.AGAIN
+        return ""
     return f"finished parts of the study are kept in {args.out}; the same command goes on"
 
 

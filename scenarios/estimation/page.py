@@ -96,6 +96,14 @@ def load(folder: str | Path) -> dict[str, dict[str, Any]]:
     }
     if not found:
         raise DataError(f"{os.fspath(folder)}: no results; apu estimate study all makes them")
+    for name, record in found.items():
+        try:
+            REPORTS[name].claims(studies.results(record))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as e:
+            raise DataError(
+                f"{studies.path_of(studies.STUDIES[name], folder)}: damaged: its results cannot be "
+                f"read ({type(e).__name__}: {e}); run the study with --again"
+            ) from None
     return found
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
+from apu_casadi import files
 from apu_casadi.errors import DataError, ParameterError, nearest
 from scenarios.estimation.fingerprint import digest
 from scenarios.estimation.gaspath_study import FRESH, TUNED, TUNED_LONG
@@ -523,14 +524,40 @@ def read(study: Study, folder: str | Path) -> dict[str, Any]:
     """
     path = path_of(study, folder)
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return {"study": study.name, "fixed": {}, "parts": {}}
-    except (OSError, ValueError) as e:
+        if not path.exists():
+            return {"study": study.name, "fixed": {}, "parts": {}}
+        record = json.loads(files.read_text(path, "study"), parse_constant=_no_number)
+    except DataError:
+        raise
+    except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as a study: {e}") from None
     if not isinstance(record, dict) or record.get("study") != study.name:
         raise DataError(f"{path} does not hold the study {study.name!r}")
+    wrong = _misshapen(record)
+    if wrong:
+        raise DataError(f"{path}: damaged: {wrong}; delete it, or run the study with --again")
     return record
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _misshapen(record: Mapping[str, Any]) -> str:
+    """Say what a record lacks to be one, "" if it is whole."""
+    if not isinstance(record.get("fixed"), dict) or not isinstance(record.get("parts"), dict):
+        return "tables 'fixed' and 'parts' are expected"
+    for name, part in record["parts"].items():
+        if not isinstance(part, dict) or not isinstance(part.get("result"), dict | list):
+            return f"part {name!r} has no result"
+        seeds, seconds = part.get("seeds"), part.get("seconds")
+        if not (isinstance(seeds, list) and len(seeds) == 2):
+            return f"part {name!r} does not say its seeds"
+        if not all(type(s) is int for s in seeds) or type(seconds) not in (int, float):
+            return f"part {name!r}: seeds and seconds must be numbers"
+        if not isinstance(part.get("versions", {}), dict):
+            return f"part {name!r}: versions must be a table"
+    return ""
 
 
 @dataclass(frozen=True)
