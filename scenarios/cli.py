@@ -6,23 +6,10 @@ file; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by a closed terminal.
 
 from __future__ import annotations
 
-import _signal
 import os
 import sys
 
-
-def _early(signum: int, frame: object) -> None:
-    """Answer Ctrl-C while the guard itself is being imported."""
-    os.write(2, b"apu: interrupted; nothing was written; run the same command again\n")
-    os._exit(128 + signum)
-
-
-if (__name__ == "__main__" or os.path.basename(sys.argv[0]) in ("apu", "apu.exe")) and (
-    _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler
-):
-    _signal.signal(_signal.SIGINT, _early)
-
-from scenarios import guard  # noqa: E402 - after what answers an interrupt
+from scenarios import guard
 
 # anything else is imported when the guard stands
 TYPE_CHECKING = False
@@ -53,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     may end the process, and an unforeseen error becomes a sentence.  With ``argv``, from Python,
     the signal handlers come back afterwards, and an unforeseen error is raised.
     """
-    with guard.Guard(own=argv is None, early=_early) as g:
+    with guard.Guard(own=argv is None) as g:
         from scenarios import streams
 
         with streams.tolerant():

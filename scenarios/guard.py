@@ -22,6 +22,8 @@ import os
 import sys
 import time
 
+from scenarios import _answer
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -78,12 +80,11 @@ class Guard:
     ----------
     own : the process is the command's own: it may be ended, and also SIGTERM and SIGHUP count.
         Otherwise (a call of ``main`` with arguments, from Python) the former handler comes back.
-    early : the handler that was in force before, to be replaced.
     """
 
-    def __init__(self, own: bool, early: object = None) -> None:
+    def __init__(self, own: bool) -> None:
         """Install nothing yet."""
-        self.own, self._early = own, early
+        self.own = own
         self.raising = not own
         self._came = False
         self._before: dict[int, object] = {}
@@ -101,7 +102,7 @@ class Guard:
         for s in signals:
             before = _signal.getsignal(s)
             # ignored by who started us (nohup, a shell's background), or somebody else's: stays
-            if before not in (_signal.SIG_DFL, _signal.default_int_handler, self._early):
+            if before not in (_signal.SIG_DFL, _signal.default_int_handler, _answer):
                 continue
             try:
                 _signal.signal(s, self._handler)

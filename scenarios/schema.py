@@ -163,7 +163,6 @@ class LoadSpec:
         for required in ("power_kW", "R_ohm", "L_mH"):
             if required in takes and getattr(self, required) is None:
                 raise _PlacedError(required, f"missing: a {self.kind!r} load needs it")
-        _require(len(self.name) <= 100, "name", f"{len(self.name)} characters, 100 at most")
         put: Callable[[str, Any], None] = lambda n, v: object.__setattr__(self, n, v)  # noqa: E731
         if self.power_kW is not None:
             put("power_kW", number(self.power_kW, "power_kW", lo=0.1, hi=500.0, unit="kW"))
@@ -520,6 +519,7 @@ class Scenario:
             "name",
             f"only letters, digits, '_' and '-', beginning with a letter or digit: {self.name!r}",
         )
+        _require(len(self.name) <= 100, "name", f"{len(self.name)} characters, 100 at most")
         put: Callable[[str, Any], None] = lambda n, v: object.__setattr__(self, n, v)  # noqa: E731
         _text(self.title, "title", empty=True)
         _text(self.doc, "doc", empty=True)
@@ -696,16 +696,12 @@ class Scenario:
         except KeyboardInterrupt:
             raise
         except ScenarioError as e:
-            raise ScenarioError(f"{path}{_line_of(e, path)}: {e}") from e
-        except SystemExit as e:
-            raise ScenarioError(
-                f"{path}{_line_of(e, path)}: the file ends the program (sys.exit, status "
-                f"{e.code!r}) before it is read; remove that, or put it under __main__"
-            ) from e
-        except (
-            BaseException
-        ) as e:  # whatever it raises, it must not pass for the end of the command
-            raise ScenarioError(f"{path}{_line_of(e, path)}: {type(e).__name__}: {e}") from e
+            raise ScenarioError(f"{path}: {e}{_at_line(e, path)}") from e
+        except BaseException as e:  # SystemExit too: it would pass for the end of the command
+            said = str(e)
+            if isinstance(e, SystemExit):
+                said = f"the file ends the program, with status {e.code!r}; remove that"
+            raise ScenarioError(f"{path}: {type(e).__name__}{_at_line(e, path)}: {said}") from e
         found = scope.get("scenario")
         if isinstance(found, Scenario):
             return found
