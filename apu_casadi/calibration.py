@@ -432,7 +432,7 @@ def read_points(path: str | Path) -> list[CalibrationPoint]:
     SignalError : a point with unknown names, or not two held quantities.
     """
     path = Path(path)
-    text = files.read_text(path, "file of points")
+    text = files.read_text(path)
     lines = [(k, x) for k, x in enumerate(text.split("\n"), 1) if x.strip() and x[0] != "#"]
     rows = []
     for k, x in lines:

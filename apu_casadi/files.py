@@ -77,32 +77,32 @@ def folder(path: str | os.PathLike[str]) -> Path:
     return place
 
 
-def read_bytes(path: str | os.PathLike[str], what: str = "file", limit: int = 1 << 32) -> bytes:
+def read_bytes(path: str | os.PathLike[str], what: str = "", limit: int = 1 << 40) -> bytes:
     """Return the bytes of a regular file; a device or a pipe might never end.
 
     Parameters
     ----------
-    path : the file; ``what`` : what it should be, for the message.
+    path : the file.
+    what : what it should be, for the message.
     limit : largest size, bytes.
 
     Raises
     ------
     DataError : it cannot be read; says which, why, and what to do.
     """
+    begin = f"{path}: {what} cannot be read" if what else f"{path}: cannot be read"
     try:
         with open(path, "rb", opener=_without_waiting) as f:
             status = os.fstat(f.fileno())
             if not stat.S_ISREG(status.st_mode):
-                raise DataError(f"{path}: {what} cannot be read: no regular file")
+                raise DataError(f"{begin}: no regular file")
             if status.st_size > limit:
-                raise DataError(
-                    f"{path}: {what} cannot be read: {status.st_size} bytes, {limit} at most"
-                )
+                raise DataError(f"{begin}: {status.st_size} bytes, {limit} at most")
             return f.read()
     except (OSError, ValueError) as e:
         if isinstance(e, DataError):
             raise
-        raise DataError(f"{path}: {what} cannot be read: {reason(e)}") from None
+        raise DataError(f"{begin}: {reason(e)}") from None
 
 
 def _without_waiting(path: str, flags: int) -> int:
@@ -110,7 +110,7 @@ def _without_waiting(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def read_text(path: str | os.PathLike[str], what: str = "file", limit: int = 1 << 28) -> str:
+def read_text(path: str | os.PathLike[str], what: str = "", limit: int = 1 << 28) -> str:
     """Return the text of a UTF-8 file, without a byte-order mark; line ends become ``\\n``.
 
     Raises
@@ -123,14 +123,16 @@ def read_text(path: str | os.PathLike[str], what: str = "file", limit: int = 1 <
     except UnicodeDecodeError as e:
         line = raw[: e.start].count(b"\n") + 1
         raise DataError(
-            f"{path}: {what} cannot be read: not UTF-8 text (byte {raw[e.start]:#04x} in line "
-            f"{line}); save it as UTF-8"
+            f"{path}: {what + ' ' if what else ''}cannot be read: not UTF-8 text (byte "
+            f"{raw[e.start]:#04x} in line {line}); save it as UTF-8"
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextlib.contextmanager
-def whole(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator[Path]:
+def whole(
+    path: str | os.PathLike[str], *, make_folder: bool = True, refusal: str = "cannot be written"
+) -> Iterator[Path]:
     """Yield the name under which to write; it becomes ``path`` when the block has ended well.
 
     What the block raises leaves the former file as it was.  A symbolic link stays and its target is
@@ -140,6 +142,7 @@ def whole(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator
     ----------
     path : the file.
     make_folder : make the folders that are missing on the way.
+    refusal : what cannot be done, for the message.
 
     Raises
     ------
@@ -152,7 +155,7 @@ def whole(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator
             real.parent.mkdir(parents=True, exist_ok=True)
         mode = _mode(real)
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be written: {reason(e)}") from None
+        raise DataError(f"{path}: {refusal}: {reason(e)}") from None
     device = mode is not None and not stat.S_ISREG(mode)
     # short, because the name itself may be as long as names can be
     target = real if device else real.with_name(f".{os.getpid()}-{next(_count)}.part")
@@ -167,7 +170,7 @@ def whole(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator
                 os.chmod(target, stat.S_IMODE(mode))
             os.replace(target, real)
     except OSError as e:
-        raise DataError(f"{path}: cannot be written: {reason(e)}") from None
+        raise DataError(f"{path}: {refusal}: {reason(e)}") from None
     finally:
         if not device:
             with contextlib.suppress(OSError):
@@ -190,14 +193,17 @@ def _mode(real: Path) -> int | None:
     return mode
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> Path:
+def write_text(
+    path: str | os.PathLike[str], text: str, *, refusal: str = "cannot be written",
+    make_folder: bool = True,
+) -> Path:  # fmt: skip
     """Write a text file in UTF-8, whole or not at all; return its path.
 
     Raises
     ------
     DataError : as :func:`whole`.
     """
-    with whole(path) as target:
+    with whole(path, refusal=refusal, make_folder=make_folder) as target:
         # a name from the system that is no UTF-8 stands in the text as \udc.., not as an error
         target.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
     return Path(path)

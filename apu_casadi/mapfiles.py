@@ -391,7 +391,8 @@ def write_map_csv(table: MapTable, path: str | Path) -> None:
         out.append(",".join(SURGE_COLUMNS))
         for W, PR in zip(table.surge_W, table.surge_PR, strict=True):
             out.append(f"{float(W)!r},{float(PR)!r}")
-    files.write_text(path, "\n".join(out) + "\n")
+    refusal = "cannot write the map file"
+    files.write_text(path, "\n".join(out) + "\n", refusal=refusal, make_folder=False)
 
 
 def _one_line(text: str) -> str:

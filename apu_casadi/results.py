@@ -191,7 +191,7 @@ def load(path: str | os.PathLike[str]) -> xr.Dataset:
     import xarray as xr
 
     path = Path(path)
-    raw = files.read_bytes(path, "netCDF file", limit=1 << 40)
+    raw = files.read_bytes(path)
     if raw[:3] != b"CDF":
         raise DataError(f"{path}: not a netCDF 3 file (it begins with {raw[:8]!r})")
     try:
