@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.checked import number
 from apu_casadi.cycle import reynolds_index
 from apu_casadi.errors import (
@@ -431,12 +433,14 @@ def read_points(path: str | Path) -> list[CalibrationPoint]:
     SignalError : a point with unknown names, or not two held quantities.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as e:
-        raise DataError(f"{path}: cannot be read: {getattr(e, 'strerror', None) or e}") from e
-    lines = [(k, x) for k, x in enumerate(text.splitlines(), 1) if x.strip() and x[0] != "#"]
-    rows = list(csv.reader(x for _, x in lines))
+    text = files.read_text(path)
+    lines = [(k, x) for k, x in enumerate(text.split("\n"), 1) if x.strip() and x[0] != "#"]
+    rows = []
+    for k, x in lines:
+        try:
+            rows += list(csv.reader([x], strict=True))
+        except csv.Error as e:  # a quotation mark left open, a cell beyond csv's limit
+            raise DataError(f"{path}, line {k}: no line of a CSV file ({e})") from None
     if not rows or tuple(c.strip() for c in rows[0]) != COLUMNS:
         raise DataError(f"{path}: the first line must be {','.join(COLUMNS)}")
     found: dict[str, dict[str, dict[str, Any]]] = {}
@@ -457,7 +461,10 @@ def read_points(path: str | Path) -> list[CalibrationPoint]:
         group[name] = (v, _number(sigma, where)) if role == "measured" else v
     if not found:
         raise DataError(f"{path}: no points below the header")
-    return [CalibrationPoint(**groups, name=point) for point, groups in found.items()]
+    try:
+        return [CalibrationPoint(**groups, name=point) for point, groups in found.items()]
+    except SignalError as e:
+        raise SignalError(f"{path}: {e}") from None
 
 
 def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
@@ -473,11 +480,9 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
             rows += [(p.name, role, n, repr(float(v)), "") for n, v in getattr(p, role).items()]
         rows += [(p.name, "measured", n, repr(float(v)), repr(float(s)))
                  for n, (v, s) in p.measured.items()]  # fmt: skip
-    try:
-        with Path(path).open("w", encoding="utf-8", newline="") as f:
-            csv.writer(f, lineterminator="\n").writerows(rows)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from e
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    files.write_text(path, text.getvalue())
 
 
 def _number(text: str, where: str) -> float:

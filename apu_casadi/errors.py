@@ -9,9 +9,20 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from apu_casadi import interrupts
+
 
 class ApuError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base of every error that the package raises on purpose.
+
+    None is made of an interrupt: while one is recorded, KeyboardInterrupt is raised instead, since
+    what failed then failed because of it (:mod:`apu_casadi.interrupts`).
+    """
+
+    def __init__(self, *args: object) -> None:
+        """Keep the message, or raise KeyboardInterrupt."""
+        interrupts.check()
+        super().__init__(*args)
 
 
 class SignalError(ApuError, ValueError):

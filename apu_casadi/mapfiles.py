@@ -47,6 +47,7 @@ from pathlib import Path
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import DataError, MapError, nearest
 from apu_casadi.mapcheck import Finding
 from apu_casadi.maptable import GRID_COLUMNS, SURGE_COLUMNS, MapTable, fault, found_text
@@ -304,10 +305,8 @@ def write_map_csv(table: MapTable, path: str | Path) -> None:
         out.append(",".join(SURGE_COLUMNS))
         for W, PR in zip(table.surge_W, table.surge_PR, strict=True):
             out.append(f"{float(W)!r},{float(PR)!r}")
-    try:
-        Path(path).write_text("\n".join(out) + "\n", encoding="utf-8")
-    except OSError as e:
-        raise DataError(f"{path}: cannot write the map file: {e.strerror}") from None
+    refusal = "cannot write the map file"
+    files.write_text(path, "\n".join(out) + "\n", refusal=refusal, make_folder=False)
 
 
 def _one_line(text: str) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import DataError
 from apu_casadi.results import RPM, phases
 
@@ -626,13 +627,12 @@ def save_figures(ds: xr.Dataset, folder: str | os.PathLike[str]) -> list[Path]:
 
     Raises
     ------
-    DataError : a variable is missing.
+    DataError : a variable is missing, or a file cannot be written.
     """
     made = []
     for key, draw in _DRAW.items():
         path = Path(folder) / f"{key}.png"
-        draw(ds).savefig(path, dpi=DPI)
-        made.append(path)
+        made.append(files.save_figure(draw(ds), path, dpi=DPI))
     return made
 
 

@@ -6,18 +6,16 @@ and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for)
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
-import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi import netcdf3
+from apu_casadi import files, netcdf3
 from apu_casadi.errors import DataError, SignalError, nearest
 from apu_casadi.filearrays import is_lazy
 
@@ -168,19 +166,8 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     DataError : the file cannot be written there, or a variable has 4 GiB or more.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as f:
-            netcdf3.write(ds, f)
-            f.flush()
-            os.fsync(f.fileno())
-        os.replace(partial, path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from e
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+    with files.whole(path) as target, target.open("wb") as f:
+        netcdf3.write(ds, f)
     return path
 
 
@@ -198,21 +185,28 @@ def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
     DataError : the file is missing, is no netCDF 3 file, or is damaged.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as f:
-            start, size = f.read(8), os.fstat(f.fileno()).st_size
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror or e}") from e
+    start, size = files.beginning(path, 8)
     if start[:3] != b"CDF":
         raise DataError(f"{path}: not a netCDF 3 file (it begins with {start!r})")
     try:
         ds = netcdf3.open_lazily(path)
-        return ds if lazy else ds.load()
+        ds = ds if lazy else ds.load()
     except Exception as e:  # a damaged file fails anywhere inside the reader, with any type
         raise DataError(
             f"{path}: damaged netCDF file of {size} bytes ({type(e).__name__}: {e}); "
             "run the scenario again"
         ) from e
+    # the number of records counts for nothing where no dimension can grow
+    if start[4:8] != bytes(4) and not ds.encoding.get("unlimited_dims"):
+        raise DataError(f"{path}: damaged netCDF file: its header tells of records that it lacks")
+    ds.encoding["source"] = str(path)
+    return ds
+
+
+def _source(ds: xr.Dataset) -> str:
+    """Return the file that a dataset was read from, as the beginning of a message."""
+    source = ds.encoding.get("source")
+    return f"{source}: " if source else ""
 
 
 def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
@@ -225,8 +219,12 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
     DataError : no ``time`` coordinate, or an attribute that holds something else.
     """
     if "time" not in ds.coords or ds.sizes["time"] < 2:
-        raise DataError("the dataset lacks a 'time' coordinate of at least two samples")
+        raise DataError(
+            f"{_source(ds)}the dataset lacks a 'time' coordinate of at least two samples"
+        )
     t = ds["time"].values
+    if t.ndim != 1 or t.dtype.kind not in "fiu" or not np.all(np.diff(t) > 0):
+        raise DataError(f"{_source(ds)}'time' does not increase from sample to sample")
     text = ds.attrs.get("phases")
     if text is None:
         return [{"name": "run", "start": float(t[0]), "end": float(t[-1])}]
@@ -237,12 +235,16 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
             for r in rows
         ]
     except (TypeError, ValueError, KeyError) as e:
-        raise DataError(f"attribute 'phases' is not a list of name, start and end: {e!r}") from e
+        raise DataError(
+            f"{_source(ds)}attribute 'phases' is not a list of name, start and end: {e!r}"
+        ) from e
     if not rows:
-        raise DataError("attribute 'phases' is an empty list")
+        raise DataError(f"{_source(ds)}attribute 'phases' is an empty list")
     for r in rows:
         if not r["end"] > r["start"]:
-            raise DataError(f"phase {r['name']!r} ends at {r['end']:g} s, before it starts")
+            raise DataError(
+                f"{_source(ds)}phase {r['name']!r} ends at {r['end']:g} s, before it starts"
+            )
     return rows
 
 
@@ -282,11 +284,16 @@ class _Columns:
         v = self.ds[name]
         if v.dims != ("time",) or v.dtype.kind not in "fiu":
             where = ", ".join(map(str, v.dims)) or "no dimension"
-            raise DataError(f"{name}: numbers on time are expected, {v.dtype} on {where} found")
+            raise DataError(
+                f"{_source(self.ds)}{name}: numbers on time are expected, {v.dtype} on {where} found"
+            )
         values: np.ndarray = v.values
         if name not in _HEALTHY_NAN and not np.isfinite(values).all():
             k = int(np.flatnonzero(~np.isfinite(values))[0])
-            raise DataError(f"{name} = {values[k]:g} at t = {self.ds['time'].values[k]:g} s")
+            raise DataError(
+                f"{_source(self.ds)}{name} = {values[k]:g} at t = {self.ds['time'].values[k]:g} s "
+                "is no finite number"
+            )
         return values
 
 
@@ -307,12 +314,13 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
     missing = [v for v in needed if v not in ds]
     if missing:
-        raise DataError(f"the dataset lacks {', '.join(missing)}")
+        raise DataError(f"{_source(ds)}the dataset lacks {', '.join(missing)}")
+    spans = phases(ds)
     t = ds["time"].values
     tol = 1e-9
     col = _Columns(ds)
     rows = []
-    for k, p in enumerate(phases(ds)):
+    for k, p in enumerate(spans):
         # a sample is the end of a step: the one at a boundary belongs to the earlier phase
         before_end = t <= p["end"] + tol
         whole = ((t > p["start"] + tol) | ((k == 0) & (t >= p["start"] - tol))) & before_end
@@ -320,8 +328,8 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         tail = (t > p["end"] - window + tol) & before_end
         if not tail.any():
             raise DataError(
-                f"phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no sample; "
-                f"time runs from {t[0]:g} to {t[-1]:g} s"
+                f"{_source(ds)}phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no "
+                f"sample; time runs from {t[0]:g} to {t[-1]:g} s"
             )
         row: dict[str, Any] = {**p, "window": window}
         for key, v, scale in _MEANS:

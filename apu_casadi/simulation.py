@@ -20,6 +20,7 @@ import numpy as np
 from apu_casadi.calling import Buffers
 from apu_casadi.checked import array
 from apu_casadi.errors import SignalError, SimulationError, nearest
+from apu_casadi.interrupts import watched
 from apu_casadi.sharing import PerThread, Rebuilt, building, keep, twin
 from apu_casadi.statespace import StateSpace
 
@@ -194,9 +195,9 @@ class Stepper(Rebuilt):
         if not dt > 0:
             raise SimulationError(f"{ss.name}: step length must be > 0, got {dt!r} s")
         try:
-            x, means = self._solve(x0, u, theta, dt)
+            with watched():
+                x, means = self._solve(x0, u, theta, dt)
         except RuntimeError as error:
-            _reraise_interrupt(error)
             raise self._failure(error, x0, u, theta, dt, t0) from None
         if not np.all(np.isfinite(x)):
             raise self._failure(RuntimeError("states are not finite"), x0, u, theta, dt, t0)
@@ -227,9 +228,9 @@ class Stepper(Rebuilt):
         for _ in range(10):
             middle = 0.5 * (good + bad)
             try:
-                x = short._solve(x0, u, theta, middle * dt)[0].ravel()
-            except RuntimeError as again:
-                _reraise_interrupt(again)
+                with watched():
+                    x = short._solve(x0, u, theta, middle * dt)[0].ravel()
+            except RuntimeError:
                 bad = middle
             else:
                 good, last = middle, x
@@ -271,11 +272,6 @@ class _Buffered:
 
 def _symbols(ss: StateSpace) -> Any:
     return ca.SX if ss.f.is_a("SXFunction") and ss.residual.is_a("SXFunction") else ca.MX
-
-
-def _reraise_interrupt(error: RuntimeError) -> None:
-    if "KeyboardInterrupt" in str(error):
-        raise KeyboardInterrupt from error
 
 
 def _vector(model: str, label: str, values: Any, n: int) -> np.ndarray:

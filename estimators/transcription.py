@@ -29,6 +29,7 @@ import scipy.sparse as sp
 
 from apu_casadi.backend import compiled
 from apu_casadi.errors import EstimationError
+from apu_casadi.interrupts import watched
 from apu_casadi.sharing import Rebuilt, building, derived, keep, kept
 from estimators.belief import Belief
 from estimators.lifting import Lifted
@@ -502,7 +503,8 @@ class Transcription(Rebuilt):
         if start is not None:
             given |= {"lam_g0": start.lam_g, "lam_x0": start.lam_z}
         with _ipopt[0]:
-            out = solver(**given)
+            with watched():  # IPOPT would report an interrupt as a solution that was not found
+                out = solver(**given)
             stats = solver.stats()
         s = Solution(
             z=np.array(out["x"]).ravel(),

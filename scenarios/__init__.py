@@ -1,1 +1,24 @@
 """Scenarios, studies and the command line."""
+
+from __future__ import annotations
+
+import _signal
+import os
+import sys
+
+
+def _answer(signum: int, frame: object) -> None:
+    """End at an interrupt that comes before the guard of the command stands."""
+    os.write(2, b"apu: interrupted; nothing was written; run the same command again\n")
+    os._exit(128 + signum)
+
+
+def _is_command() -> bool:
+    """Whether this process is the command ``apu``, and not a program that imports the package."""
+    name = os.path.basename(sys.argv[0]) if sys.argv else ""
+    return name in ("apu", "apu.exe") or (name == "-m" and "scenarios.cli" in sys.orig_argv)
+
+
+# here, since this is the first line of the package that runs; what follows may take long to import
+if _is_command() and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+    _signal.signal(_signal.SIGINT, _answer)

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import ScenarioError, SimulationError, nearest
 from apu_casadi.sharing import once
 from scenarios import pages, registry
@@ -635,10 +636,7 @@ def write_plot(curves: Curves, size: Size, path: str | os.PathLike[str]) -> Path
         f"prolonged, no waveforms. Middle: {size.joint.duration:g} s each. Right: "
         f"{size.joint.duration:g} s; 0 stores no waveforms. Lines: least squares.",
     )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=120)
-    return path
+    return files.save_figure(fig, path, dpi=120)
 
 
 # ------------------------------------------------------------------------------ peers

@@ -1,62 +1,100 @@
 """The console command ``apu``.
 
 Exit status: 0 done; 1 a simulation or an estimate failed; 2 wrong usage, scenario, parameter or
-file; 130 interrupted by Ctrl-C.
+file; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by a closed terminal.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
-from collections.abc import Sequence
 
-from apu_casadi.errors import ApuError, EstimationError, OperatingPointError, SimulationError
-from scenarios import commands
+from scenarios import guard
 
-
-class _Version(argparse.Action):
-    """Print the installed version; looked up only then."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
-
-        print(f"apu-casadi {version('apu-casadi')}")
-        parser.exit()
+# anything else is imported when the guard stands
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from argparse import ArgumentParser
+    from collections.abc import Sequence
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> ArgumentParser:
     """Return the parser of the command with all its subcommands."""
-    p = argparse.ArgumentParser(
+    from scenarios import commands
+    from scenarios.usage import Parser, ShowVersion
+
+    p = Parser(
         prog="apu",
         description="Joint simulation of an all-electric APU: gas path and stator faults.",
         epilog="Try: apu run joint",
     )
-    p.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    p.add_argument("--version", action=ShowVersion, nargs=0, help="print the version")
     commands.register(p.add_subparsers(metavar="COMMAND", required=True))
     return p
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command with ``argv`` (the process's own if None); return the exit status."""
+    """Run the command with ``argv``; return the exit status.
+
+    Without ``argv`` the process is the command's own: it takes the process's arguments, a signal
+    may end the process, and an unforeseen error becomes a sentence.  With ``argv``, from Python,
+    the signal handlers come back afterwards, and an unforeseen error is raised.
+    """
+    with guard.Guard(own=argv is None) as g:
+        from scenarios import streams
+
+        with streams.tolerant():
+            status = _guarded(argv, g)
+            return streams.finish(status, own=g.own)
+
+
+def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:
+    from apu_casadi import files, interrupts
+    from scenarios import streams
+
+    files.account(True)
+    try:
+        status = _run(argv, g)
+        if not interrupts.recorded():
+            return status
+    except KeyboardInterrupt:
+        pass
+    except BrokenPipeError:  # the reader (head, less) has had enough
+        return 0
+    except Exception as e:
+        # what fails after an interrupt fails because of it
+        if not interrupts.recorded():
+            told = streams.explain(e, program=g.own)
+            if told is None:
+                raise
+            guard.say(f"apu: error: {told[0]}")
+            return told[1]
+    finally:
+        files.account(False)
+    signum = interrupts.recorded() or 2
+    g.ignore()
+    guard.tell(signum)
+    return 128 + signum
+
+
+def _run(argv: Sequence[str] | None, g: guard.Guard) -> int:
+    from apu_casadi.errors import ScenarioError
+
     try:
         args = parser().parse_args(argv)
     except SystemExit as e:  # argparse has printed the message
         return e.code if isinstance(e.code, int) else 2
+    if g.own and "MPLBACKEND" in os.environ:
+        os.environ["MPLBACKEND"] = "agg"  # figures go to files, whatever screens there are
+    resume = getattr(args, "resume", None)
+    if resume is not None:
+        guard.note(resume(args))
+    g.raising = True
     try:
         status: int = args.run(args)
-        sys.stdout.flush()
-        return status
-    except ApuError as e:
-        print(f"apu: error: {' '.join(str(e).split())}", file=sys.stderr)
-        failed = isinstance(e, EstimationError | OperatingPointError | SimulationError)
-        return 1 if failed else 2
-    except KeyboardInterrupt:
-        print("apu: interrupted; nothing further was written", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader (head, less) has had enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except SystemExit as e:  # of code that a scenario brought along
+        raise ScenarioError(f"the program was told to end with status {e.code!r}") from None
+    return status
 
 
 if __name__ == "__main__":

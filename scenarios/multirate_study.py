@@ -26,8 +26,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.apu import Apu
-from apu_casadi.errors import DataError, ScenarioError
+from apu_casadi.errors import ScenarioError
 from apu_casadi.events import Event, FaultChange, HealthChange, LoadChange
 from apu_casadi.generator import Generator
 from apu_casadi.machine.load import SeriesLoad
@@ -296,11 +297,8 @@ def write_figure(rows: Sequence[Measured], path: Path, dpi: float | None = None)
     DataError : the file cannot be written there.
     """
     fig = figure(rows)
-    try:
-        fig.savefig(path, dpi=dpi or fig.get_dpi(), pil_kwargs={"optimize": True})
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from None
-    return path
+    options = {"dpi": dpi or fig.get_dpi(), "pil_kwargs": {"optimize": True}}
+    return files.save_figure(fig, path, **options)
 
 
 class Mode(NamedTuple):

@@ -1,33 +1,13 @@
-"""Pages that are made from the code: Markdown tables, and files written whole or not at all."""
+"""Pages that are made from the code: Markdown tables and filled paragraphs."""
 
 from __future__ import annotations
 
-import os
 import textwrap
-import threading
 from collections.abc import Sequence
-from pathlib import Path
 
-from apu_casadi.errors import DataError
+from apu_casadi.files import write_text
 
-
-def write_text(path: str | os.PathLike[str], text: str) -> Path:
-    """Write a text file under a temporary name, then rename it; return the path.
-
-    Raises
-    ------
-    DataError : the file cannot be written there.
-    """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
-    try:
-        partial.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(partial, path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from None
-    finally:
-        partial.unlink(missing_ok=True)
-    return path
+__all__ = ["fill", "markdown_table", "write_text"]
 
 
 def markdown_table(

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi import simulation
+from apu_casadi import files, simulation
 from apu_casadi.errors import ScenarioError, nearest
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import Generator
@@ -330,8 +330,7 @@ def write_figures(folder: str | os.PathLike[str], *, joint: bool = True) -> list
     )
     made = []
     for key, figure in draw.items():
-        figure().savefig(out / f"{key}.png", dpi=plotting.DPI)
-        made.append(out / f"{key}.png")
+        made.append(files.save_figure(figure(), out / f"{key}.png", dpi=plotting.DPI))
     if joint:
         made += plotting.save_figures(registry.run("joint"), out)
     return made

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.errors import ScenarioError, nearest
 from apu_casadi.sharing import last, once
+from scenarios import jsontext
 from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
@@ -140,16 +141,9 @@ def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool
 
 def prepare(out: str | os.PathLike[str]) -> Path:
     """Make the folder for results, before a long run; :class:`DataError` if that is impossible."""
-    from apu_casadi.errors import DataError
+    from apu_casadi import files
 
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise DataError(f"{folder}: cannot make the folder for results: {e.strerror}") from None
-    if not os.access(folder, os.W_OK):
-        raise DataError(f"{folder}: no permission to write results there")
-    return folder
+    return files.folder(out)
 
 
 def name_of(ds: xr.Dataset) -> str:
@@ -185,20 +179,14 @@ def write(
     ------
     DataError : the folder or a file cannot be written.
     """
-    from apu_casadi import results
-    from apu_casadi.errors import DataError
+    from apu_casadi import files, results
 
     folder = prepare(out)
     made = [results.save(ds, folder / f"{name or name_of(ds)}.nc")]
-    text = json.dumps(summary(ds), indent=2, ensure_ascii=False, allow_nan=False)
-    path = folder / "summary.json"
-    try:
-        path.write_text(text + "\n", encoding="utf-8")
-        made.append(path)
-        if figures:
-            from apu_casadi import plotting
+    text = jsontext.dumps(summary(ds))
+    made.append(files.write_text(folder / "summary.json", text + "\n"))
+    if figures:
+        from apu_casadi import plotting
 
-            made += plotting.save_figures(ds, folder)
-    except OSError as e:
-        raise DataError(f"{folder}: cannot write results: {e.strerror or e}") from None
+        made += plotting.save_figures(ds, folder)
     return made

@@ -30,8 +30,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import numbers
 import os
 import re
+import reprlib
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -40,7 +42,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from apu_casadi.errors import ScenarioError, nearest
+from apu_casadi import files
+from apu_casadi.errors import DataError, ScenarioError, nearest
 from apu_casadi.events import HEALTH_FACTORS, Ambient, health_factors, number
 
 if TYPE_CHECKING:
@@ -57,6 +60,9 @@ LOAD_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """The kinds of load, each with the keys that it takes besides ``kind``."""
+
+LARGEST_FILE = 1 << 24
+"""Largest scenario file, bytes."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _PHASES = ("a", "b", "c")
@@ -513,6 +519,7 @@ class Scenario:
             "name",
             f"only letters, digits, '_' and '-', beginning with a letter or digit: {self.name!r}",
         )
+        _require(len(self.name) <= 100, "name", f"{len(self.name)} characters, 100 at most")
         put: Callable[[str, Any], None] = lambda n, v: object.__setattr__(self, n, v)  # noqa: E731
         _text(self.title, "title", empty=True)
         _text(self.doc, "doc", empty=True)
@@ -533,7 +540,8 @@ class Scenario:
         _require(
             isinstance(self.parameters, Mapping), "parameters", f"a table, got {self.parameters!r}"
         )
-        put("parameters", MappingProxyType(dict(self.parameters)))
+        checked = {k: _parameter(k, v) for k, v in self.parameters.items()}
+        put("parameters", MappingProxyType(checked))
         self._check_order()
 
     def _check_order(self) -> None:
@@ -646,22 +654,26 @@ class Scenario:
         ------
         ScenarioError : no such file, no TOML (with line and column), or a wrong key or value.
         """
-        path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as e:
-            reason = e.strerror if isinstance(e, OSError) else "not UTF-8 text"
-            raise ScenarioError(f"{path}: scenario file cannot be read: {reason}") from None
-        return cls.from_toml_text(text, str(path))
+            text = files.read_text(path, "scenario file", LARGEST_FILE)
+        except DataError as e:
+            raise ScenarioError(str(e)) from None
+        return cls.from_toml_text(text, os.fspath(path))
 
     @classmethod
     def from_toml_text(cls, text: str, source: str = "") -> Self:
         """Read TOML text; ``source`` names it in messages.  Errors as :meth:`from_toml`."""
         try:
             data = tomllib.loads(text)
+            return cls.from_dict(data, source)
         except tomllib.TOMLDecodeError as e:
             raise ScenarioError(f"{source or 'TOML'}: not valid TOML: {e}") from None
-        return cls.from_dict(data, source)
+        except RecursionError:
+            raise ScenarioError(f"{source or 'TOML'}: nested too deeply to be a scenario") from None
+        except ScenarioError:
+            raise
+        except ValueError as e:  # a whole number of more digits than Python reads
+            raise ScenarioError(f"{source or 'TOML'}: not valid TOML: {e}") from None
 
     @classmethod
     def from_python(cls, path: str | os.PathLike[str]) -> Scenario:
@@ -675,24 +687,21 @@ class Scenario:
         """
         path = Path(path)
         try:
-            code = path.read_bytes()
-        except OSError as e:
-            reason = e.strerror
-            raise ScenarioError(f"{path}: scenario file cannot be read: {reason}") from None
+            code = files.read_bytes(path, "scenario file", LARGEST_FILE)
+        except DataError as e:
+            raise ScenarioError(str(e)) from None
         scope: dict[str, Any] = {"__name__": "__scenario__", "__file__": str(path)}
         try:
             exec(compile(code, str(path), "exec"), scope)
+        except KeyboardInterrupt:
+            raise
         except ScenarioError as e:
-            raise ScenarioError(f"{path}: {e}") from e
-        except Exception as e:
-            line = getattr(e, "lineno", None)
-            tb = e.__traceback__
-            while tb is not None:
-                if tb.tb_frame.f_code.co_filename == str(path):
-                    line = tb.tb_lineno
-                tb = tb.tb_next
-            at = f" at line {line}" if line else ""
-            raise ScenarioError(f"{path}: {type(e).__name__}{at}: {e}") from e
+            raise ScenarioError(f"{path}: {e}{_at_line(e, path)}") from e
+        except BaseException as e:  # SystemExit too: it would pass for the end of the command
+            said = str(e)
+            if isinstance(e, SystemExit):
+                said = f"the file ends the program, with status {e.code!r}; remove that"
+            raise ScenarioError(f"{path}: {type(e).__name__}{_at_line(e, path)}: {said}") from e
         found = scope.get("scenario")
         if isinstance(found, Scenario):
             return found
@@ -789,13 +798,35 @@ class Scenario:
         return json.dumps(self.to_dict(), ensure_ascii=False)
 
 
+def _at_line(e: BaseException, path: Path) -> str:
+    """Return the innermost line of a file in a traceback, or of a syntax error, as words."""
+    line = getattr(e, "lineno", None)
+    tb = e.__traceback__
+    while tb is not None:
+        if tb.tb_frame.f_code.co_filename == str(path):
+            line = tb.tb_lineno
+        tb = tb.tb_next
+    return f" at line {line}" if line else ""
+
+
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted names and numbers of nested tables: TOML reads ``a.b = 1`` as a nested table."""
+    """Yield dotted names and values of nested tables: TOML reads ``a.b = 1`` as a nested table."""
     for k, v in table.items():
         name = f"{prefix}{k}"
         if isinstance(v, Mapping):
+            _require(name.count(".") < 5, f"parameters.{name[:80]}", "nested too deeply")
             yield from _flat(v, f"{name}.")
-        elif isinstance(v, float) and not math.isfinite(v):
-            raise _PlacedError(f"parameters.{name}", f"must be finite, got {v!r}")
         else:
             yield name, v
+
+
+def _parameter(name: str, value: Any) -> float | str:
+    """Return a parameter's value if it is a finite number or a word."""
+    place = f"parameters.{name}"
+    if isinstance(value, str):
+        return value
+    ok = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    _require(ok, place, f"a number is expected, got {reprlib.repr(value)}")
+    plain: float = value.item() if hasattr(value, "item") else value
+    _require(math.isfinite(plain), place, f"must be finite, got {value!r}")
+    return plain

@@ -61,7 +61,7 @@ class Row:
     @property
     def passed(self) -> bool:
         """Whether the error is a number within the tolerance."""
-        return math.isfinite(self.error) and abs(self.error) <= self.tolerance
+        return bool(math.isfinite(self.error) and abs(self.error) <= self.tolerance)
 
 
 Section = Callable[[], list[Row]]

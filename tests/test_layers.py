@@ -17,8 +17,9 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # Bottom first.  A module may import the layers below its own, and its neighbours only if NEIGHBOURS
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
+    ("interrupts",),
     ("errors", "checked", "sharing"),
-    ("signals", "parameters", "mapcheck", "cachefolder", "calling", "filearrays"),
+    ("signals", "parameters", "mapcheck", "cachefolder", "calling", "files", "filearrays"),
     ("netcdf3", "runstorage"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above
@@ -51,7 +52,7 @@ NEIGHBOURS = {
 # uses matplotlib.
 ONLY = {
     "figstyle": set(),
-    "plotting": {"results", "errors", "figstyle"},
+    "plotting": {"results", "errors", "figstyle", "files"},
     # these two draw what they are given a model of: eigenvalues, operating lines on a map
     "eigenplot": {"errors", "figstyle", "linearisation"},
     "benchplot": {"errors", "figstyle"},
@@ -76,6 +77,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 # Estimators know f, g and names; of the solvers only how to make a step of f and to compile it.
 ESTIMATORS = {
     "statespace", "signals", "results", "errors", "checked", "sharing", "backend", "discretisation",
+    "interrupts",
 }  # fmt: skip
 
 RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}
@@ -195,7 +197,7 @@ def test_inner_packages_hold_no_code():
 @pytest.mark.parametrize(
     ("path", "module", "words"),
     [
-        ("apu_casadi/signals.py", "apu_casadi.gas", "upward import: signals is in layer 1"),
+        ("apu_casadi/signals.py", "apu_casadi.gas", "upward import: signals is in layer 2"),
         ("apu_casadi/simulation.py", "apu_casadi.generator", "upward"),
         ("apu_casadi/machine/wrsg.py", "apu_casadi.components.shaft", "sideways"),
         ("apu_casadi/components/shaft.py", "apu_casadi.machine.park", "sideways"),
@@ -203,7 +205,7 @@ def test_inner_packages_hold_no_code():
         (
             "apu_casadi/plotting.py",
             "apu_casadi.apu",
-            "plotting sees only errors, figstyle, results",
+            "plotting sees only errors, figstyle, files, results",
         ),
         ("apu_casadi/apu.py", "apu_casadi.plotting", "no model or solver imports plotting"),
         ("apu_casadi/apu.py", "apu_casadi", "name the module"),

@@ -1,7 +1,9 @@
 """The subcommands of ``apu``, one module each.
 
 A module has ``NAME`` and ``HELP`` (texts), ``add_arguments(parser)`` and ``run(args) -> int``, the
-exit status.  It imports anything heavy inside ``run``, so that the other commands start quickly.
+exit status; and, where an interruption leaves more than finished files, ``resume(args) -> str``,
+the words on what is kept and how to go on.  It imports anything heavy inside ``run``, so that the
+other commands start quickly.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 MODULES: tuple[str, ...] = (
     "scenarios.commands.bench",
@@ -47,7 +49,7 @@ class Command(Protocol):
 
 
 def register(
-    subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
+    subparsers: argparse._SubParsersAction[Any],
     modules: Sequence[str] = MODULES,
 ) -> None:
     """Add the subcommands of ``modules`` to a parser."""
@@ -58,4 +60,4 @@ def register(
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )  # fmt: skip
         command.add_arguments(parser)
-        parser.set_defaults(run=command.run)
+        parser.set_defaults(run=command.run, resume=getattr(command, "resume", None))

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
 import sys
 from pathlib import Path
+
+from scenarios import jsontext
 
 NAME = "bench"
 HELP = "measure times and their accuracy (takes minutes)"
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             made.append(bench.write_plot(report.curves, size, page.parent / image))
         made.append(pages.write_text(page, bench.page(report, image)))
     if args.json:
-        print(json.dumps(report.to_dict(), indent=2, allow_nan=False))
+        jsontext.show(report.to_dict())
     else:
         print(bench.table(report))
         if made:

@@ -17,8 +17,9 @@ war), health (f_eta_c, ...), fixed (two for each point) or measured:
 from __future__ import annotations
 
 import argparse
-import json
 from typing import TYPE_CHECKING, Any
+
+from scenarios import jsontext
 
 if TYPE_CHECKING:
     from apu_casadi.calibration import CalibrationPoint, CalibrationResult
@@ -111,7 +112,10 @@ def run(args: argparse.Namespace) -> int:
         write_points(points, args.write_points)
     free = [n.strip() for n in args.free.split(",") if n.strip()] if args.free else list(FREE)
     result = calibrate(GasGenerator() if args.file else uncalibrated(), points, free)
-    print(json.dumps(report(result), indent=2, allow_nan=False) if args.json else text(result))
+    if args.json:
+        jsontext.show(report(result))
+    else:
+        print(text(result))
     return 0
 
 

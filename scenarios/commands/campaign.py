@@ -11,12 +11,13 @@ campaign works in DIR this one waits, and takes over what that one has done.
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from scenarios import jsontext
 
 NAME = "campaign"
 HELP = "run many joint scenarios with random faults"
@@ -42,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def resume(args: argparse.Namespace) -> str:
+    """Tell what an interruption leaves."""
+    return f"finished runs are kept in {args.out}; the same command, without --fresh, goes on"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -82,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     path = Path(args.out) / campaigns.DATASET
     if args.json:
         report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": n}
-        print(json.dumps({**report, "reasons": reasons, "file": str(path)}, indent=2))
+        jsontext.show({**report, "reasons": reasons, "file": str(path)})
         return 0
     print(f"{args.runs} runs in {t:.1f} s: " + ", ".join(f"{v} {k}" for k, v in n.items() if v))
     for name, why in list(reasons.items())[:10]:

@@ -6,9 +6,10 @@ The libraries go to the folder that $APU_CACHE_DIR names, by default ~/.cache/ap
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
+
+from scenarios import jsontext
 
 NAME = "compile"
 HELP = "compile the hot functions to C libraries ahead of time"
@@ -28,6 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
+def resume(args: argparse.Namespace) -> str:
+    """Tell what an interruption leaves."""
+    return "what was compiled is kept; the same command goes on"
+
+
 def run(args: argparse.Namespace) -> int:
     """Compile every group; return 1 if there is no compiler."""
     from importlib import import_module
@@ -37,7 +43,10 @@ def run(args: argparse.Namespace) -> int:
 
     if args.clear:
         n = backend.clear_cache()
-        print(json.dumps({"deleted": n}) if args.json else f"{n} libraries deleted")
+        if args.json:
+            jsontext.show({"deleted": n})
+        else:
+            print(f"{n} libraries deleted")
         return 0
     groups = dict(HOT)
     only = [n.strip() for n in args.only.split(",")] if args.only else list(groups)
@@ -62,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"{group:<12} {len(names):3d} functions  {rows[-1]['seconds']:6.1f} s")
     if args.json:
         out = {"folder": str(folder), "compiler": compiler, "groups": rows}
-        print(json.dumps(out, indent=2))
+        jsontext.show(out)
     else:
         print(f"in {folder}")
     return 0

@@ -10,10 +10,12 @@ Points that do not exist, or lie beyond a limit, are NaN; ``status`` says why.
 from __future__ import annotations
 
 import argparse
-import json
+import math
 import time
 from pathlib import Path
 from typing import Any
+
+from scenarios import jsontext
 
 NAME = "deck"
 HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
@@ -34,9 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve the grid and write it."""
-    import numpy as np
-
-    from apu_casadi.errors import DataError, ScenarioError
+    from apu_casadi import files, results
+    from apu_casadi.errors import ScenarioError
     from apu_casadi.gasgenerator import GasGenerator
     from apu_casadi.steadypoint import MEANING, Status
     from apu_casadi.trimbatch import performance_deck
@@ -45,24 +46,23 @@ def run(args: argparse.Namespace) -> int:
         "altitude": _axis("--altitude", args.altitude), "Mach": _axis("--mach", args.mach),
         "dT_isa": _axis("--disa", args.disa), "PW": _axis("--power", args.power),
     }  # fmt: skip
-    points = int(np.prod([len(v) for v in axes.values()]))
+    points = math.prod(len(v) for v in axes.values())
     if points > LARGEST:
-        raise ScenarioError(f"{points} points asked for, {LARGEST} at most")
+        raise ScenarioError(
+            f"{points} points asked for, {LARGEST} at most; take coarser axes, or several decks"
+        )
+    files.folder(Path(args.out).parent)
     keep = None if args.outputs is None else [n.strip() for n in args.outputs.split(",")]
     t = time.perf_counter()
     deck = performance_deck(
         GasGenerator(), **axes, outputs=keep, n_threads=args.threads
     )  # fmt: skip
     t = time.perf_counter() - t
-    try:
-        Path(args.out).parent.mkdir(parents=True, exist_ok=True)
-        deck.to_netcdf(args.out)
-    except OSError as e:
-        raise DataError(f"{args.out} cannot be written: {e.strerror or e}") from None
+    results.save(deck, args.out)
     status = deck["status"].values
     counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}
     if args.json:
-        print(json.dumps({"points": points, "seconds": t, "counts": counts, "file": args.out}))
+        jsontext.show({"points": points, "seconds": t, "counts": counts, "file": args.out})
         return 0
     print(f"{points} points in {t:.2f} s ({1e6 * t / points:.0f} us each)")
     for name, n in counts.items():
@@ -82,7 +82,14 @@ def _axis(option: str, text: str) -> list[float]:
             first, last, count = text.split(":")
             if int(count) < 1:
                 raise ValueError
-            values = np.linspace(float(first), float(last), int(count))
+            if int(count) > LARGEST:
+                raise ScenarioError(
+                    f"{option}: {int(count)} points asked for, {LARGEST} at most in a deck"
+                )
+            ends = float(first), float(last)
+            if not math.isfinite(ends[1] - ends[0]):
+                raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
+            values = np.linspace(*ends, int(count))
         else:
             values = np.array([float(v) for v in text.split(",")])
     except ValueError:

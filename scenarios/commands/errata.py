@@ -6,7 +6,8 @@ The effects are computed from the model; takes about a minute.
 from __future__ import annotations
 
 import argparse
-import json
+
+from scenarios import jsontext
 
 NAME = "errata"
 HELP = "what the paper leaves open, what was chosen, and what it changes"
@@ -23,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from scenarios import errata, pages
 
     if args.json:
-        print(json.dumps(errata.report(), indent=2, ensure_ascii=False))
+        jsontext.show(errata.report())
         return 0
     page = errata.page()
     if args.write:

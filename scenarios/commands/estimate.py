@@ -9,15 +9,14 @@ apu estimate sensors               what is measured, how well, and where that is
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from scenarios import jsontext
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
@@ -73,6 +72,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     p.add_argument("--json", action="store_true", help="print JSON")
 
 
+def resume(args: argparse.Namespace) -> str:
+    """Tell what an interruption leaves."""
+    if args.action is not _study:
+        return ""
+    return f"finished parts of the study are kept in {args.out}; the same command goes on"
+
+
 def run(args: argparse.Namespace) -> int:
     """Do what was asked for."""
     status: int = args.action(args)
@@ -87,7 +93,7 @@ def _joint(args: argparse.Namespace) -> int:
     from apu_casadi import results
     from apu_casadi.errors import ScenarioError
     from scenarios import registry
-    from scenarios.commands.run import _bar, _stoppable
+    from scenarios.commands.run import _bar
     from scenarios.estimation import jointrun
     from scenarios.pages import write_text
 
@@ -96,15 +102,14 @@ def _joint(args: argparse.Namespace) -> int:
     s = registry.get(args.scenario)
     folder = registry.prepare(args.out or f"results/estimate_{s.name}")
     show = not args.quiet and sys.stderr.isatty()
-    with _bar(f"{s.name}, truth", s.duration, show=show) as bar, _stoppable(bar) as progress:
+    with _bar(f"{s.name}, truth", s.duration, show=show) as progress:
         truth = jointrun.truth(s, progress=progress)
     if show:
         print("estimating ...", file=sys.stderr)
-    with _interruptible():
-        e = jointrun.estimate(truth, args.seed)
+    e = jointrun.estimate(truth, args.seed)
     report = jointrun.report(e)
     made = [results.save(e, folder / f"estimate_{s.name}.nc")]
-    text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
+    text = jsontext.dumps(report)
     made.append(write_text(folder / "estimate.json", text + "\n"))
     if args.figures:
         path = folder / f"estimate_{s.name}.png"
@@ -146,7 +151,7 @@ def _study(args: argparse.Namespace) -> int:
         )  # fmt: skip
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
-        with _interruptible(), _study_bar(name, show=show) as progress:
+        with _study_bar(name, show=show) as progress:
             record = studies.run(name, folder, n_seeds=n, again=args.again, progress=progress)
         with understood(name):
             found[name] = REPORTS[name].claims(studies.results(record))
@@ -161,7 +166,7 @@ def _study(args: argparse.Namespace) -> int:
         import dataclasses
 
         table = {k: [dataclasses.asdict(c) for c in v] for k, v in found.items()}
-        print(json.dumps(table, indent=2, ensure_ascii=False))
+        jsontext.show(table)
     else:
         print(f"kept in {folder}; apu estimate page makes the page")
     return 0
@@ -187,34 +192,12 @@ def _study_bar(name: str, *, show: bool) -> Iterator[Callable[[str, float, float
         yield progress
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let Ctrl-C come out as such, also where an integrator or a filter turned it into an error."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    asked = threading.Event()
-
-    def handler(*_: object) -> None:
-        asked.set()
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, handler)
-    try:
-        yield
-    except Exception:
-        if asked.is_set():
-            raise KeyboardInterrupt from None
-        raise
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 # ------------------------------------------------------------------------------ page, sensors
 
 
 def _page(args: argparse.Namespace) -> int:
     """Write the page and its figures from the kept studies."""
+    from apu_casadi import files
     from apu_casadi.errors import DataError
     from scenarios.estimation import page, studies
     from scenarios.pages import write_text
@@ -227,7 +210,10 @@ def _page(args: argparse.Namespace) -> int:
             text = page.put_summary(path.read_text(encoding="utf-8"), records)
             made.append(write_text(path, text))
     except OSError as e:
-        raise DataError(f"{e.filename or args.write}: {e.strerror or e}") from None
+        place = e.filename or args.readme or args.write
+        raise DataError(f"{place}: cannot be read: {files.reason(e)}") from None
+    except UnicodeDecodeError as e:
+        raise DataError(f"{args.readme}: not UTF-8 text ({e})") from None
     print("written:", *(f"  {p}" for p in made), sep="\n")
     # not on the page, which is what the kept numbers say, whatever the code has become
     for name, record in records.items():
@@ -243,7 +229,7 @@ def _sensors(args: argparse.Namespace) -> int:
 
     sets = {"gas path, every 20 ms": GAS_PATH, "electrical, at 10 kHz": ELECTRICAL}
     if args.json:
-        print(json.dumps({k: v.table() for k, v in sets.items()}, indent=2, ensure_ascii=False))
+        jsontext.show({k: v.table() for k, v in sets.items()})
         return 0
     for head, table in sets.items():
         print(head)

@@ -18,7 +18,6 @@ each row is a steady operating point.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.errors import DataError, ParameterError, nearest
+from scenarios import jsontext
 
 if TYPE_CHECKING:
     from estimators.fit import Profile
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     if args.json:
-        print(json.dumps(found, indent=2, allow_nan=False))
+        jsontext.show(found)
         return 0
     print(text(found))
     for path in figures:
@@ -450,13 +450,13 @@ def text(found: Mapping[str, Any]) -> str:
 
 def _draw(fit: EngineFit, path: str, steady: bool) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
+    from apu_casadi import files
     from apu_casadi.fitplot import plot_fit
     from apu_casadi.gasgenerator import GasGenerator
 
     first = Path(path)
     if first.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ParameterError(f"--figure {path!r}: .png, .pdf or .svg is expected")
-    first.parent.mkdir(parents=True, exist_ok=True)
     units = {s.name: s.unit for s in GasGenerator.Y}
     r, made = fit.result, []
     note = "; ".join(f"{n} = {v:.4f} ± {1.96 * s:.4f}" for n, v, s in
@@ -468,9 +468,5 @@ def _draw(fit: EngineFit, path: str, steady: bool) -> list[Path]:
             t + 1 if steady else t, fit.series(k), units, steady=steady,
             heading=f"{name}: measured and fitted", note=f"95 %: {note}.",
         )  # fmt: skip
-        try:
-            fig.savefig(target)
-        except OSError as e:
-            raise DataError(f"{target}: cannot be written: {e.strerror or e}") from None
-        made.append(target)
+        made.append(files.save_figure(fig, target))
     return made

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from scenarios import jsontext
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,7 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compute, print and draw."""
-    from apu_casadi.errors import DataError, ParameterError
+    from apu_casadi import files
+    from apu_casadi.errors import ParameterError
     from estimators.identifiability import compare_sensors, which_to_add
     from scenarios.estimation import identify as study
 
@@ -107,11 +108,7 @@ def run(args: argparse.Namespace) -> int:
             for label, p in (("without PW", False), ("with PW", True))
         }
     if args.figure is not None:
-        try:
-            Path(args.figure).parent.mkdir(parents=True, exist_ok=True)
-            _figure(first, options["samples"]).savefig(args.figure)
-        except (OSError, ValueError) as e:
-            raise DataError(f"{args.figure} cannot be written: {e}") from None
+        files.save_figure(_figure(first, options["samples"]), args.figure)
     if args.json:
         report = {
             "point": args.point,
@@ -143,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
             "severity": [_severity_row(s) for s in electrical],
             "transient": None if ramp is None else {k: r.rows() for k, r in ramp.items()},
         }  # fmt: skip
-        print(json.dumps(_plain(report), indent=2, allow_nan=False))
+        jsontext.show(report)
         return 0
     lines = [
         *_heading(args, sensors),
@@ -164,15 +161,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _names(text: str) -> list[str]:
     return [n.strip() for n in text.split(",") if n.strip()]
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: no infinities, no NaN."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _wrap(text: str, first: str = "- ") -> list[str]:

@@ -8,9 +8,10 @@ time, with its governor.  The eigenvalues are printed slowest first, and drawn i
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from typing import TYPE_CHECKING, Any
+
+from scenarios import jsontext
 
 if TYPE_CHECKING:
     from apu_casadi.linearisation import LinearModel
@@ -44,14 +45,15 @@ def run(args: argparse.Namespace) -> int:
     model = linear_model(args)
     path = None
     if not args.no_figures:
+        from apu_casadi import files
         from apu_casadi.eigenplot import plot_eigenvalues
         from scenarios import registry
 
         label = f"{args.power:g} kW each, {args.altitude:g} m, Mach {args.mach:g}"
         path = registry.prepare(args.out) / "eigenvalues.png"
-        plot_eigenvalues({label: model}).savefig(path)
+        files.save_figure(plot_eigenvalues({label: model}), path)
     if args.json:
-        print(json.dumps(report(model), indent=2, allow_nan=False))
+        jsontext.show(report(model))
         return 0
     print(table(model))
     if path is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
+
+from scenarios import jsontext
 
 NAME = "list"
 HELP = "list the scenarios of the library"
@@ -21,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
     scenarios = list_scenarios()
     if args.json:
         rows = [{"name": s.name, "duration": s.duration, "title": s.title} for s in scenarios]
-        print(json.dumps(rows, indent=2, ensure_ascii=False))
+        jsontext.show(rows)
         return 0
     width = max(len(s.name) for s in scenarios)
     for s in scenarios:

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw both maps and print the paths."""
-    from apu_casadi import results
+    from apu_casadi import files, results
     from apu_casadi.gasgenerator import GasGenerator
     from apu_casadi.mapplots import default_lines, plot_compressor_map, plot_turbine_map
     from scenarios import registry
@@ -33,6 +33,5 @@ def run(args: argparse.Namespace) -> int:
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
         path = folder / f"{name}.png"
-        draw(gg, lines=lines, trajectory=ds).savefig(path)
-        print(path)
+        print(files.save_figure(draw(gg, lines=lines, trajectory=ds), path))
     return 0

@@ -7,11 +7,11 @@ the predicted exchange; takes some minutes.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 from apu_casadi.errors import ScenarioError
+from scenarios import jsontext
 
 NAME = "multirate"
 HELP = "measure the error of the multi-rate exchange (takes minutes)"
@@ -36,17 +36,17 @@ def run(args: argparse.Namespace) -> int:
     """Run the study and write its results."""
     from scenarios import multirate_study as study
     from scenarios import pages, registry
-    from scenarios.commands.run import _bar, _stoppable
+    from scenarios.commands.run import _bar
 
     steps = study.STEPS if args.steps is None else _steps(args.steps, study.COMMON)
     folder = registry.prepare(args.out or "results/multirate")
     show = not args.quiet and sys.stderr.isatty()
     if args.page and study.PAPER_STEP not in steps:
         raise ScenarioError("--page needs the paper's 20 ms among --steps")
-    with _bar(NAME, study.simulated(steps), show=show) as bar, _stoppable(bar) as progress:
+    with _bar(NAME, study.simulated(steps), show=show) as progress:
         rows = study.measure(steps=steps, progress=progress)
     report = study.report(rows)
-    text = json.dumps(report, indent=2)
+    text = jsontext.dumps(report)
     made = [study.write_figure(rows, folder / "multirate_error.png")]
     made.append(pages.write_text(folder / "multirate.json", text + "\n"))
     if args.page:

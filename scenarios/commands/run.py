@@ -7,14 +7,13 @@ SCENARIO is a name of the library (see ``apu list``), a .toml file, or a .py fil
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from scenarios import jsontext
 
 NAME = "run"
 HELP = "run a scenario of the library or of a file"
@@ -50,12 +49,12 @@ def run(args: argparse.Namespace) -> int:
         s = s.change(waveform_dt=None)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
-    with _bar(s.name, s.duration, show=show) as bar, _stoppable(bar) as progress:
+    with _bar(s.name, s.duration, show=show) as progress:
         ds = registry.run(s, progress=progress, solver=args.solver, phasors=args.phasors)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
     if args.json:
-        print(json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False))
+        jsontext.show(report)
         return 0
     print(f"{s.name}: {s.title}" if s.title else s.name)
     print(table(report["phases"]))
@@ -67,36 +66,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 Progress = Callable[[float, float], None]
-
-
-@contextmanager
-def _stoppable(inner: Progress) -> Iterator[Progress]:
-    """Let Ctrl-C stop the run between two exchange steps; a second one stops it at once.
-
-    Inside an integrator it would come out as a failure of the right-hand side.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield inner
-        return
-    asked = threading.Event()
-
-    def handler(*_: object) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-
-    def progress(done: float, total: float) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        inner(done, total)
-
-    before = signal.signal(signal.SIGINT, handler)
-    try:
-        yield progress
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if asked.is_set():
-        raise KeyboardInterrupt
 
 
 @contextmanager

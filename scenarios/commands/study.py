@@ -6,8 +6,8 @@ Exit status 1 when a point is wrong or refused without a reason.
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
+
+from scenarios import jsontext
 
 NAME = "study"
 HELP = "run a numerical study (trim)"
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
         raise ScenarioError(f"--threads must be >= 1, got {args.threads}")
     report = trim_study.run(args.points, args.seed, n_threads=args.threads)
     if args.json:
-        print(json.dumps(dataclasses.asdict(report), indent=2))
+        jsontext.show(report)
     else:
         print(trim_study.table(report))
     return 1 if report.wrong or report.unexplained else 0

@@ -18,12 +18,12 @@ The whole unit under an electrical load of each generator, or one generator at a
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Mapping
 from typing import Any
 
 from apu_casadi.errors import OperatingPointError, SignalError, nearest
+from scenarios import jsontext
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -198,7 +198,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         }  # fmt: skip
         if point.second is not None:
             report["second"] = point.second.values
-        print(json.dumps(report, indent=2, allow_nan=False))
+        jsontext.show(report)
         return 0
     print(_table(values, list(values) if args.all else ["N_rpm", *SHOWN]))
     if extra:
@@ -227,7 +227,7 @@ def _generator(args: argparse.Namespace) -> int:
     point = gen.steady_state(load, w_r=w_r, V_t=args.voltage)
     values = {"V_t": point.V_t, "V_ref": point.V_ref, **_scalars(point.y)}
     if args.json:
-        print(json.dumps({"generator": values, "residual": point.residual}, indent=2))
+        jsontext.show({"generator": values, "residual": point.residual})
         return 0
     print(_table(values, list(values)))
     print(f"\nresidual {point.residual:.1e} 1/s")

@@ -7,10 +7,11 @@ run; without ``--only``, sections whose peer is not installed are skipped with t
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
+
+from scenarios import jsontext
 
 NAME = "validate"
 HELP = "recompute published tables and numerical checks"
@@ -64,21 +65,14 @@ def run(args: argparse.Namespace) -> int:
         report[name] = rows
         if not args.json:
             print(f"\n{name}: {known[name][0]}")
-            print(table(rows))
+            print(table(rows), flush=True)
     total = sum(len(r) for r in report.values())
     if args.json:
         out = {
-            name: [
-                {
-                    **{k: _plain(v) for k, v in vars(r).items()},
-                    "passed": r.passed,
-                }
-                for r in rows
-            ]
-            for name, rows in report.items()
+            name: [{**vars(r), "passed": r.passed} for r in rows] for name, rows in report.items()
         }
         summary = {"rows": total, "failed": failed, "skipped": skipped}
-        print(json.dumps({"sections": out, **summary}, indent=2))
+        jsontext.show({"sections": out, **summary})
     else:
         left_out = f"; skipped: {', '.join(skipped)}" if skipped else ""
         print(f"\n{total} rows, {failed} short of their tolerance{left_out}")
@@ -125,7 +119,3 @@ def table(rows: list) -> str:
         ).rstrip()
         for row in (head, *body)
     )  # fmt: skip
-
-
-def _plain(v: object) -> object:
-    return None if isinstance(v, float) and not math.isfinite(v) else v

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.control import GovernorParameters, governor
 from apu_casadi.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
@@ -542,5 +543,5 @@ def run_study(
         tell = None if progress is None else (lambda a, b, k=kind: progress(k, a, b))
         results.append(coverage(n, seed0=seed0, kind=kind, progress=tell))
     report = {"goal": "93 to 97 % of the 95 % intervals hold the truth", "coverage": results}
-    Path(path).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    files.write_text(path, json.dumps(report, indent=2) + "\n")
     return report

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import ScenarioError
 from apu_casadi.sharing import last
 from scenarios import registry
@@ -350,8 +351,7 @@ def saved(e: xr.Dataset, every: int = 2) -> dict[str, Any]:
 
 def draw(kept: Mapping[str, Any], path: Path, *, dpi: int | None = None) -> Path:
     """Draw truth, estimate and band of :func:`saved` numbers into a PNG file."""
-    figure(kept).savefig(path, **({} if dpi is None else {"dpi": dpi}))
-    return path
+    return files.save_figure(figure(kept), path, **({} if dpi is None else {"dpi": dpi}))
 
 
 def figure(kept: Mapping[str, Any]) -> Any:

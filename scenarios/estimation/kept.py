@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from apu_casadi import files
 from apu_casadi.errors import DataError
 
 _log = logging.getLogger("apu_casadi")
@@ -38,11 +39,12 @@ def read(path: Path, name: str) -> dict[str, Any] | None:
     ------
     DataError : the file cannot be read, or does not hold the study ``name``.
     """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError, RecursionError) as e:
+    text = files.read_text(path, "study")
+    try:
+        record = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as a study: {e}") from None
     if not isinstance(record, dict) or record.get("study") != name:
         raise DataError(f"{path} does not hold the study {name!r}")
@@ -55,6 +57,10 @@ def read(path: Path, name: str) -> dict[str, Any] | None:
             _log.warning("%s: part %r is left out: %s; it is to be run again", path, key, why)
             del record["parts"][key]
     return record
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
 
 
 def _wrong(part: Any) -> str:

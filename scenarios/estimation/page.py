@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from apu_casadi import files
 from apu_casadi.errors import DataError
 from scenarios.estimation import studies
 from scenarios.estimation.kept import understood
@@ -96,6 +97,14 @@ def load(folder: str | Path) -> dict[str, dict[str, Any]]:
     }
     if not found:
         raise DataError(f"{os.fspath(folder)}: no results; apu estimate study all makes them")
+    for name, record in found.items():
+        try:
+            REPORTS[name].claims(studies.results(record))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as e:
+            raise DataError(
+                f"{studies.path_of(studies.STUDIES[name], folder)}: damaged: its results cannot be "
+                f"read ({type(e).__name__}: {e}); run the study with --again"
+            ) from None
     return found
 
 
@@ -274,12 +283,10 @@ def write(path: str | os.PathLike[str], records: Mapping[str, Mapping[str, Any]]
     """Write page and figures (in ``docs/images`` beside it); return the paths."""
     path = Path(path)
     out = path.parent / IMAGES
-    out.mkdir(parents=True, exist_ok=True)
     made = [write_text(path, page(records))]
     for name, group in pictures(records).items():
         for file, figure in group.values():
             with understood(name):
                 drawn = figure()
-            drawn.savefig(out / file, dpi=DPI)
-            made.append(out / file)
+            made.append(files.save_figure(drawn, out / file, dpi=DPI))
     return made

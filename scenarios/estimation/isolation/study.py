@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi import files
 from apu_casadi.errors import ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
 from scenarios.estimation.gaspath_study import VARIANTS, variant
@@ -255,10 +256,10 @@ def main() -> None:
         kappas = ", ".join(f"{m} {r[m]['kappa']:.3f}" for m in (*METHODS, "limit"))
         print(f"{name}: kappa {kappas}")
     if args.out is not None:
-        args.out.write_text(json.dumps(result, indent=1), encoding="utf-8")
+        files.write_text(args.out, json.dumps(result, indent=1))
         if not args.study:
             for name, fig in figures(result).items():
-                fig.savefig(args.out.with_name(f"{name}.png"))
+                files.save_figure(fig, args.out.with_name(f"{name}.png"))
 
 
 if __name__ == "__main__":

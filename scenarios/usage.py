@@ -1,0 +1,46 @@
+"""How the command line is read: options in full, and the nearest name where one is unknown."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from apu_casadi.errors import nearest
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser, also for its subcommands, that takes no abbreviation and names what is near."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        """Take the arguments of :class:`argparse.ArgumentParser`."""
+        # an abbreviation that works today may be another option's name tomorrow
+        super().__init__(*args, **{**options, "allow_abbrev": False})
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse; end with status 2 at an unknown option, and at ``--option=--``."""
+        for text in args or ():
+            # argparse takes the two dashes away and then misses the value
+            if re.fullmatch(r"--[^=]+=--", text):
+                self.error(f"argument {text[:-3]}: a value is expected, got '--'")
+        found, rest = super().parse_known_args(args, namespace)
+        unknown = [text for text in rest if text.startswith("-") and text != "--"]
+        if unknown:
+            option = unknown[0].partition("=")[0]
+            known = [o for o in self._option_string_actions if o.startswith("--")]
+            self.error(f"unrecognized arguments: {' '.join(unknown)} {nearest(option, known)}")
+        return found, rest
+
+
+class ShowVersion(argparse.Action):
+    """Print the installed version; looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Print and end."""
+        from importlib.metadata import version
+
+        print(f"apu-casadi {version('apu-casadi')}")
+        parser.exit()
