@@ -435,7 +435,12 @@ def read_points(path: str | Path) -> list[CalibrationPoint]:
     except (OSError, UnicodeDecodeError) as e:
         raise DataError(f"{path}: cannot be read: {getattr(e, 'strerror', None) or e}") from e
     lines = [(k, x) for k, x in enumerate(text.splitlines(), 1) if x.strip() and x[0] != "#"]
-    rows = list(csv.reader(x for _, x in lines))
+    try:
+        rows = list(csv.reader(x for _, x in lines))
+    except csv.Error as e:
+        raise DataError(f"{path}: no CSV file: {e}") from None
+    if len(rows) != len(lines):
+        raise DataError(f"{path}: a quoted cell runs over several lines; is a quote missing?")
     if not rows or tuple(c.strip() for c in rows[0]) != COLUMNS:
         raise DataError(f"{path}: the first line must be {','.join(COLUMNS)}")
     found: dict[str, dict[str, dict[str, Any]]] = {}
@@ -456,7 +461,10 @@ def read_points(path: str | Path) -> list[CalibrationPoint]:
         group[name] = (v, _number(sigma, where)) if role == "measured" else v
     if not found:
         raise DataError(f"{path}: no points below the header")
-    return [CalibrationPoint(**groups, name=point) for point, groups in found.items()]
+    try:
+        return [CalibrationPoint(**groups, name=point) for point, groups in found.items()]
+    except SignalError as e:
+        raise SignalError(f"{path}: {e}") from None
 
 
 def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
@@ -481,6 +489,9 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
 
 def _number(text: str, where: str) -> float:
     try:
-        return float(text)
+        value = float(text) if text.isascii() and "_" not in text else math.nan
     except ValueError:
-        raise DataError(f"{where}: {text!r} is not a number") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise DataError(f"{where}: {text[:40]!r} is not a number")
+    return value
