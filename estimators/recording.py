@@ -42,7 +42,8 @@ def plain_numbers(data: Any, what: str, *, gaps: bool = False) -> np.ndarray:
         a = np.asarray(data)
     except ValueError:
         raise DataError(f"{what}: an array of numbers expected, got {data!r:.60}") from None
-    wrong, kind = (a.flat[0] if a.size else None), a.dtype.kind
+    wrong: Any = a.flat[0] if a.size else None
+    kind: str = a.dtype.kind
     if kind == "O":
         others = [x for x in a.ravel() if not _is_number(x)]
         kind = "f" if not others else _KINDS.get(type(others[0]).__name__, "O")
@@ -174,8 +175,8 @@ def _stamped(name: str, data: Any) -> tuple[np.ndarray, np.ndarray]:
         times, values = data
     except (TypeError, ValueError):
         raise DataError(f"{name}: (times, values) expected, got {data!r:.80}") from None
-    t = plain_numbers(times, f"{name}: times")
-    v = plain_numbers(values, f"{name}: values", gaps=True)
+    t = plain_numbers(times, f"{name}: (times, values) expected; times")
+    v = plain_numbers(values, f"{name}: (times, values) expected; values", gaps=True)
     if t.ndim != 1 or t.shape != v.shape or t.size == 0:
         raise DataError(
             f"{name}: times and values of one length expected, got {t.shape}, {v.shape}"
