@@ -94,11 +94,15 @@ def filled(
     edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int)))
     for i, j in zip(edges[::2], edges[1::2], strict=True):
         gap = slice(i, j)
-        sides = [~missing & (angle < angle[i]) & (angle > angle[i] - 2 * math.pi - 1e-6),
-                 ~missing & (angle > angle[j - 1]) & (angle < angle[j - 1] + 2 * math.pi + 1e-6)]  # fmt: skip
+        near = 2 * math.pi + 1e-6
+        before = ~missing & (angle < angle[i]) & (angle > angle[i] - near)
+        after = ~missing & (angle > angle[j - 1]) & (angle < angle[j - 1] + near)
         long = angle[j - 1] - angle[i] > LONG * 2 * math.pi
-        fits = [_fit(basis, x, s) for s in (sides if long else [sides[0] | sides[1]])]
-        fits = [f for f in fits if f is not None]
+        fits = [
+            f
+            for f in (_fit(basis, x, s) for s in ((before, after) if long else (before | after,)))
+            if f is not None
+        ]
         if not fits:
             raise DataError(
                 f"{name}: too few samples within a period of the gap at t = {t[i]:.9g} s "
