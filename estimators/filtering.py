@@ -35,6 +35,7 @@ __all__ = [
     "FilterResult",
     "FilterStep",
     "block_of",
+    "narrow",
     "padded",
     "run",
 ]
@@ -351,9 +352,9 @@ class _Passes:
         # the buffers are this run's own: runs may be nested, or go on in several threads
         self.calls: dict[bool, Caller] = {}
         root = prior.root
-        if step.root or (step.wide is not None and (root is not None or _narrow(prior.cov))):
+        if step.root or (step.wide is not None and (root is not None or narrow(prior.cov))):
             root = root_of(prior.cov) if root is None else root
-            if step.root or _narrow(root, root=True):
+            if step.root or narrow(root, root=True):
                 self._root(root)
 
     @property
@@ -377,7 +378,7 @@ class _Passes:
         self, u: np.ndarray, y: np.ndarray, R: np.ndarray, dt: np.ndarray, p: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         """Return the outputs of one block, and go on to the next."""
-        if self.rooted and not self.step.root and not _narrow(self.P, root=True):
+        if self.rooted and not self.step.root and not narrow(self.P, root=True):
             # well enough known in all directions: on with the covariance
             self.P, self.now = self.P @ self.P.T, self.step
         out = self._call(u, y, R, dt, p)
@@ -389,7 +390,7 @@ class _Passes:
         return out
 
 
-def _narrow(P: np.ndarray, *, root: bool = False) -> bool:
+def narrow(P: np.ndarray, *, root: bool = False) -> bool:
     """Whether some combination of states is known far better than each of them, or not a number."""
     if root:
         size = np.sqrt((P**2).sum(1))
@@ -412,7 +413,7 @@ def _lossy(out: Sequence[np.ndarray], R: np.ndarray, nx: int) -> bool:
     S = out[5].reshape(R.shape)
     if not np.isfinite(S).all() or ((R > 0) & (S > WIDE * R)).any():
         return True
-    return bool(not np.isfinite(out[1]).all() or _narrow(out[1].reshape(nx, nx)))
+    return bool(not np.isfinite(out[1]).all() or narrow(out[1].reshape(nx, nx)))
 
 
 @dataclass(frozen=True, eq=False)
