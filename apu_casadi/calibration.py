@@ -487,6 +487,9 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
 
 def _number(text: str, where: str) -> float:
     try:
-        return float(text)
+        value = float(text) if text.isascii() and "_" not in text else math.nan
     except ValueError:
-        raise DataError(f"{where}: {text!r} is not a number") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise DataError(f"{where}: {text[:40]!r} is not a number")
+    return value

@@ -18,6 +18,7 @@ __all__ = [
     "cholesky",
     "cholesky_semidefinite",
     "forward",
+    "graded_lower",
     "qr_lower",
     "root_of",
     "root_update",
@@ -129,6 +130,37 @@ def qr_lower(A: ca.SX) -> ca.SX:
             for j in tail:
                 row[j] = row[j] - dot * rows[i][j]
             L[r, i] = (dot * v0 - row[i]) * sign
+    return L
+
+
+def graded_lower(A: ca.SX) -> ca.SX:
+    """Return lower triangular L with L L' = A A', also where the columns of A differ widely.
+
+    ``A`` is (n, m), of any rank.  Rows are made orthogonal one after the other (modified
+    Gram-Schmidt): what is taken off an entry is a multiple of its own column, so that a column of
+    1 beside one of 1e12 keeps its digits, which reflections would mix.  Thornton and Bierman
+    (1980), Control and Dynamic Systems 16, 177; Björck (1996), section 4.4.
+    """
+    n, m = A.shape
+    rows = [[A[i, j] for j in range(m)] for i in range(n)]
+    L = ca.SX(n, n)
+    for i in range(n):
+        filled = [j for j in range(m) if not rows[i][j].is_zero()]
+        if not filled:
+            continue
+        square = sum((rows[i][j] ** 2 for j in filled), ca.SX(0))
+        there = square > TINY
+        L[i, i] = ca.if_else(there, ca.sqrt(square), 0)
+        per = ca.if_else(there, 1 / ca.sqrt(square), 0)
+        unit = {j: rows[i][j] * per for j in filled}
+        for r in range(i + 1, n):
+            along = sum((rows[r][j] * unit[j] for j in filled if not rows[r][j].is_zero()),
+                        ca.SX(0))  # fmt: skip
+            if along.is_zero():
+                continue
+            L[r, i] = along
+            for j in filled:
+                rows[r][j] = rows[r][j] - along * unit[j]
     return L
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ class Belief:
     x : the states.
     mean : shape (nx,).
     cov : covariance, shape (nx, nx), symmetric, positive semidefinite.
+    root : lower triangular L with L L' = cov, where a filter knows it: it holds twice as many
+        digits, which count where some directions are far better known than others.
 
     Raises
     ------
@@ -38,6 +40,7 @@ class Belief:
     x: Signals
     mean: np.ndarray
     cov: np.ndarray
+    root: np.ndarray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check shapes, finiteness, symmetry and that no direction has negative variance."""

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -217,7 +218,15 @@ def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> 
     out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
     kept = "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"
     name = f"ekf{kept}_{model.name}"
-    return FilterStep(model, ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT))
+    function = ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT)
+    return FilterStep(model, function, wide=partial(_with_roots, model, iterations, iterated))
+
+
+def _with_roots(model: FilterModel, iterations: int, iterated: str) -> FilterStep:
+    """The same filter in square-root form; made only where it is needed."""
+    from estimators.rootfilter import ekf_root_step
+
+    return ekf_root_step(model, iterations, iterated)
 
 
 def extended_kalman_filter(

@@ -7,9 +7,11 @@ where there is a compiler; Python is not crossed for each sample.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -34,6 +36,7 @@ __all__ = [
     "FilterResult",
     "FilterStep",
     "block_of",
+    "narrow",
     "padded",
     "run",
 ]
@@ -46,6 +49,11 @@ STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
 step to the next sample; then the predicted belief at the next sample, the filtered belief, the
 cross-covariance of filtered state and next state, innovation, its covariance, and ``STATS``."""
 STATS = ("check", "nis", "loglik", "measured")
+ROOT_OUT = ["Y", "Z", "Lf"]
+"""What a step in square-root form may give beside: roots for the smoother, see
+:mod:`estimators.rootfilter`."""
+WIDE = 1e7  # innovation over noise variance from which a covariance loses more than eight digits
+NARROW = 1e-9  # share of a variance that is left when the other states are known; below: the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +66,19 @@ class FilterStep(Parametric):
     function : Function ``STEP_IN`` -> ``STEP_OUT``.
     root : the filter carries square roots: ``P`` and ``P1`` (and only these) are lower triangular
         factors L of the covariance L L'.
+    wide : makes the same filter in square-root form, for beliefs whose covariance double precision
+        does not hold; None where there is none.
     """
 
     model: FilterModel
     function: ca.Function
     root: bool = False
+    wide: Callable[[], FilterStep] | None = None
+
+    @property
+    def gives_roots(self) -> bool:
+        """Whether the function gives ``ROOT_OUT`` too."""
+        return bool(self.function.n_out() > len(STEP_OUT))
 
     @derived
     def plain(self) -> FilterStep:
@@ -104,6 +120,9 @@ class FilterResult:
     cross : covariance of the filtered state at k and the predicted one at k+1, (K, nx, nx).
     innovation_cov : covariances of the innovations, (K, ny, ny), 1 on the diagonal where nothing
         was measured; None unless kept.
+    roots : roots of the predicted covariance before each sample, and Y, Z and the root of the
+        filtered covariance, each (K, nx, nx); see :mod:`estimators.rootfilter`.
+    again : runs the same filter in square-root form and keeps the roots; None where it cannot.
     """
 
     x: Signals
@@ -122,6 +141,8 @@ class FilterResult:
     cov_pred: np.ndarray | None = None
     cross: np.ndarray | None = None
     innovation_cov: np.ndarray | None = None
+    roots: tuple[np.ndarray, ...] | None = field(default=None, repr=False)
+    again: Callable[[], FilterResult] | None = field(default=None, repr=False)
 
     def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (mean, standard deviation) of one state, each of shape (K,)."""
@@ -210,10 +231,12 @@ def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> c
         STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
     )]  # fmt: skip
     m, P, u, p, y, R, dt = s
-    o = dict(zip(STEP_OUT, step.function(*s), strict=True))
+    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
     kept = [o["m_f"], ca.vec(o["P_f"]), o["nu"], ca.diag(o["S"]), o["stats"]]
     if full:
         kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
+    if step.gives_roots:
+        kept += [ca.vec(o[n]) for n in (ROOT_OUT if full else ROOT_OUT[-1:])]
     name = f"{step.function.name()}{'_full' if full else ''}"
     out = [o["m1"], o["P1"], *(ca.densify(k) for k in kept)]
     one = ca.Function(f"{name}_one", [m, P, u, y, R, dt, p], out)
@@ -266,8 +289,7 @@ def run(
         raise SignalError(
             f"prior of {', '.join(prior.x.names)}; {model.name} has {', '.join(model.x.names)}"
         )
-    # the buffers are this run's own: runs may be nested, or go on in several threads
-    call = Caller(_block(step, full, backend, backend_in_use()), copy=False)
+    passes = _Passes(step, prior, full, backend)
     nx, _, _, _, ny = model.sizes
     K = data.size
     n_blocks = -(-K // BLOCK)
@@ -277,34 +299,129 @@ def run(
     mean, var = np.empty((nx, K)), np.empty((nx, K))
     nu, S = np.empty((ny, K)), np.empty((ny, K))
     stats = np.empty((len(STATS), K))
-    kept = _Kept.of(K, nx, ny) if full else None
-    m, P = prior.mean.copy(), root_of(prior.cov) if step.root else prior.cov.copy()
-    last = P
+    kept = _Kept.of(K, nx, ny, roots=step.gives_roots) if full else None
     for b in range(n_blocks):
         s = slice(b * BLOCK, (b + 1) * BLOCK)
         n = min(BLOCK, K - b * BLOCK)
         r = slice(b * BLOCK, b * BLOCK + n)
-        out = call(m, P, u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
-        P_f = out[3][:, :n]
-        for target, source in ((mean, out[2]), (var, P_f[:: nx + 1]), (nu, out[4]), (S, out[5])):
+        out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
+        for target, source in (
+            (mean, out[2]), (var, out[3][:: nx + 1]), (nu, out[4]), (S, out[5]), (stats, out[6])
+        ):  # fmt: skip
             target[:, r] = source[:, :n]
-        stats[:, r] = out[6][:, :n]
         _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
         if kept is not None:
-            kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=step.root)
-        last = P_f[:, -1].reshape(nx, nx)
-        last = (last + last.T) / 2
-        np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
-        m, P = out[0].copy(), out[1].copy()
+            kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=passes.rooted)
         if progress is not None:
             progress(b * BLOCK + n, K)
+    last = out[3][:, n - 1].reshape(nx, nx)
+    last = (last + last.T) / 2
+    np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
+    root = None if not passes.now.gives_roots else out[-1][:, n - 1].reshape(nx, nx).T.copy()
     np.maximum(var, 0.0, out=var)  # rounding, judged above
     nu[missing], S[missing] = np.nan, np.nan
+    again = None
+    if full and step.wide is not None:
+        again = partial(_rooted, step, prior, data, backend)
     return FilterResult(
         model.x, model.y, data.t, mean, var, nu, S, stats[1], stats[3], float(stats[2].sum()),
-        Belief(model.x, mean[:, -1].copy(), last),
-        *(() if kept is None else (kept.cov, kept.mean_pred, kept.cov_pred, kept.cross, kept.S)),
+        Belief(model.x, mean[:, -1].copy(), last, root),
+        **({} if kept is None else kept.fields()), again=again,
     )  # fmt: skip
+
+
+def _rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
+    """Run a filter in square-root form from the beginning."""
+    assert step.wide is not None
+    return run(step.wide(), prior, data, full=True, backend=backend)
+
+
+class _Passes:
+    """A filter's blocks one after the other, in square-root form where a covariance loses digits.
+
+    Parameters
+    ----------
+    step : the filter. prior, full, backend : as of :func:`run`.
+    """
+
+    def __init__(self, step: FilterStep, prior: Belief, full: bool, backend: str | None) -> None:
+        """Start with the prior."""
+        self.step = self.now = step
+        self.full, self.backend = full, backend
+        self.m = prior.mean.copy()
+        self.P = prior.cov.copy()
+        # the buffers are this run's own: runs may be nested, or go on in several threads
+        self.calls: dict[bool, Caller] = {}
+        self.done = 0
+        root = prior.root
+        if step.root or (step.wide is not None and (root is not None or narrow(prior.cov))):
+            root = root_of(prior.cov) if root is None else root
+            if step.root or narrow(root, root=True):
+                self._root(root)
+
+    @property
+    def rooted(self) -> bool:
+        """Whether roots are carried now."""
+        return self.now.root
+
+    def _root(self, L: np.ndarray) -> None:
+        self.P = L
+        if not self.step.root:
+            assert self.step.wide is not None
+            self.now = self.step.wide()
+
+    def _call(self, *args: np.ndarray) -> tuple[np.ndarray, ...]:
+        if self.rooted not in self.calls:
+            block = _block(self.now, self.full, self.backend, backend_in_use())
+            self.calls[self.rooted] = Caller(block, copy=False)
+        return self.calls[self.rooted](self.m, self.P, *args)
+
+    def block(
+        self, u: np.ndarray, y: np.ndarray, R: np.ndarray, dt: np.ndarray, p: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Return the outputs of one block, and go on to the next."""
+        if self.rooted and not self.step.root and not narrow(self.P, root=True):
+            # well enough known in all directions: on with the covariance
+            self.P, self.now = self.P @ self.P.T, self.step
+        out = self._call(u, y, R, dt, p)
+        nx = self.m.size
+        self.done += 1
+        ends = self.done % 4 == 1
+        if self.step.wide is not None and not self.rooted and _lossy(out, R, nx, ends):
+            self._root(root_of(self.P))
+            out = self._call(u, y, R, dt, p)
+        self.m, self.P = out[0].ravel().copy(), out[1].reshape(nx, nx).copy()
+        return out
+
+
+def narrow(P: np.ndarray, *, root: bool = False) -> bool:
+    """Whether some combination of states is known far better than each of them, or not a number."""
+    if root:
+        size = np.sqrt((P**2).sum(1))
+        rows = size > 0
+        return bool((np.abs(np.diag(P))[rows] < math.sqrt(NARROW) * size[rows]).any())
+    d = P.diagonal()
+    if not (d > 0).all():
+        rows = np.flatnonzero(d > 0)
+        P, d = P[np.ix_(rows, rows)], d[rows]
+    s = 1 / np.sqrt(d)
+    try:
+        pivots = np.linalg.cholesky(P * s * s[:, None]).diagonal()
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((pivots**2 >= NARROW).all())
+
+
+def _lossy(out: Sequence[np.ndarray], R: np.ndarray, nx: int, ends: bool) -> bool:
+    """Whether a block of the covariance filter has lost digits; out as of :func:`_block`.
+
+    A sample far better than the belief makes a narrow direction at once, and shows in S.  What
+    makes one slowly shows at the ends of blocks.
+    """
+    # where nothing was measured S is 1 and R is -1
+    if not (out[5].reshape(R.shape) <= WIDE * np.abs(R)).all():
+        return True
+    return ends and narrow(out[1].reshape(nx, nx))
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,16 +433,25 @@ class _Kept:
     cov_pred: np.ndarray
     cross: np.ndarray
     S: np.ndarray
+    roots: tuple[np.ndarray, ...] | None
 
     @classmethod
-    def of(cls, K: int, nx: int, ny: int) -> _Kept:
-        square = [np.empty((K, n, n)) for n in (nx, nx, nx, ny)]
-        return cls(square[0], np.empty((nx, K)), *square[1:])
+    def of(cls, K: int, nx: int, ny: int, *, roots: bool) -> _Kept:
+        cov, cov_pred, cross, S = (np.empty((K, n, n)) for n in (nx, nx, nx, ny))
+        four = tuple(np.empty((K, nx, nx)) for _ in range(4)) if roots else None
+        return cls(cov, np.empty((nx, K)), cov_pred, cross, S, four)
+
+    def fields(self) -> dict[str, Any]:
+        """The fields of a result that hold them."""
+        return {
+            "cov": self.cov, "mean_pred": self.mean_pred, "cov_pred": self.cov_pred,
+            "cross": self.cross, "innovation_cov": self.S, "roots": self.roots,
+        }  # fmt: skip
 
     def put(self, r: slice, columns: list[np.ndarray], *, root: bool) -> None:
         """Take P_f, m, P, C, S of some instants; matrices are columns in column-major order."""
         nx, ny = self.cov.shape[1], self.S.shape[1]
-        P_f, m, P, C, S = columns
+        P_f, m, P, C, S = columns[:5]
         n = m.shape[1]
         self.cov[r] = P_f.T.reshape(n, nx, nx)
         self.mean_pred[:, r] = m
@@ -333,6 +459,10 @@ class _Kept:
         self.cov_pred[r] = before @ before.transpose(0, 2, 1) if root else before
         self.cross[r] = C.T.reshape(n, nx, nx).transpose(0, 2, 1)
         self.S[r] = S.T.reshape(n, ny, ny)
+        if self.roots is not None:
+            self.roots[0][r] = before
+            for target, source in zip(self.roots[1:], columns[5:], strict=True):
+                target[r] = source.T.reshape(n, nx, nx).transpose(0, 2, 1)
 
 
 def _believable(

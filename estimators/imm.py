@@ -30,9 +30,19 @@ from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.sharing import kept
 from apu_casadi.signals import Signals
+from estimators.algebra import graded_lower, root_of
 from estimators.belief import Belief
 from estimators.ekf import ekf_step
-from estimators.filtering import BLOCK, FilterResult, FilterStep, block_of, padded, run
+from estimators.filtering import (
+    BLOCK,
+    WIDE,
+    FilterResult,
+    FilterStep,
+    block_of,
+    narrow,
+    padded,
+    run,
+)
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording
 
@@ -270,6 +280,46 @@ def _mixer(x: Sequence[Signals]) -> ca.Function:
     return ca.Function("mix", [logs, m_in, P_in, logT], [ca.densify(o) for o in ca.cse(out)])
 
 
+def _root_mixer(x: Sequence[Signals]) -> ca.Function:
+    """The same as :func:`_mixer` with lower triangular roots in place of P.
+
+    A root of the mixture is that of [sqrt(w_i) L_i, sqrt(w_i) (m_i - mean)], side by side.
+    """
+    M, n = len(x), [len(s) for s in x]
+    logs, logT = ca.SX.sym("logs", M), ca.SX.sym("logT", M * M)
+    ms = [ca.SX.sym(f"m{i}", k) for i, k in enumerate(n)]
+    dense = [ca.SX.sym(f"L{i}", k, k) for i, k in enumerate(n)]
+    Ls = [ca.tril(L) for L in dense]
+    T = ca.reshape(logT, M, M)
+    predicted, m_out, L_out = [], [], []
+    for j in range(M):
+        c = _log_sum(logs + T[:, j])
+        predicted.append(c)
+        share = ca.exp((logs + T[:, j] - c) / 2)  # roots of the weights
+        carried = []
+        for i in range(M):
+            m, L = ca.SX(ms[j]), ca.SX(n[j], n[i])
+            here = [b for b, s in enumerate(x[j].names) if s in x[i]]
+            there = [x[i].index(x[j].names[b]) for b in here]
+            rest = [b for b in range(n[j]) if b not in here]
+            m[here] = ms[i][there]
+            L[here, :] = Ls[i][there, :]
+            if rest:
+                own = ca.SX(n[j], n[j])
+                own[rest, :] = Ls[j][rest, :]
+                L = ca.horzcat(L, own)
+            carried.append((m, L))
+        mean = ca.SX(n[j], 1)
+        for i, (m, _) in enumerate(carried):
+            mean += share[i] ** 2 * m
+        wide = [share[i] * ca.horzcat(L, m - mean) for i, (m, L) in enumerate(carried)]
+        m_out.append(mean)
+        L_out.append(ca.vec(ca.densify(graded_lower(ca.sparsify(ca.horzcat(*wide))))))
+    m_in, L_in = ca.vertcat(*ms), ca.vertcat(*(ca.vec(L) for L in dense))
+    out = [ca.vertcat(*predicted), ca.vertcat(*m_out), ca.vertcat(*L_out)]
+    return ca.Function("root_mix", [logs, m_in, L_in, logT], [ca.densify(o) for o in ca.cse(out)])
+
+
 def _weigher(x: Sequence[Signals], common: Signals) -> ca.Function:
     """SX Function (logs, logliks, m_f, P_f) -> (logs, loglik, mean, variance) of the mixture."""
     M, n = len(x), [len(s) for s in x]
@@ -296,6 +346,7 @@ def _block(
     first: FilterStep,
     others: tuple[FilterStep, ...],
     common: Signals,
+    roots: bool,
     backend: str | None,
     _in_use: str,
 ) -> ca.Function:
@@ -315,12 +366,13 @@ def _block(
         "y": ny, "R": ny, "dt": 1, "p": np_,
     }  # fmt: skip
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
-    logs, m, P = _mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
+    mixer = _root_mixer if roots else _mixer
+    logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
     ms = ca.vertsplit(m, [0, *np.cumsum(n).tolist()])
     Ps = ca.vertsplit(P, [0, *np.cumsum([k * k for k in n]).tolist()])
     # covariances are mixed, so filters that carry square roots hand them over as such
     outs = [
-        step.plain.function(
+        (_with_roots(step) if roots else step.plain).function(
             ms[i], ca.reshape(Ps[i], n[i], n[i]), s["u"], s["p"], s["y"], s["R"], s["dt"]
         )
         for i, step in enumerate(steps)
@@ -335,9 +387,35 @@ def _block(
         ca.vertcat(*(o[0] for o in outs)),
         ca.vertcat(*(ca.vec(o[1]) for o in outs)),
     ]
-    kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check)]
-    one = ca.Function("imm_one", list(s.values()), [*carried, *kept])
-    return compiled(block_of(one, "imm", len(carried)), backend=backend)
+    S = ca.vertcat(*(ca.diag(o[6]) for o in outs))
+    kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check), S]
+    name = "imm_roots" if roots else "imm"
+    one = ca.Function(f"{name}_one", list(s.values()), [*carried, *kept])
+    return compiled(block_of(one, name, len(carried)), backend=backend)
+
+
+def _with_roots(step: FilterStep) -> FilterStep:
+    """The step in square-root form."""
+    return step if step.root or step.wide is None else step.wide()
+
+
+def _needs_roots(
+    n: list[int], P1: np.ndarray, P_f: np.ndarray, S: np.ndarray, R: np.ndarray
+) -> bool:
+    """Whether a block of covariances has lost digits, as in :mod:`estimators.filtering`.
+
+    P1 (sum of squares,) at the end, P_f (sum of squares, samples), S (modes x ny, samples).
+    """
+    R = np.tile(R, (S.shape[0] // R.shape[0], 1))
+    if ((R > 0) & ~(S <= WIDE * R)).any():
+        return True
+    at = np.cumsum([0, *(k * k for k in n)])
+    for P in (*P_f.T[::5], P1):
+        if not np.isfinite(P).all():
+            return True
+        if any(narrow(P[i:j].reshape(k, k)) for i, j, k in zip(at[:-1], at[1:], n, strict=True)):
+            return True
+    return False
 
 
 def _log_transitions(
@@ -433,17 +511,44 @@ def interacting_multiple_models(
     y, R, u, dt = padded(data, pad)
     # a padded sample changes no mode
     logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
+
     # the buffers are this run's own, as in estimators.filtering
     one, *others = steps.values()
-    block = _block(one, tuple(others), common, backend, backend_in_use())
-    call = Caller(block, copy=False)
+
+    def caller(roots: bool) -> Caller:
+        block = _block(one, tuple(others), common, roots, backend, backend_in_use())
+        return Caller(block, copy=False)
+
+    # what a filter without square-root form lacks, mixing cannot give back
+    able = all(step.root or step.wide is not None for step in steps.values())
+    rooted = able and any(narrow(b.cov) for b in priors)
+    call = caller(rooted)
     logs = _log_prior(names, prior_probability)
     m = np.concatenate([b.mean for b in priors])
-    P = np.concatenate([b.cov.ravel(order="F") for b in priors])
+    roots = [root_of(b.cov) if b.root is None else b.root for b in priors]
+    P = np.concatenate([(L if rooted else b.cov).ravel(order="F")
+                        for b, L in zip(priors, roots, strict=True)])  # fmt: skip
     kept: list[list[np.ndarray]] = [[], [], [], [], []]
     for start in range(0, blocks * BLOCK, BLOCK):
         s = slice(start, start + BLOCK)
-        out = call(logs, m, P, logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
+        data_of = logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p
+        out = call(logs, m, P, *data_of)
+        if (
+            able
+            and not rooted
+            and _needs_roots(
+                n,
+                out[2].ravel(),
+                out[7][:, : K - start],
+                out[11][:, : K - start],
+                R[:, s][:, : K - start],
+            )
+        ):
+            at = np.cumsum([0, *(k * k for k in n)])
+            P = np.concatenate([root_of(P[i:j].reshape(k, k)).ravel(order="F")
+                                for i, j, k in zip(at[:-1], at[1:], n, strict=True)])  # fmt: skip
+            rooted, call = True, caller(True)
+            out = call(logs, m, P, *data_of)
         each = [o[:, : K - start] for o in out[3:]]
         for target, i in zip(kept, (0, 3, 5, 6, 7), strict=True):
             target.append(each[i].copy())

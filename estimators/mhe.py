@@ -24,13 +24,15 @@ import numpy as np
 from apu_casadi.backend import Caller, compiled
 from apu_casadi.errors import EstimationError, ParameterError, SignalError
 from apu_casadi.sharing import Rebuilt, building, kept
+from estimators.algebra import root_of
 from estimators.belief import Belief
-from estimators.ekf import correct, kind_of
+from estimators.ekf import kind_of
 from estimators.filtering import FilterResult
 from estimators.lifting import Lifted, plain
 from estimators.model import FilterModel
 from estimators.recording import Recording
-from estimators.transcription import Solution, Transcription, square_root
+from estimators.rootfilter import root_functions
+from estimators.transcription import Solution, Transcription
 
 __all__ = ["HorizonEstimator", "moving_horizon"]
 
@@ -39,7 +41,7 @@ class _Along(NamedTuple):
     """One step of the filter linearised at a given point; see :func:`_along`."""
 
     m1: Any
-    P1: Any
+    L1: Any
     P_f: Any
     C: Any
     x1: Any
@@ -50,9 +52,10 @@ class _Along(NamedTuple):
 
 @kept
 def _along(model: FilterModel) -> ca.Function:
-    """Function (m, P, at, w, u, p, y, R, dt) -> :class:`_Along`.
+    """Function (m, L, at, w, u, p, y, R, dt) -> :class:`_Along`.
 
-    Corrects (m, P) with a sample and carries it on to (m1, P1), the model linearised at (at, w);
+    Corrects a belief (mean m, root L of the covariance) with a sample and carries it on to
+    (m1, L1), the model linearised at (at, w), in the way of :mod:`estimators.rootfilter`;
     x1 is where the model itself leads from there, ``stats`` are normalised innovation squared,
     log-likelihood and number measured.
     """
@@ -60,26 +63,23 @@ def _along(model: FilterModel) -> ca.Function:
     kind = kind_of(model)
     nx, nu_, np_, nw, ny = model.sizes
     shapes = [(nx, 1), (nx, nx), (nx, 1), (nw, 1), (nu_, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)]
-    names = ["m", "P", "at", "w", "u", "p", "y", "R", "dt"]
+    names = ["m", "L", "at", "w", "u", "p", "y", "R", "dt"]
     args = [kind.sym(n, *s) for n, s in zip(names, shapes, strict=True)]
-    m, P, at, w, u, p, y, R, dt = args
+    m, L, at, w, u, p, y, R, dt = args
+    update, predict = root_functions(model, ())
     point, mean = ca.vertcat(at, w), ca.vertcat(m, kind.zeros(nw))
     s = kind.sym("s", nx + nw)
     h, _ = model.output(s[:nx], u, p, s[nx:])
     x1, _ = model.transition(s[:nx], u, p, s[nx:], dt)
     line = ca.Function("line", [s, u, p, dt], [h, ca.jacobian(h, s), x1, ca.jacobian(x1, s)])
     h0, H, f0, F = line(point, u, p, dt)
-    Pa = ca.diagcat(P, kind.eye(nw)) if nw else P
     nu = y - h0 + H @ (point - mean)
-    done = correct(Pa, H, nu, R)
-    filtered = mean + done.d
-    m1 = f0 + F @ (filtered - point)
-    P1 = F @ done.P @ F.T + ca.diag(ca.DM(model.walk**2)) * dt
-    stats = ca.vertcat(done.nis, done.loglik, done.measured)
-    out = _Along(
-        m1, (P1 + P1.T) / 2, done.P[:nx, :nx], done.P[:nx, :] @ F.T, f0,
-        ca.if_else(R >= 0, nu, 0), done.S, stats,
-    )  # fmt: skip
+    d, La, S, nis, loglik, measured = update(ca.tril(L), H, nu, R)
+    m1 = f0 + F @ (mean + d - point)
+    L1, C, _, _ = predict(La, F, dt)
+    own = La[:nx, :nx]
+    stats = ca.vertcat(nis, loglik, measured)
+    out = _Along(m1, L1, ca.mtimes(own, own.T), C, f0, ca.if_else(R >= 0, nu, 0), S, stats)
     dense = [ca.densify(o) for o in (ca.cse(list(out)) if kind is ca.SX else out)]
     return ca.Function(f"along_{model.name}", args, dense, names, list(_Along._fields))
 
@@ -158,14 +158,15 @@ class HorizonEstimator(Rebuilt):
         innovation, S = np.full((ny, K), np.nan), np.full((ny, K), np.nan)
         stats = np.empty((3, K))
         cov, cov_pred, cross = (np.empty((K, nx, nx)) for _ in range(3))
-        m, P = prior.mean, prior.cov  # of the window's first state, before its sample
-        mp, Pp = m, P  # of the state now, before its sample
+        # of the window's first state, before its sample: mean and root of the covariance
+        m, L = prior.mean, root_of(prior.cov) if prior.root is None else prior.root
+        mp, Lp = m, L  # of the state now, before its sample
         z0: np.ndarray | None = None
         for k in range(K):
             s = max(0, k - N + 1)
             i, at = k - s, slice(s, s + N)
-            mean_pred[:, k], cov_pred[k] = mp, Pp
-            now = _Along(*self._step(mp, Pp, mp, np.zeros(nw), u[:, k], data.p, y[:, k], R[:, k],
+            mean_pred[:, k], cov_pred[k] = mp, Lp @ Lp.T
+            now = _Along(*self._step(mp, Lp, mp, np.zeros(nw), u[:, k], data.p, y[:, k], R[:, k],
                                      dt[k]))  # fmt: skip
             there = ~missing[:, k]
             innovation[there, k] = now.nu[there]
@@ -175,24 +176,24 @@ class HorizonEstimator(Rebuilt):
             known = np.where(np.arange(N) <= i, R[:, at], -1.0)
             window = (u[:, at], p, y[:, at], known, dt[at])
             try:
-                solution = self._solve(m, P, window, i, z0, mp)
+                solution = self._solve(m, L, window, i, z0, mp)
             except EstimationError as e:
                 raise EstimationError(f"t = {data.t[k]:.9g} s (sample {k}): {e}") from None
             local = self.program.locals_of(solution)[0]
-            out = _Along(*self._window(m, P, local.x, local.w, *window))
+            out = _Along(*self._window(m, L, local.x, local.w, *window))
             blocks = {
                 n: a.reshape((nx, N * nx), order="F")[:, i * nx : (i + 1) * nx]
-                for n, a in (("P_f", out.P_f), ("P1", out.P1), ("C", out.C))
+                for n, a in (("P_f", out.P_f), ("L1", out.L1), ("C", out.C))
             }
             # scaling back may round across a bound
             mean[:, k] = np.clip(local.x[:, i], model.lower, model.upper)
             cov[k], cross[k] = blocks["P_f"], blocks["C"]
             var[:, k] = np.diag(cov[k])
             # the model leads on from the estimate, bounds included
-            mp, Pp = out.x1.reshape((nx, N), order="F")[:, i], blocks["P1"]
+            mp, Lp = out.x1.reshape((nx, N), order="F")[:, i], blocks["L1"]
             if i == N - 1:
                 m = out.m1.reshape((nx, N), order="F")[:, 0]
-                P = out.P1.reshape((nx, N * nx), order="F")[:, :nx]
+                L = out.L1.reshape((nx, N * nx), order="F")[:, :nx]
             z0 = self._shifted(solution, moved=i == N - 1)
             if progress is not None:
                 progress(k + 1, K)
@@ -205,7 +206,7 @@ class HorizonEstimator(Rebuilt):
     def _solve(
         self,
         m: np.ndarray,
-        P: np.ndarray,
+        L: np.ndarray,
         window: tuple[np.ndarray, ...],
         last: int,
         z0: np.ndarray | None,
@@ -217,7 +218,7 @@ class HorizonEstimator(Rebuilt):
         nx, nom = len(model.x), model.x.nominals
         weight = np.where(R >= 0, 1 / np.sqrt(np.where(R >= 0, R, 1.0)), 0.0)
         stages = np.vstack([u, p, y, weight, dt[None, :]])
-        root = square_root(P) / nom[:, None]
+        root = L / nom[:, None]
         data = np.concatenate([stages.ravel(order="F"), m / nom, root.ravel(order="F")])
         lower, upper = np.full(program.n_z, -np.inf), np.full(program.n_z, np.inf)
         # what lies ahead of the last sample is a forecast, on which a bound has no say

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,63 @@ from apu_casadi.errors import DataError, nearest
 from apu_casadi.signals import Signals
 from estimators.model import FilterModel
 
-__all__ = ["Recording", "record"]
+__all__ = ["Recording", "plain_numbers", "record"]
+
+
+def plain_numbers(data: Any, what: str, *, gaps: bool = False) -> np.ndarray:
+    """Return an array of floats from numbers; what is masked is a gap, NaN.
+
+    Parameters
+    ----------
+    data : array, list, masked array, pandas series.
+    what : name, for messages.
+    gaps : whether NaN and masked values are allowed.
+
+    Raises
+    ------
+    DataError : dates and spans of time, whose ticks are no seconds; truth values and text, which
+        NumPy would turn into numbers; a masked value where none may be.
+    """
+    mask = np.ma.getmaskarray(data) if isinstance(data, np.ma.MaskedArray) else None
+    try:
+        a = np.asarray(data)
+    except ValueError:
+        raise DataError(f"{what}: an array of numbers expected, got {data!r:.60}") from None
+    wrong: Any = a.flat[0] if a.size else None
+    kind: str = a.dtype.kind
+    if kind == "O":
+        others = [x for x in a.ravel() if not _is_number(x)]
+        kind = "f" if not others else _KINDS.get(type(others[0]).__name__, "O")
+        wrong = others[0] if others else None
+        if not others:
+            a = np.array([_float(x) for x in a.ravel()]).reshape(a.shape)
+    if kind in "mM":
+        how = "t / np.timedelta64(1, 's')" if kind == "m" else "(t - t[0]) / np.timedelta64(1, 's')"
+        raise DataError(f"{what}: {str(wrong)!r} is a time of NumPy, not a number: give {how}")
+    if kind not in "fiu" and a.size:
+        raise DataError(f"{what}: numbers expected, got {wrong!r:.60} of type "
+                        f"{type(wrong).__name__}")  # fmt: skip
+    out = a.astype(float)
+    if mask is not None and mask.any():
+        if not gaps:
+            raise DataError(f"{what}: {int(mask.sum())} of {mask.size} values are masked")
+        out[mask] = np.nan
+    return out
+
+
+_NUMBERS = (int, float, np.integer, np.floating, Decimal, Fraction)
+_KINDS = {"timedelta": "m", "Timedelta": "m", "datetime": "M", "Timestamp": "M"}
+
+
+def _is_number(x: Any) -> bool:
+    """Tell whether an object is a number or a gap (None, pandas.NA)."""
+    gap = x is None or type(x).__name__ == "NAType"
+    return gap or (isinstance(x, _NUMBERS) and not isinstance(x, bool))
+
+
+def _float(x: Any) -> float:
+    return float(x) if isinstance(x, _NUMBERS) else math.nan
+
 
 SAME_TIME = 1e-9  # s; stamps closer than this are one instant
 
@@ -50,7 +108,8 @@ class Recording:
     def __post_init__(self) -> None:
         """Check everything once, so that the filters need not."""
         for name in ("t", "u", "y", "variance", "p"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+            value = plain_numbers(getattr(self, name), name, gaps=name in ("y", "variance"))
+            object.__setattr__(self, name, value)
         K = np.size(self.t)
         if np.shape(self.t) != (K,) or K == 0:
             raise DataError(f"t: shape (K,) with K > 0 expected, got {np.shape(self.t)}")
@@ -113,9 +172,11 @@ class Recording:
 
 def _stamped(name: str, data: Any) -> tuple[np.ndarray, np.ndarray]:
     try:
-        t, v = (np.asarray(a, dtype=float) for a in data)
+        times, values = data
     except (TypeError, ValueError):
         raise DataError(f"{name}: (times, values) expected, got {data!r:.80}") from None
+    t = plain_numbers(times, f"{name}: (times, values) expected; times")
+    v = plain_numbers(values, f"{name}: (times, values) expected; values", gaps=True)
     if t.ndim != 1 or t.shape != v.shape or t.size == 0:
         raise DataError(
             f"{name}: times and values of one length expected, got {t.shape}, {v.shape}"
@@ -137,7 +198,7 @@ def _variance(name: str, sigma: Any, values: np.ndarray) -> np.ndarray:
     if np.isinf(values).any():
         k = int(np.argmax(np.isinf(values)))
         raise DataError(f"{name}: sample {k} is infinite; a gap is NaN")
-    s = np.asarray(sigma, dtype=float)
+    s = plain_numbers(sigma, f"sigma of {name}", gaps=True)
     if s.shape not in ((), values.shape):
         raise DataError(
             f"sigma of {name}: a number or shape {values.shape} expected, got {s.shape}"
@@ -196,7 +257,7 @@ def record(
     constant: dict[str, float] = {}
     for name, value in (inputs or {}).items():
         if np.ndim(value) == 0 and not isinstance(value, tuple):
-            constant[name] = float(value)
+            constant[name] = float(plain_numbers(value, f"input {name}"))
         else:
             held[name] = _stamped(name, value)
     first = min(float(t[0]) for t, _ in streams.values())

@@ -27,19 +27,21 @@ are found when the filter is built, and cost nothing.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
 
 from apu_casadi.errors import ParameterError, nearest
 from apu_casadi.sharing import kept
-from estimators.algebra import append_column, forward, qr_lower, root_update
+from estimators.algebra import append_column, forward, graded_lower, qr_lower, root_update
 from estimators.belief import Belief
 from estimators.ekf import projected, step_symbols
-from estimators.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
+from estimators.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterResult, FilterStep, run
 from estimators.model import FilterModel
 from estimators.recording import Recording
 
@@ -191,6 +193,15 @@ def ukf_step(
     ------
     ParameterError : see :meth:`PointSet.of`; a model without states.
     """
+    step = _built(model, points, alpha, beta, kappa, False)
+    wide = partial(_built, model, points, alpha, beta, kappa, True)
+    return dataclasses.replace(step, wide=wide)
+
+
+def _built(
+    model: FilterModel, points: str, alpha: float, beta: float, kappa: float, roots: bool
+) -> FilterStep:
+    """The step, with ``ROOT_OUT`` for the smoother if ``roots``."""
     nx, _, _, nw, ny = model.sizes
     n = nx + nw
     if not nx:
@@ -220,19 +231,28 @@ def ukf_step(
     La = ca.SX.sym("L", ca.Sparsity.lower(n))
     x1, D, Q, check = f.transform(values)
     walk = ca.sparsify(ca.diag(ca.DM(model.walk))) * ca.sqrt(dt)
-    L1 = qr_lower(ca.sparsify(ca.horzcat(D, Q, walk)))
-    out = [x1, ca.densify(L1), ca.densify(La[:nx, :] @ D.T), check]
+    out, names = [x1], STEP_OUT
+    if roots:
+        width = Q.shape[1] + walk.shape[1]
+        own = ca.horzcat(La[:nx, :], ca.SX(nx, width))
+        G = graded_lower(ca.sparsify(ca.vertcat(ca.horzcat(D, Q, walk), own)))
+        names = STEP_OUT + ROOT_OUT
+        out += [G[:nx, :nx], La[:nx, :] @ D.T, check, G[nx:, :nx], G[nx:, nx:], La[:nx, :nx]]
+        out = [ca.densify(o) for o in out]
+    else:
+        L1 = qr_lower(ca.sparsify(ca.horzcat(D, Q, walk)))
+        out += [ca.densify(L1), ca.densify(La[:nx, :] @ D.T), check]
     predict = ca.Function("predict", [values, La, dt], ca.cse(out))
 
     s = step_symbols(model, ca.MX)
     m, P, u, p, y, R, dt = s
     P = ca.project(P, lower)
     at, m_f, P_f, La, nu_, S, stats = update(m, P, g(first(m, P), u, p), y, R)
-    x1, L1, C, check = predict(f(at, u, p, dt), La, dt)
+    x1, L1, C, check, *more = predict(f(at, u, p, dt), La, dt)
     stats = ca.vertcat(stats[0] + check, stats[1:])
-    name = f"ukf_{points}_{model.name}"
-    out = [ca.densify(o) for o in (x1, L1, m_f, P_f, C, nu_, S, stats)]
-    return FilterStep(model, ca.Function(name, s, out, STEP_IN, STEP_OUT), root=True)
+    name = f"ukf_{points}_{'roots_' if roots else ''}{model.name}"
+    out = [ca.densify(o) for o in (x1, L1, m_f, P_f, C, nu_, S, stats, *more)]
+    return FilterStep(model, ca.Function(name, s, out, STEP_IN, names), root=True)
 
 
 def _updated(

@@ -180,44 +180,12 @@ def test_damaged_netcdf(tmp_path):
 
 def test_parquet_names_what_to_install(tmp_path, monkeypatch):
     """Without an engine nothing is guessed."""
-    import scenarios.estimation.recorded as module
+    import scenarios.estimation.binaryfiles as module
 
     path = tmp_path / "run.parquet"
     path.write_bytes(b"PAR1")
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     with pytest.raises(DataError, match="needs pandas and pyarrow: pip install pandas pyarrow"):
-        read_table(path)
-
-
-def test_parquet_by_the_engine_that_is_there(tmp_path, monkeypatch):
-    """The reader is pandas; it is replaced here where no engine is installed."""
-    import types
-
-    import scenarios.estimation.recorded as module
-
-    frame = {"T3 [degC]": np.array([295.0, 296.0]), "note": np.array(["a", "b"])}
-
-    class Frame(dict):
-        columns = list(frame)
-
-        def __getitem__(self, n):
-            return types.SimpleNamespace(to_numpy=lambda: frame[n])
-
-    def read_parquet(path, engine):
-        if path.stat().st_size < 10:
-            raise ValueError("cut off")
-        return Frame()
-
-    path = tmp_path / "run.parquet"
-    path.write_bytes(b"PAR1" * 5)
-    monkeypatch.setattr(module, "find_spec", lambda name: object())
-    fake = types.SimpleNamespace(read_parquet=read_parquet)
-    monkeypatch.setattr(module, "import_module", lambda name: fake)
-    t = read_table(path)
-    assert_allclose(t.get("T3", "K"), [568.15, 569.15])
-    assert np.isnan(t.columns["note"].values).all()
-    path.write_bytes(b"PAR1")
-    with pytest.raises(DataError, match=r"damaged Parquet file \(ValueError: cut off\)"):
         read_table(path)
 
 
@@ -229,3 +197,10 @@ def test_real_parquet(tmp_path):
     path = tmp_path / "run.parquet"
     pd.DataFrame({"T3 [degC]": [295.0, None]}).to_parquet(path)
     assert_allclose(read_table(path).get("T3", "K"), [568.15, np.nan])
+    pd.DataFrame({"T3 [degC]": [295.0, 296.0], "note": ["a", "b"]}).to_parquet(path)
+    t = read_table(path)
+    assert_allclose(t.get("T3", "K"), [568.15, 569.15])
+    assert np.isnan(t.columns["note"].values).all()
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(DataError, match="damaged Parquet file"):
+        read_table(path)

@@ -9,7 +9,9 @@ stand in the header or are SI:
     0.02,36051,,568.3,474.8,173.7,500.3
 
 An empty cell is a gap.  With a time column the rows are a transient; without, or with --steady,
-each row is a steady operating point.
+each row is a steady operating point.  Dates, decimal commas, a row of units and the like are read,
+with a line on how; what may mean two things, and readings that cannot be, are refused with the
+option that decides.
 
     apu fit engine.csv --column T5=EGT_in:degC --column N=NGG:rpm
     apu fit run.nc --estimate f_eta_c,f_W_c,gain_T5 --prior f_W_c=1:0.02 --figure fit.png
@@ -30,7 +32,7 @@ from scenarios import jsontext
 if TYPE_CHECKING:
     from estimators.fit import Profile
     from scenarios.estimation.fitting import EngineData, EngineFit
-    from scenarios.estimation.recorded import Table
+    from scenarios.estimation.recorded import Reading, Table
     from scenarios.estimation.sensors import SensorSet
 
 NAME = "fit"
@@ -52,7 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--column", metavar="NAME=COLUMN[:UNIT]", action="append", default=[],
         help="column of another name, or its unit",
     )  # fmt: skip
-    parser.add_argument("--time", metavar="COLUMN", help="time column (default: time or t)")
+    parser.add_argument(
+        "--time", metavar="COLUMN", help="time column (default: time, t, Timestamp and the like)"
+    )
+    _add_reading(parser)
     parser.add_argument("--steady", action="store_true", help="each row is a steady point")
     parser.add_argument(
         "--sigma", metavar="NAME=VALUE", action="append", default=[],
@@ -85,6 +90,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no word on progress")
 
 
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    """Declare how files are read that leave a question."""
+    parser.add_argument("--encoding", metavar="NAME", help="of text files, such as utf-16")
+    parser.add_argument("--decimal", choices=("point", "comma"), help="decimal point or comma")
+    parser.add_argument(
+        "--missing", metavar="A,B", default="",
+        help="numbers that stand for a gap, as in the file: --missing=-999,9999",
+    )  # fmt: skip
+    parser.add_argument(
+        "--exclude-implausible", action="store_true",
+        help="leave out readings that cannot be, instead of refusing the file",
+    )  # fmt: skip
+    parser.add_argument(
+        "--range", metavar="NAME=LOW:HIGH", action="append", default=[],
+        help="another plausible range, in SI: T5=250:1300",
+    )  # fmt: skip
+    parser.add_argument(
+        "--time-format", metavar="FORMAT", help="of dates, such as %%d.%%m.%%Y %%H:%%M:%%S"
+    )
+    parser.add_argument(
+        "--time-zone", metavar="ZONE", help="of dates without one: UTC, Europe/Berlin"
+    )
+
+
+def _reading(args: argparse.Namespace) -> Reading:
+    from scenarios.estimation.plausible import parse_limits
+    from scenarios.estimation.recorded import Reading
+
+    missing = [_number(n, "--missing", args.missing) for n in _names(args.missing)]
+    return Reading(
+        args.encoding, args.decimal, tuple(missing), args.exclude_implausible,
+        parse_limits(args.range), args.time_format, args.time_zone,
+    )  # fmt: skip
+
+
 def run(args: argparse.Namespace) -> int:
     """Read, fit, print; return 0."""
     from estimators.fit import profile
@@ -93,7 +133,9 @@ def run(args: argparse.Namespace) -> int:
 
     mapping = parse_mapping(args.column)
     _known_targets(mapping)
-    tables = [read_table(f, mapping) for f in args.files]
+    reading = _reading(args)
+    notes: list[str] = []
+    tables = [read_table(f, mapping, reading=reading, notes=notes) for f in args.files]
     sensors = _sensors(args.sigma)
     times = [None if args.steady else t.time(args.time) for t in tables]
     if len({t is None for t in times}) > 1:
@@ -129,6 +171,7 @@ def run(args: argparse.Namespace) -> int:
     figures = _draw(fit, args.figure, steady) if args.figure else []
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
+    found["read_as"] = [*notes, *_unheeded(tables, times, args)]
     if args.json:
         jsontext.show(found)
         return 0
@@ -278,17 +321,31 @@ def _assumed(data: Sequence[EngineData]) -> dict[str, float]:
     return {n: U[n].default or 0.0 for n in AMBIENT if any(n not in d.ambient for d in data)}
 
 
+def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Namespace) -> list[str]:
+    """Say it where a column rises like a time, or flags rows as bad, and is not used."""
+    flags = [f for t in tables for f in t.flags()]
+    if args.steady:
+        return flags
+    hints = [(t.source, t.steady_hint()) for t, at in zip(tables, times, strict=True) if at is None]
+    return flags + [
+        f"{source}: no time column, so each row is taken as a steady point; if {hint} is the time, "
+        f"give --time {hint}"
+        for source, hint in hints
+        if hint is not None
+    ]
+
+
 def _ignored(tables: Sequence[Table], sensors: SensorSet, time: str | None) -> list[str]:
     """Columns that the fit does not use, with a guess of what they may be."""
     from apu_casadi.gasgenerator import GasGenerator
     from scenarios.estimation.fitting import AMBIENT
-    from scenarios.estimation.recorded import TIMES
+    from scenarios.estimation.timestamps import is_time_name
 
-    used = {*sensors.names, *AMBIENT, *TIMES, time}
+    used = {*sensors.names, *AMBIENT, time}
     out: dict[str, None] = {}
     for table in tables:
         for name in table.columns:
-            if name in used or name in table.mapped:
+            if name in used or name in table.mapped or is_time_name(name):
                 continue
             hint = "no sigma known: give --sigma" if name in GasGenerator.Y else ""
             if not hint:
@@ -443,6 +500,7 @@ def text(found: Mapping[str, Any]) -> str:
             f"assumed, since neither option nor column gives it: {taken}; a wrong ambient "
             "condition is taken for a change of health"
         )
+    lines += [f"read: {n}" for n in found.get("read_as", ())]
     if found["ignored_columns"]:
         lines.append(f"columns not used: {', '.join(found['ignored_columns'])}")
     return "\n".join(lines)

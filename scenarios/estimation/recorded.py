@@ -1,89 +1,67 @@
 """Recorded data files: CSV, Parquet or netCDF, columns by name, with units, into SI.
 
-A column's unit stands in its header, ``T3 [K]`` or ``P3 (kPa)``, or in the netCDF attribute
-``units``; a bare name is taken as SI.  Empty cells and NaN are gaps.
+A column's unit stands in its header, ``T3 [K]`` or ``P3 (kPa)``, in a row below it, or in the
+netCDF attribute ``units``; a bare name is taken as SI.  Empty cells and NaN are gaps.
+
+Nothing is understood in silence.  Decimal commas, a row of units, dates, another encoding and the
+like are common, and mean one thing; they are read where somebody is told, which takes a list
+``notes``, and refused where nobody is.  What may mean two things is refused with the option that
+decides.  A reading that its quantity cannot have (:mod:`scenarios.estimation.plausible`) is
+refused, or left out on request.
 """
 
 from __future__ import annotations
 
-import csv
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from apu_casadi.errors import DataError, nearest
+from apu_casadi.gasgenerator import GasGenerator
+from scenarios.estimation.binaryfiles import netcdf_columns, parquet_columns
+from scenarios.estimation.columns import Column, text_columns
+from scenarios.estimation.plausible import PLAUSIBLE, Limits
+from scenarios.estimation.timestamps import TIMES, is_time_name, looks_like_time, to_seconds
+from scenarios.estimation.units import UNITS, convert, split_unit, unit_of
 
-__all__ = ["UNITS", "Column", "Table", "convert", "parse_mapping", "read_table"]
+__all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_mapping", "read_table"]
 
-#: By SI unit: what one of each unit is in it.
-_SCALES: dict[str, dict[str, float]] = {
-    "K": {"K": 1.0, "degR": 5 / 9},
-    "Pa": {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5,
-           "psi": 6894.757293168},
-    "rad/s": {"rad/s": 1.0, "rpm": np.pi / 30, "r/min": np.pi / 30, "1/min": np.pi / 30},
-    "W": {"W": 1.0, "kW": 1e3, "MW": 1e6, "hp": 745.6998715823},
-    "kg/s": {"kg/s": 1.0, "g/s": 1e-3, "kg/min": 1 / 60, "kg/h": 1 / 3600,
-             "lb/h": 0.45359237 / 3600, "lb/s": 0.45359237},
-    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
-    "m": {"m": 1.0, "km": 1e3, "ft": 0.3048},
-    "m/s": {"m/s": 1.0},
-    "kg/J": {"kg/J": 1.0},
-    "kg/kg": {"kg/kg": 1.0, "g/kg": 1e-3},
-    "1": {"1": 1.0, "-": 1.0, "%": 1e-2},
-}  # fmt: skip
-#: Unit -> (SI unit, factor, offset): SI value = factor * value + offset.
-UNITS: dict[str, tuple[str, float, float]] = {
-    **{unit: (si, scale, 0.0) for si, all_of in _SCALES.items() for unit, scale in all_of.items()},
-    **dict.fromkeys(("degC", "°C", "C"), ("K", 1.0, 273.15)),
-    **dict.fromkeys(("degF", "°F"), ("K", 5 / 9, 459.67 * 5 / 9)),
-}
-
-_GAPS = {"", "nan", "na", "n/a", "null", "none", "-"}
-_HEADER = re.compile(r"^\s*(?P<name>.*?)\s*(?:\[(?P<a>[^\]]*)\]|\((?P<b>[^)]*)\))?\s*$")
+_QUANTITIES = frozenset({*PLAUSIBLE, *GasGenerator.Y.names})
 
 
-@dataclass(frozen=True, eq=False)
-class Column:
-    """One column as it stands in the file.
+def _known(name: str) -> bool:
+    return name in _QUANTITIES or is_time_name(name)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a file is to be read, where it leaves a question.
 
     Parameters
     ----------
-    name : without the unit. unit : as written, None where there is none.
-    values : shape (K,), NaN where there is a gap.
+    encoding : of a text file, such as ``"utf-16"``; default UTF-8.
+    decimal : ``"point"`` or ``"comma"``.
+    missing : numbers that stand for a gap, in the unit of the file.
+    exclude : leave impossible readings out instead of refusing them.
+    ranges : quantity -> (lowest, highest), SI; go before the table's.
+    time_format, time_zone : see :func:`~scenarios.estimation.timestamps.to_seconds`.
     """
 
-    name: str
-    unit: str | None
-    values: np.ndarray
+    encoding: str | None = None
+    decimal: str | None = None
+    missing: tuple[float, ...] = ()
+    exclude: bool = False
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    time_format: str | None = None
+    time_zone: str | None = None
 
-
-def convert(
-    values: np.ndarray, unit: str | None, si: str, what: str, *, difference: bool = False
-) -> np.ndarray:
-    """Return values in the SI unit ``si``; no unit means that they are in it already.
-
-    A ``difference`` of temperatures has no offset.
-
-    Raises
-    ------
-    DataError : unknown unit, with the nearest one, or a unit of another quantity.
-    """
-    if unit is None:
-        return np.asarray(values, float)
-    if unit not in UNITS:
-        raise DataError(f"{what}: unknown unit {unit!r} {nearest(unit, UNITS)}")
-    base, factor, offset = UNITS[unit]
-    if {base, si} == {"1", "kg/kg"}:
-        base = si
-    if base != si:
-        raise DataError(f"{what}: a unit of {si} is expected, {unit!r} measures {base}")
-    return np.asarray(values, float) * factor + (0.0 if difference else offset)
+    @property
+    def limits(self) -> Limits:
+        """The table of ranges with those given."""
+        return Limits({**PLAUSIBLE, **self.ranges}, self.exclude)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,19 +73,27 @@ class Table:
     source : file name, for messages.
     columns : by name, in the file's order, all of one length.
     mapping : names of the model -> (column of the file, unit or None), which go before.
+    reading : how questions are decided.
+    notes : what was understood is put here; None where nobody reads it, see the module.
+    lines : line of each row in a text file.
+    others : variables that are no columns, and why.
     """
 
     source: str
     columns: Mapping[str, Column]
     mapping: Mapping[str, tuple[str, str | None]] = field(default_factory=dict)
+    reading: Reading = field(default_factory=Reading)
+    notes: list[str] | None = None
+    lines: Sequence[int] | None = None
+    others: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that mapped columns are there."""
         for name, (column, _) in self.mapping.items():
-            if column not in self.columns:
+            if self._spelt(column) not in self.columns:
                 raise DataError(
                     f"{self.source}: no column {column!r} for {name} "
-                    f"{nearest(column, self.columns)}"
+                    f"{nearest(column, self.columns)}{self._other(column)}"
                 )
 
     @property
@@ -119,6 +105,34 @@ class Table:
         """Tell whether there is a column for this name of the model."""
         return name in self.mapping or name in self.columns
 
+    def _spelt(self, column: str) -> str:
+        """The name of a column as it is kept: without the unit that it may end with."""
+        own = None if column in self.columns else split_unit(column, _known)
+        return column if own is None else own[0]
+
+    def _other(self, name: str) -> str:
+        return f"; {name} {self.others[name]}" if name in self.others else ""
+
+    def _tell(self, what: str) -> None:
+        _told(self.notes, what)
+
+    def _find(self, name: str) -> tuple[Column, Any]:
+        """Return the column for a name of the model, and its unit."""
+        column, unit = self.mapping.get(name, (name, None))
+        column = self._spelt(column)
+        if column not in self.columns:
+            raise DataError(
+                f"{self.source}: no column {name!r} {nearest(name, self.columns)}"
+                f"{self._other(column)}"
+            )
+        c = self.columns[column]
+        return c, c.unit if unit is None else unit
+
+    def place(self, column: str, k: int) -> str:
+        """Say where row k of a column stands."""
+        line = f", line {self.lines[k]}" if self.lines is not None else ""
+        return f"{self.source}, column {column}, data row {k + 1}{line}"
+
     def get(self, name: str, si: str, *, difference: bool = False) -> np.ndarray:
         """Return the values of a name of the model, in its SI unit, shape (K,).
 
@@ -126,35 +140,108 @@ class Table:
 
         Raises
         ------
-        DataError : no such column, with the nearest one; an unknown or unfitting unit.
+        DataError : no such column, with the nearest one; an unknown or unfitting unit; a column
+            that holds no numbers; an impossible reading.
         """
-        column, unit = self.mapping.get(name, (name, None))
-        if column not in self.columns:
-            raise DataError(f"{self.source}: no column {name!r} {nearest(name, self.columns)}")
-        c = self.columns[column]
-        what = f"{self.source}, column {column}"
-        return convert(c.values, unit or c.unit, si, what, difference=difference)
+        c, unit = self._find(name)
+        what = f"{self.source}, column {c.name}"
+        if c.problem is not None:
+            raise DataError(f"{what} holds no numbers: {c.problem}")
+        raw = c.values
+        gap = np.isin(raw, self.reading.missing)
+        if gap.any():
+            raw = np.where(gap, np.nan, raw)
+        if isinstance(unit, str) and unit == "%" and si == "rad/s":
+            design = GasGenerator().parameters.N
+            self._tell(
+                f"{what}: 100 % is taken as the design speed, {design * 30 / np.pi:.0f} r/min"
+            )
+            values = raw / 100 * design
+        else:
+            values = convert(raw, unit, si, what, difference=difference)
+        return self.reading.limits.apply(
+            name, si, values, raw, unit, lambda k: self.place(c.name, k), self._tell,
+            mixed=self._units_elsewhere(c.name),
+        )  # fmt: skip
+
+    def _units_elsewhere(self, name: str) -> bool:
+        """Whether most of the other columns with numbers name a unit."""
+        others = [c for n, c in self.columns.items() if n != name and c.problem is None
+                  and not is_time_name(n)]  # fmt: skip
+        named = sum(isinstance(c.unit, str) for c in others)
+        return 2 * named > len(others)
 
     @property
     def mapped(self) -> set[str]:
         """Columns of the file that the mapping uses."""
-        return {c for c, _ in self.mapping.values()}
+        return {self._spelt(c) for c, _ in self.mapping.values()}
+
+    def time_column(self) -> str | None:
+        """Return the column that is the time by its name or its kind; None if there is none.
+
+        Raises
+        ------
+        DataError : several that may be.
+        """
+        found = next((n for n in TIMES if n in self), None)
+        if found is not None:
+            return found
+        named = [n for n in self.columns if is_time_name(n)]
+        kind = [n for n, c in self.columns.items() if looks_like_time(c.raw)]
+        both = [n for n in named if n in kind]
+        for names in (both, named, kind):
+            if len(names) == 1:
+                return names[0]
+            if names:
+                raise DataError(
+                    f"{self.source}: {' and '.join(names)} may be the time: give --time COLUMN, or "
+                    "--steady if the rows are steady points"
+                )
+        return None
+
+    def steady_hint(self) -> str | None:
+        """Return a column that rises like a time, in a table without one; None if none does."""
+        for n, c in self.columns.items():
+            if n in self.mapped or _known(n) or c.values.size < 10 or c.problem is not None:
+                continue
+            step = np.diff(c.values)
+            if (step > 0).all() and np.ptp(step) < 1e-3 * step.mean():
+                return n
+        return None
+
+    def flags(self) -> list[str]:
+        """Return columns of truth values that are false in some rows, which nobody heeds."""
+        out = []
+        for n, c in self.columns.items():
+            cells = [str(x).strip().lower() for x in (c.raw if c.problem else ())]
+            if cells and set(cells) <= {"true", "false", "good", "bad", "ok", "valid", "invalid"}:
+                bad = sum(x in ("false", "bad", "invalid") for x in cells)
+                if bad:
+                    out.append(f"{self.source}, column {n} is not heeded: {bad} of {len(cells)} "
+                               "rows that it calls bad are used")  # fmt: skip
+        return out
 
     def time(self, name: str | None = None) -> np.ndarray | None:
         """Return the time column, s; None if there is none and none was asked for.
 
         Parameters
         ----------
-        name : of the column; else ``time``, ``Time``, ``t`` or ``timestamp``.
+        name : of the column; else one of a usual name (``time``, ``t``, ``Timestamp``, ...), or the
+            only one that holds dates.
 
         Raises
         ------
         DataError : not found, gaps, or times that do not increase; names the row.
         """
-        found = name or next((n for n in TIMES if n in self), None)
+        found = name or self.time_column()
         if found is None:
             return None
-        t = self.get(found, "s")
+        c, unit = self._find(found)
+        what = f"{self.source}, column {c.name}"
+        t = to_seconds(
+            c.values if c.raw is None else c.raw, unit, what, self._tell,
+            form=self.reading.time_format, zone=self.reading.time_zone,
+        )  # fmt: skip
         if not np.isfinite(t).all():
             k = int(np.argmax(~np.isfinite(t)))
             raise DataError(f"{self.source}: column {found} has a gap in data row {k + 1}")
@@ -168,7 +255,12 @@ class Table:
         return t
 
 
-TIMES = ("time", "Time", "t", "timestamp")
+def _told(notes: list[str] | None, what: str) -> None:
+    if notes is None:
+        raise DataError(f"{what}: refused, since nobody would be told; read_table(..., notes=[]) "
+                        "reads it, and `apu fit` does")  # fmt: skip
+    if what not in notes:
+        notes.append(what)
 
 
 def parse_mapping(items: list[str]) -> dict[str, tuple[str, str | None]]:
@@ -187,7 +279,7 @@ def parse_mapping(items: list[str]) -> dict[str, tuple[str, str | None]]:
         name, column, unit = name.strip(), column.strip(), unit.strip()
         if not (sep and name and column) or (colon and not unit):
             raise DataError(f"column {item!r}: NAME=COLUMN or NAME=COLUMN:UNIT is expected")
-        if unit and unit not in UNITS:
+        if unit and unit_of(unit) is None:
             raise DataError(f"column {item!r}: unknown unit {unit!r} {nearest(unit, UNITS)}")
         if name in out:
             raise DataError(f"column of {name} given twice")
@@ -196,9 +288,20 @@ def parse_mapping(items: list[str]) -> dict[str, tuple[str, str | None]]:
 
 
 def read_table(
-    path: str | Path, mapping: Mapping[str, tuple[str, str | None]] | None = None
+    path: str | Path,
+    mapping: Mapping[str, tuple[str, str | None]] | None = None,
+    *,
+    reading: Reading | None = None,
+    notes: list[str] | None = None,
 ) -> Table:
     """Read a file; the ending tells the kind: .csv, .txt, .tsv, .parquet, .nc.
+
+    Parameters
+    ----------
+    path, mapping : the file; names of the model -> (column, unit or None).
+    reading : how questions that the file leaves are decided.
+    notes : a list to which one sentence is added for each thing that was understood; without it
+        such a file is refused.
 
     Raises
     ------
@@ -206,146 +309,47 @@ def read_table(
         named.
     """
     path = Path(path)
+    reading = Reading() if reading is None else reading
     kind = path.suffix.lower()
-    readers: dict[str, Any] = {
-        ".csv": _csv, ".txt": _csv, ".tsv": _csv,
-        ".parquet": _parquet, ".pq": _parquet,
-        ".nc": _netcdf, ".cdf": _netcdf,
-    }  # fmt: skip
     if not path.is_file():
         raise DataError(f"{path}: no such file")
-    if kind not in readers:
+    if kind not in _KINDS:
         raise DataError(
-            f"{path}: unknown kind of file {kind!r} {nearest(kind, readers)}; CSV, Parquet and "
+            f"{path}: unknown kind of file {kind!r} {nearest(kind, _KINDS)}; CSV, Parquet and "
             "netCDF are read"
         )
-    columns = readers[kind](path)
+
+    def tell(what: str) -> None:
+        _told(notes, what)
+
+    lines: list[int] | None = None
+    others: dict[str, str] = {}
+    try:
+        if _KINDS[kind] == "text":
+            columns, lines = text_columns(
+                path, tell, encoding=reading.encoding, decimal=reading.decimal
+            )
+        elif _KINDS[kind] == "parquet":
+            columns = parquet_columns(path, tell)
+        else:
+            columns, others = netcdf_columns(path, tell)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read: {e.strerror or e}") from None
     if not columns or not columns[0].values.size:
         raise DataError(f"{path}: no data rows")
     table: dict[str, Column] = {}
     for c in columns:
+        own = split_unit(c.name, _known) if c.unit is None else None
+        if own is not None and notes is not None and (mapping or {}).get(own[0]) is None:
+            tell(f"{path}: column {c.name} is taken as {own[0]} in {own[1]}")
+            c = Column(own[0], own[1], c.values, c.raw, c.problem)
         if c.name in table:
             raise DataError(f"{path}: two columns are named {c.name!r}")
         table[c.name] = c
-    return Table(str(path.name), table, dict(mapping or {}))
+    return Table(path.name, table, dict(mapping or {}), reading, notes, lines, others)
 
 
-def _header(text: str) -> tuple[str, str | None]:
-    found = _HEADER.match(text)
-    if found is None or not found["name"]:
-        return text.strip(), None
-    unit = found["a"] if found["a"] is not None else found["b"]
-    return found["name"], unit.strip() if unit is not None and unit.strip() else None
-
-
-def _csv(path: Path) -> list[Column]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as e:
-        raise DataError(f"{path}: not a text file in UTF-8 (byte {e.start})") from None
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror or e}") from None
-    if "\0" in text:
-        raise DataError(f"{path}: holds binary data, not CSV")
-    lines = text.splitlines()
-    kept = [(i + 1, x) for i, x in enumerate(lines) if x.strip() and not x.startswith("#")]
-    if not kept:
-        raise DataError(f"{path}: empty")
-    head = kept[0][1]
-    delimiter = max(",;\t", key=head.count)
-    rows = list(csv.reader((x for _, x in kept), delimiter=delimiter))
-    if len(rows) != len(kept):
-        raise DataError(f"{path}: a quoted cell runs over several lines; is a quote missing?")
-    names = [_header(h) for h in rows[0]]
-    for i, (name, _) in enumerate(names):
-        if not name:
-            raise DataError(f"{path}, line {kept[0][0]}: column {i + 1} has no name")
-    if all(_number(name) is not None for name, _ in names):
-        raise DataError(f"{path}, line {kept[0][0]}: a line of column names is expected first")
-    values = np.full((len(names), len(rows) - 1), np.nan)
-    for k, ((line, _), row) in enumerate(zip(kept[1:], rows[1:], strict=True)):
-        if len(row) != len(names):
-            raise DataError(
-                f"{path}, line {line}: {len(row)} cells, but {len(names)} columns are named; is "
-                "the file cut off?"
-            )
-        for i, cell in enumerate(row):
-            value = _number(cell)
-            if value is None:
-                raise DataError(
-                    f"{path}, line {line}, column {names[i][0]}: {cell!r} is no number (an empty "
-                    "cell is a gap)"
-                )
-            values[i, k] = value
-    return [Column(n, u, v) for (n, u), v in zip(names, values, strict=True)]
-
-
-def _number(cell: str) -> float | None:
-    """A number, NaN for a gap, None for anything else."""
-    cell = cell.strip()
-    if cell.lower() in _GAPS:
-        return float("nan")
-    try:
-        value = float(cell)
-    except ValueError:
-        return None
-    return value if np.isfinite(value) else None
-
-
-def _parquet(path: Path) -> list[Column]:
-    engines = ("pyarrow", "fastparquet")
-    engine = next((e for e in engines if find_spec(e)), None)
-    if engine is None or find_spec("pandas") is None:
-        raise DataError(
-            f"{path}: reading Parquet needs pandas and pyarrow: pip install pandas pyarrow; or "
-            "export the data as CSV"
-        )
-    pd: Any = import_module("pandas")
-
-    try:
-        frame = pd.read_parquet(path, engine=engine)
-    except Exception as e:  # damaged files fail with any type
-        raise DataError(f"{path}: damaged Parquet file ({type(e).__name__}: {e})") from None
-    return [_typed(path, *_header(str(n)), frame[n].to_numpy()) for n in frame.columns]
-
-
-def _typed(path: Path, name: str, unit: str | None, raw: Any) -> Column:
-    try:
-        values = np.asarray(raw, dtype=float)
-    except (TypeError, ValueError):
-        # text, such as a comment column: nothing that can be fitted to
-        return Column(name, unit, np.full(len(raw), np.nan))
-    if np.isinf(values).any():
-        raise DataError(f"{path}, column {name}: infinite values")
-    return Column(name, unit, values)
-
-
-def _netcdf(path: Path) -> list[Column]:
-    import xarray as xr
-
-    from apu_casadi.results import load
-
-    with path.open("rb") as f:
-        start = f.read(4)
-    if start == b"\x89HDF":
-        try:
-            with xr.open_dataset(path, decode_times=False) as ds:
-                data = ds.load()
-        except ValueError:
-            raise DataError(
-                f"{path}: a netCDF 4 file; reading it needs h5netcdf: pip install h5netcdf"
-            ) from None
-        except Exception as e:  # damaged files fail with any type
-            raise DataError(f"{path}: damaged netCDF file ({type(e).__name__}: {e})") from None
-    else:
-        data = load(path)
-    lines = {d: int(n) for d, n in data.sizes.items()}
-    if not lines:
-        raise DataError(f"{path}: no data rows")
-    dim = "time" if "time" in lines else max(lines, key=lambda d: lines[d])
-    out = []
-    for name in [*data.coords, *data.data_vars]:
-        v = data[name]
-        if v.dims == (dim,):
-            out.append(_typed(path, str(name), v.attrs.get("units"), v.values))
-    return out
+_KINDS = {
+    ".csv": "text", ".txt": "text", ".tsv": "text", ".dat": "text", ".asc": "text",
+    ".parquet": "parquet", ".pq": "parquet", ".nc": "netcdf", ".cdf": "netcdf",
+}  # fmt: skip

@@ -25,7 +25,8 @@ from apu_casadi.terminalmodel import (
 )
 from estimators.belief import Belief
 from estimators.model import FilterModel, Unknown, augment
-from estimators.recording import SAME_TIME, Recording
+from estimators.recording import SAME_TIME, Recording, plain_numbers
+from scenarios.estimation.electrical.gaps import evened, filled, usable
 from scenarios.estimation.electrical.model import electrical_model
 from scenarios.estimation.electrical.signals import (
     ADMITTANCE,
@@ -56,6 +57,9 @@ from scenarios.estimation.sensors import ELECTRICAL, SensorSet
 
 __all__ = ["GAINS", "ElectricalFilter", "electrical_filter"]
 
+#: Harmonics that each channel consists of, for what is missing of it.
+HARMONICS_OF = {**dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3)),
+                **dict.fromkeys(("V_fd", "i_fd"), (0, 2))}  # fmt: skip
 GAINS = ("none", "estimate", "consider")
 
 
@@ -90,33 +94,36 @@ class ElectricalFilter(Parametric):
         Parameters
         ----------
         samples : ``t`` (s) and w_r, v_a, v_b, v_c, V_fd, i_a, i_b, i_c, i_fd, each of shape (K,).
-            NaN is a missing sample: a missing current is not used; an instant without all voltages
-            and speed is left out, and the step goes over it.
+            NaN is a missing sample.  A missing current is not used, the others are.  Voltages and
+            speed that are missing are filled from the harmonics around (:mod:`.gaps`), and so are
+            instants that were left out; before the first and after the last instant that has all
+            of them nothing is used.
         window : length of the windows of the mean power, s, with ``power``; default 0.02.
         start : beginning of the first window, s; default the first instant.
 
         Raises
         ------
-        DataError : missing names, shapes, no usable instant.
+        DataError : missing names, shapes, no usable instant, infinite samples, a gap with too
+            little around it.
         """
         names = ("t", "w_r", *VOLTAGES, *MEASURED)
         missing = [n for n in names if n not in samples]
         if missing:
             raise DataError(f"samples lack {', '.join(missing)}")
-        a = {n: np.asarray(samples[n], dtype=float) for n in names}
+        a = {n: plain_numbers(samples[n], n, gaps=True) for n in names}
         K = a["t"].size
         wrong = [f"{n} {v.shape}" for n, v in a.items() if v.shape != (K,)]
         if wrong:
             raise DataError(f"samples of shape ({K},) expected, as t; got {', '.join(wrong)}")
-        there = np.all([np.isfinite(a[n]) for n in ("t", "w_r", *VOLTAGES)], axis=0)
-        if not there.any():
-            raise DataError("no instant has all of w_r, v_a, v_b, v_c, V_fd")
-        a = {n: v[there] for n, v in a.items()}
+        a = evened(usable(a, ("w_r", *VOLTAGES)))
+        off = self._filled(a)
         t = a["t"]
         given = {n: a[n] for n in INPUTS.names}
         v = np.array([a[n] for n in PHASES_V])
         given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=JUMP), strict=True))
-        mid = _middles(t, v, a["w_r"], np.any([given[n] > 0 for n in JUMP_SIZES.names], axis=0))
+        jumped = np.any([given[n] > 0 for n in JUMP_SIZES.names], axis=0)
+        mid = _middles(t, v, a["w_r"], jumped)
+        given |= {n: np.maximum(given[n], off) for n in JUMP_SIZES.names}
         given |= {f"{n}_mid": m for n, m in zip(VOLTAGES, mid, strict=False)}
         given["V_fd_mid"] = (a["V_fd"] + np.append(a["V_fd"][1:], a["V_fd"][-1])) / 2
         given |= {f"{n}_next": np.append(a[n][1:], a[n][-1]) for n in VOLTAGES}
@@ -132,16 +139,31 @@ class ElectricalFilter(Parametric):
         variance = np.broadcast_to(sigma**2, y.shape).copy()
         return Recording(t, u, y, variance, self.model.p.pack({}))
 
+    def _filled(self, a: dict[str, np.ndarray]) -> np.ndarray:
+        """Fill the inputs in place; return by how much a step's voltage may be off, V, (K,)."""
+        t, w = a["t"], a["w_r"]
+        there = np.isfinite(w)
+        a["w_r"] = w = np.interp(t, t[there], w[there])
+        off = np.zeros(t.size)
+        for n in VOLTAGES:
+            a[n], e = filled(t, a[n], w, HARMONICS_OF[n], n)
+            if n in PHASES_V:
+                # below that the sensor's noise, which is in the model, stands for it
+                e = np.where(e > 3 * self.sensors.sigma(n, 0.0), e, 0.0)
+                off = np.maximum(off, np.maximum(e, np.append(e[1:], 0.0)))
+        return off
+
     def _smooth(
         self, a: Mapping[str, np.ndarray], given: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """Return the predictions of readings about which a model with gains is written."""
         t, w = a["t"], a["w_r"]
         out = {}
+        full = {n: filled(t, a[n], w, HARMONICS_OF[n], n)[0] for n in GAIN_SENSORS}
         share = middle_weight(w, np.append(np.diff(t), 0.0))
         for names, harmonics in (((*PHASES_V, *PHASES_I), (1, 3)), (("V_fd", "i_fd"), (0, 2))):
-            # a missing current is predicted as well; in the mean it counts as zero
-            x = np.array([np.nan_to_num(a[n]) for n in names])
+            # a missing current is predicted as well
+            x = np.array([full[n] for n in names])
             for n, p in zip(names, before(t, x, w, harmonics=harmonics), strict=True):
                 off = np.abs(a[n] - p) > SMOOTH_LIMIT * self.sensors.sigma(n, 0.0)
                 out[f"{n}_smooth"] = p = np.where(off, a[n], p)
@@ -153,7 +175,7 @@ class ElectricalFilter(Parametric):
                     out[f"{n}_next_smooth"] = np.append(p[1:], a[n][-1])
         turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
         v, i = (
-            2 / 3 * (turn @ before(t, np.array([a[n] for n in names]), w, space=True))
+            2 / 3 * (turn @ before(t, np.array([full[n] for n in names]), w, space=True))
             for names in (PHASES_V, PHASES_I)
         )
         p = self.machine
@@ -187,18 +209,21 @@ class ElectricalFilter(Parametric):
         ------
         DataError : fewer than eight samples in the period, or no voltage.
         """
-        a = {n: np.asarray(samples[n], dtype=float) for n in ("t", "w_r", *VOLTAGES, *MEASURED)}
+        names = ("t", "w_r", *VOLTAGES, *MEASURED)
+        a = {n: plain_numbers(samples[n], n, gaps=True) for n in names}
+        a = usable(a, ("w_r", *VOLTAGES))
+        start_at = a["t"][0]  # where the recording starts, complete or not
         good = np.all([np.isfinite(v) for v in a.values()], axis=0)
         a = {n: v[good] for n, v in a.items()}
         if not a["t"].size:
             raise DataError("no complete sample to start from")
         w = float(np.median(a["w_r"][: max(1, a["t"].size // 50)]))
         T = 2 * math.pi / abs(w) if period is None else period
-        first = a["t"] < a["t"][0] + T * (1 - 1e-6)
+        first = a["t"] < start_at + T * (1 - 1e-6)
         if first.sum() < 8:
             raise DataError(f"the first {T:.3g} s hold {int(first.sum())} samples; 8 are needed")
         a = {n: v[first] for n, v in a.items()}
-        tau = a["t"] - a["t"][0]
+        tau = a["t"] - start_at
         basis = np.column_stack([np.cos(w * tau), -np.sin(w * tau), np.ones_like(tau)])
         turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
 
