@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY
 from apu_casadi.errors import ScenarioError, nearest
 
 if TYPE_CHECKING:
@@ -83,27 +84,28 @@ class Ambient:
 
     Parameters
     ----------
-    altitude : pressure altitude [m], -500 to 20000.
-    Mach : flight Mach number [1], 0 to below 1.
+    altitude : pressure altitude [m].
+    Mach : flight Mach number [1].
     dT_isa : deviation from the standard day [K].
     war : water to dry air mass ratio [1].
+
+    Defaults and ranges are those of :data:`apu_casadi.conditions.CONDITIONS`, as everywhere.
 
     Raises
     ------
     ScenarioError : a value outside its range.
     """
 
-    altitude: float = 0.0
-    Mach: float = 0.0
-    dT_isa: float = 5.0
-    war: float = 0.0
+    altitude: float = DEFAULT_DAY["altitude"]
+    Mach: float = DEFAULT_DAY["Mach"]
+    dT_isa: float = DEFAULT_DAY["dT_isa"]
+    war: float = DEFAULT_DAY["war"]
 
     def __post_init__(self) -> None:
         """Check every value."""
-        number(self.altitude, "altitude", lo=-500.0, hi=20000.0, unit="m")
-        number(self.Mach, "Mach", lo=0.0, hi=0.999)
-        number(self.dT_isa, "dT_isa", lo=-80.0, hi=60.0, unit="K")
-        number(self.war, "war", lo=0.0, hi=0.1)
+        for name, c in CONDITIONS.items():
+            unit = "" if c.unit == "1" else c.unit
+            number(getattr(self, name), name, lo=c.lo, hi=c.hi, unit=unit)
 
 
 def _time(t: Any, what: str) -> None:

@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu
+from apu_casadi.conditions import AMBIENT
 from apu_casadi.control import governor
 from apu_casadi.errors import SimulationError
 from apu_casadi.events import (
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from apu_casadi.machine.load import Load
     from apu_casadi.machine.ttsc import Ttsc
 
-_AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 _GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
@@ -75,7 +75,7 @@ def joint_state_space(
         *gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x,
         *(_integral(gen, name) for name in integrals),
     ])  # fmt: skip
-    U = Signals([*(gg.U[n] for n in _AMBIENT), *own_u])
+    U = Signals([*(gg.U[n] for n in AMBIENT), *own_u])
     TH, Y = Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
     x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
@@ -83,12 +83,12 @@ def joint_state_space(
     N, Wf_I, x_sg = x[0], x[1], x[2 : 2 + len(gen.x)]
     n_health = len(gg.THETA)
     health, fault = theta[:n_health], theta[n_health:]
-    inputs = dict(zip(own_u.names, ca.vertsplit(u[len(_AMBIENT) :]), strict=True))
+    inputs = dict(zip(own_u.names, ca.vertsplit(u[len(AMBIENT) :]), strict=True))
     u_sg = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
     y_sg = gen.g(x_sg, u_sg, fault)
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
     PW = apu.PW(y_sg[gen.y.index("P_total")])
-    u_gg = ca.vertcat(fuel.Wf, PW, u[: len(_AMBIENT)])
+    u_gg = ca.vertcat(fuel.Wf, PW, u[: len(AMBIENT)])
 
     def integrand(name: str) -> Any:
         base, square, _ = name.partition("^2")

@@ -159,7 +159,8 @@ def simulate_joint(
     apu : the unit.
     duration : s.
     load : of each generator, from t = 0.
-    ambient : altitude, Mach, ISA deviation, humidity; the paper's ISA + 5 K by default.
+    ambient : altitude, Mach, ISA deviation, humidity; the default day where nothing is given
+        (:mod:`apu_casadi.conditions`).
     health : factors by name that hold from the start (trimmed with them).
     fault : stator fault from the start, None: healthy.
     events : :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`.

@@ -17,7 +17,7 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # Bottom first.  A module may import the layers below its own, and its neighbours only if NEIGHBOURS
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
-    ("errors",),
+    ("errors", "conditions"),
     ("signals", "parameters"),
     ("statespace", "results", "backend"),
     # solvers: they know nothing of turbines or windings, since those come above

@@ -24,6 +24,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from apu_casadi.errors import OperatingPointError, SignalError, nearest
+from scenarios.commands.given import (
+    ambient_arguments,
+    ambient_given,
+    ambient_line,
+    ambient_of,
+    program,
+)
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -37,10 +44,7 @@ SHOWN = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     number = float
-    parser.add_argument("--altitude", type=number, default=0.0, metavar="M", help="m")
-    parser.add_argument("--mach", type=number, default=0.0, help="flight Mach number")
-    parser.add_argument("--disa", type=number, default=0.0, metavar="K", help="ISA deviation, K")
-    parser.add_argument("--humidity", type=number, default=0.0, help="water per dry air, kg/kg")
+    ambient_arguments(parser)
     parser.add_argument("--power", type=number, metavar="W", help="shaft power, W")
     parser.add_argument("--speed", type=number, metavar="RPM", help="r/min (default: governed)")
     parser.add_argument("--load", type=number, metavar="W", help="electrical load per generator, W")
@@ -146,9 +150,7 @@ def _fixed(texts: list[str], PW_design: float, N_design: float) -> dict[str, Any
 def _gas(args: argparse.Namespace, mode: str) -> int:
     from apu_casadi.trimming import maximum_power, trim_gas_generator
 
-    ambient = {
-        "altitude": args.altitude, "Mach": args.mach, "dT_isa": args.disa, "war": args.humidity,
-    }  # fmt: skip
+    ambient = ambient_of(args)
     health, limits = _numbers("--health", args.health), _limits(args.limit)
     extra: dict[str, float] = {}
     if mode == "--load":
@@ -194,6 +196,9 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         report = {
             "outputs": values, "generator": extra, "residual": point.residual,
             "iterations": point.iterations, "inputs": {**ambient, "health": health},
+            "assumed": [n for n, v in ambient_given(args).items() if v is None],
+            "load": _load(args), "limits": _plain(limits),
+            "apu_casadi_version": program().split()[1],
         }  # fmt: skip
         print(json.dumps(report, indent=2, allow_nan=False))
         return 0
@@ -201,6 +206,9 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
     if extra:
         print("\neach generator\n" + _table(extra, list(extra)))
     print(f"\nresidual {point.residual:.1e}, {point.iterations} Newton steps")
+    print(ambient_line(ambient_given(args)))
+    ill = ", ".join(f"{n} = {v:g}" for n, v in health.items())
+    print(f"health: {ill or 'healthy'}; {_load_words(args)}{program()}")
     return 0
 
 
@@ -216,11 +224,40 @@ def _generator(args: argparse.Namespace) -> int:
     point = gen.steady_state(load, w_r=w_r, V_t=args.voltage)
     values = {"V_t": point.V_t, "V_ref": point.V_ref, **_scalars(point.y)}
     if args.json:
-        print(json.dumps({"generator": values, "residual": point.residual}, indent=2))
+        report = {"generator": values, "residual": point.residual, "load": _load(args),
+                  "apu_casadi_version": program().split()[1]}  # fmt: skip
+        print(json.dumps(report, indent=2))
         return 0
     print(_table(values, list(values)))
     print(f"\nresidual {point.residual:.1e} 1/s")
+    print(f"{_load_words(args)}{program()}")
     return 0
+
+
+def _load(args: argparse.Namespace) -> dict[str, float] | None:
+    """The electrical load of each generator; None for the gas generator alone."""
+    if args.load is None:
+        return None
+    return {"power": args.load, "power_factor": args.power_factor}
+
+
+def _load_words(args: argparse.Namespace) -> str:
+    if args.load is None:
+        return ""
+    return (
+        f"load of each generator: {args.load / 1e3:g} kW at 230 V, power factor "
+        f"{args.power_factor:g}; "
+    )
+
+
+def _plain(limits: Any) -> dict[str, float | None]:
+    """The limits as they were applied; None where there is none."""
+    import dataclasses
+
+    return {
+        n: float(v) if v is not None and math.isfinite(v) else None
+        for n, v in dataclasses.asdict(limits).items()
+    }
 
 
 def _scalars(y: Mapping[str, Any]) -> dict[str, float]:
