@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi import runrecord, validity
 from apu_casadi.apu import Apu
 from apu_casadi.conditions import AMBIENT
 from apu_casadi.control import governor
-from apu_casadi.errors import SimulationError
+from apu_casadi.errors import SimulationError, ValidityWarning
 from apu_casadi.events import (
     Ambient,
     Event,
@@ -154,11 +155,16 @@ def simulate_monolithic(
     Raises
     ------
     ScenarioError, OperatingPointError, SimulationError : as for ``simulate_joint``.
+
+    Warns
+    -----
+    ValidityWarning : as ``simulate_joint``.
     """
     gg, gen = apu.gas_generator, apu.generator
     ambient = Ambient() if ambient is None else ambient
     factors = {**dict.fromkeys(gg.THETA.names, 1.0), **health_factors(health or {})}
-    pending = list(in_order(events, duration))
+    events, first_load = in_order(events, duration), load
+    pending = list(events)
     grid = exchange_grid(duration, dt, pending)
     point = apu.steady_state(load, ambient=ambient, health=factors)
     V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
@@ -209,7 +215,10 @@ def simulate_monolithic(
             )  # fmt: skip
             x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(len(quad))]), len(sg.x)
         x[2 + n_sg :] = 0.0
-        r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
+        try:
+            r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
+        except SimulationError as error:
+            raise _explained(apu, error, x, Y[:, k - 1], ambient, factors, grid[k]) from None
         x = r.x_end.copy()
         j = ss.x.index("theta_e")
         x[j] = math.remainder(x[j], 2 * math.pi)
@@ -219,17 +228,40 @@ def simulate_monolithic(
             means[name][k] = total / h
         worst = max(worst, float(Y[gg.Y.index("residual"), k]))
         if not worst <= RESIDUAL_TOL:
-            raise SimulationError(
-                f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e} at t = {grid[k]:g} s"
-            )
+            failed = SimulationError(f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e}")
+            raise _explained(apu, failed, x, Y[:, k], ambient, factors, grid[k])
         if progress is not None:
             progress(float(grid[k]), duration)
     values = dict(zip(gg.Y.names, Y, strict=True))
     values |= {name: means[name] for name in MEANS}
     values |= {name: np.sqrt(means[square]) for name, square in RMS.items()}
-    return dataset(
+    told = runrecord.asked(load=first_load, fault=None, ambient=ambient, events=events)
+    ds = dataset(
         {"time": grid},
         {"time": values},
         signals=gg.Y,
-        attrs={"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps},
+        attrs={"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps, **told},
     )
+    starved = validity.fuel_limited(apu, grid, values["N"], values["Wf"])
+    unserved = validity.unserved(first_load, events, grid, values["P_e"])
+    notes = [ValidityWarning(words) for words in (starved, unserved) if words]
+    return validity.conclude(ds, validity.departures(gg, grid, values), notes)
+
+
+def _explained(
+    apu: Apu,
+    error: SimulationError,
+    x: np.ndarray,
+    y: np.ndarray,
+    ambient: Ambient,
+    health: Mapping[str, float],
+    t: float,
+) -> SimulationError:
+    """Return the error with its time, and with the overload where that is the reason."""
+    N = float(x[0])
+    fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=float(x[1]), par=apu.governor)
+    PW = float(y[apu.gas_generator.Y.index("PW")])
+    more = validity.overload(
+        apu, N=N, Wf=fuel.Wf, PW=PW, ambient=dataclasses.asdict(ambient), health=health
+    )
+    return SimulationError(f"at t = {t:.6g} s: {more or error}")

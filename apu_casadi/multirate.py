@@ -23,14 +23,20 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import runrecord, validity
 from apu_casadi.apu import Apu
 from apu_casadi.control import governor
-from apu_casadi.errors import ScenarioError, SignalError, SimulationError, nearest
+from apu_casadi.errors import (
+    ScenarioError,
+    SignalError,
+    SimulationError,
+    ValidityWarning,
+    nearest,
+)
 from apu_casadi.events import (
     Ambient,
     Event,
@@ -148,6 +154,7 @@ def simulate_joint(
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
     attrs: Mapping[str, Any] | None = None,
+    warn_exchange: bool = True,
 ) -> xr.Dataset:
     """Simulate gas generator, two generators and governor together.
 
@@ -181,11 +188,21 @@ def simulate_joint(
         than real time with a C compiler; CVODES takes over by itself where it does not hold).
     progress : called with (done, total) seconds after every exchange step.
     attrs : more attributes for the dataset.
+    warn_exchange : whether an estimated exchange error beyond 1 % of the speed's excursion is
+        warned of; the paper's exchange with steps up to its own 20 ms is not, see
+        :mod:`apu_casadi.validity`.
 
     Returns
     -------
     xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms); see
-    :mod:`apu_casadi.results`.
+    :mod:`apu_casadi.results`.  Attributes tell what was asked (:mod:`apu_casadi.runrecord`), the
+    estimated ``exchange_error`` (NaN with state noise or a hook), where the run left the limits of
+    the trim (``validity``), and all ``warnings``.
+
+    Warns
+    -----
+    ValidityWarning : the run left the limits of the trim, or ended with too little fuel.
+    ExchangeWarning : the estimated exchange error is beyond 1 % of the speed's excursion.
 
     Raises
     ------
@@ -279,19 +296,36 @@ def simulate_joint(
                     x = np.asarray(hook(k, x), float).reshape(1)
                 y, z = gg.output(x, u, theta, z0=z)
         except SimulationError as error:
-            raise SimulationError(f"at t = {grid[k]:.6g} s: {error}") from None
+            asked = float(u[1]) if math.isfinite(u[1]) else float(book.Y[gg.Y.index("PW"), k - 1])
+            words = validity.overload(
+                apu, N=N, Wf=float(u[0]), PW=asked, ambient=dataclasses.asdict(ambient),
+                health=factors,
+            ) or str(error)  # fmt: skip
+            raise SimulationError(f"at t = {grid[k]:.6g} s: {words}") from None
         book.put(k, y, means, factors, machine.fault)
         book.wave(t, w)
         if progress is not None:
             progress(float(grid[k]), duration)
 
+    t, N_run, Wf_run = grid, book.Y[gg.Y.index("N")], book.Y[gg.Y.index("Wf")]
+    lost = math.nan
+    if hook is None and not noise.N:  # state noise is drawn for each step: no other exchange has it
+        lost = validity.exchange_error(apu, point.gas, t, N_run, Wf_run).error
     status = {
         "solver": solver, "rtol": rtol, "atol": atol, "dt": dt, "exchange": exchange,
         "nsteps_generator": machine.nsteps, "steps_propagated": machine.propagated,
         "residual_max": float(book.Y[gg.Y.index("residual")].max()), "seed": seed,
         "V_ref": machine.V_ref,
     }  # fmt: skip
-    return _collect(apu, book, noise, rng, attrs, status)
+    told = runrecord.asked(load=load, fault=fault, ambient=ambient, events=events, seed=seed)
+    told |= {"exchange_error": lost, **(attrs or {})}
+    ds = _collect(apu, book, noise, rng, told, status)
+    outputs = dict(zip(gg.Y.names, book.Y, strict=True))
+    notes = validity.notes_of_exchange(lost, exchange, dt) if warn_exchange else []
+    starved = validity.fuel_limited(apu, t, N_run, Wf_run)
+    unserved = validity.unserved(load, events, t, book.means[MEANS.index("P_e")])
+    notes += [ValidityWarning(words) for words in (starved, unserved) if words]
+    return validity.conclude(ds, validity.departures(gg, t, outputs), notes)
 
 
 class _Book:
@@ -411,10 +445,6 @@ def _collect(
                     dataclasses.replace(y_sg[n], name=f"{n}_meas", doc=f"measured: {y_sg[n].doc}")
                 )
         values["time_w"] = w
-    try:
-        installed = version("apu-casadi")
-    except PackageNotFoundError:  # running from a plain checkout
-        installed = "unknown"
     return dataset(
         times,
         values,
@@ -422,7 +452,6 @@ def _collect(
         attrs={
             "parameters": json.dumps(apu.parameters()),
             "solver": json.dumps(dict(status)),
-            "apu_casadi_version": installed,
             **(attrs or {}),
         },
     )

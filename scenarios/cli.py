@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from apu_casadi.errors import ApuError, EstimationError, OperatingPointError, SimulationError
-from scenarios import commands
+from scenarios import commands, notices
 
 
 class _Version(argparse.Action):
@@ -44,7 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as e:  # argparse has printed the message
         return e.code if isinstance(e.code, int) else 2
     try:
-        status: int = args.run(args)
+        with notices.as_lines():
+            status: int = args.run(args)
         sys.stdout.flush()
         return status
     except ApuError as e:

@@ -465,6 +465,8 @@ def text(found: Mapping[str, Any]) -> str:
     for file, values in found.get("recorded_ambient", {}).items():
         taken = ", ".join(f"{n} = {v:g}" for n, v in values.items())
         lines.append(f"ambient conditions as the run file says, {file}: {taken}")
+    if "apu_casadi_version" in found:
+        lines.append(f"apu-casadi {found['apu_casadi_version']}")
     if found["ignored_columns"]:
         lines.append(f"columns not used: {', '.join(found['ignored_columns'])}")
     return "\n".join(lines)

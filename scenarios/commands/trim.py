@@ -7,7 +7,7 @@ The gas generator at governed speed against a shaft power, through 8 km at Mach 
 Two others instead, by the names of the outputs (SI units):
 
   apu trim --fix N_rpm=36050 --fix T4=1200
-  apu trim --fix Wf=0.04 --fix PW=cube
+  apu trim --fix Wf=0.045 --fix PW=cube
 
 The whole unit under an electrical load of each generator, or one generator at a terminal voltage:
 

@@ -107,6 +107,11 @@ def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
         "gas_gains": json.dumps(case.gas_gains),
         "electrical_gains": json.dumps(case.electrical_gains),
     }  # fmt: skip
+    told = ("ambient", "loads", "faults", "solver", "apu_casadi_version", "exchange_error",
+            "validity", "warnings")  # fmt: skip
+    found.attrs |= {
+        f"truth_{n}" if n == "solver" else n: ds.attrs[n] for n in told if n in ds.attrs
+    }
     return found
 
 
@@ -156,9 +161,17 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         })  # fmt: skip
     return {
         "scenario": scenario["name"], "title": scenario.get("title", ""), "seed": e.attrs["seed"],
-        "phases": rows, "short_circuit": _short_circuit(e), "health": _health(e),
+        **made_with(e), "phases": rows, "short_circuit": _short_circuit(e), "health": _health(e),
         "cross_talk": _cross_talk(e),
     }  # fmt: skip
+
+
+def made_with(e: xr.Dataset) -> dict[str, Any]:
+    """Return what the truth was simulated with and what must be known of it, ready for JSON."""
+    told = {"ambient": "ambient", "loads": "loads", "validity": "validity", "warnings": "warnings",
+            "truth_solver": "truth_solver"}  # fmt: skip
+    out: dict[str, Any] = {k: json.loads(e.attrs.get(a, "null")) for k, a in told.items()}
+    return out | {"apu_casadi_version": e.attrs.get("apu_casadi_version", "")}
 
 
 def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:
