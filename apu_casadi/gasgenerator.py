@@ -280,7 +280,7 @@ class GasGenerator:
         SimulationError : the cycle could not be solved, or the exhaust is choked.
         """
         x1, y, z, r = (step or self._step_call)(x, u, theta, dt, z0)
-        self._check(float(r[0]), x1, u, theta, "step")
+        self._check(float(r[0]), x1 if np.isfinite(x1).all() else x, u, theta, "step")
         self._check_exit(y)
         return x1, y, z
 

@@ -218,7 +218,7 @@ def simulate_monolithic(
         try:
             r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
         except SimulationError as error:
-            raise _explained(apu, error, x, Y[:, k - 1], ambient, factors, grid[k]) from None
+            raise _explained(apu, error, x, Y[:, :k], ambient, factors, grid[: k + 1]) from None
         x = r.x_end.copy()
         j = ss.x.index("theta_e")
         x[j] = math.remainder(x[j], 2 * math.pi)
@@ -229,7 +229,7 @@ def simulate_monolithic(
         worst = max(worst, float(Y[gg.Y.index("residual"), k]))
         if not worst <= RESIDUAL_TOL:
             failed = SimulationError(f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e}")
-            raise _explained(apu, failed, x, Y[:, k], ambient, factors, grid[k])
+            raise _explained(apu, failed, x, Y[:, :k], ambient, factors, grid[: k + 1])
         if progress is not None:
             progress(float(grid[k]), duration)
     values = dict(zip(gg.Y.names, Y, strict=True))
@@ -252,16 +252,17 @@ def _explained(
     apu: Apu,
     error: SimulationError,
     x: np.ndarray,
-    y: np.ndarray,
+    Y: np.ndarray,
     ambient: Ambient,
     health: Mapping[str, float],
-    t: float,
+    t: np.ndarray,
 ) -> SimulationError:
-    """Return the error with its time, and with the overload where that is the reason."""
+    """Return the error at t[-1] with the overload where that is the reason; Y is before it."""
     N = float(x[0])
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=float(x[1]), par=apu.governor)
-    PW = float(y[apu.gas_generator.Y.index("PW")])
+    PW = float(Y[apu.gas_generator.Y.index("PW"), -1])
     more = validity.overload(
         apu, N=N, Wf=fuel.Wf, PW=PW, ambient=dataclasses.asdict(ambient), health=health
     )
-    return SimulationError(f"at t = {t:.6g} s: {more or error}")
+    last = validity.before(apu.gas_generator, t[-2], Y[:, -1])
+    return SimulationError(f"at t = {t[-1]:.6g} s: {more or f'{error}; {last}'}")

@@ -300,7 +300,7 @@ def simulate_joint(
             words = validity.overload(
                 apu, N=N, Wf=float(u[0]), PW=asked, ambient=dataclasses.asdict(ambient),
                 health=factors,
-            ) or str(error)  # fmt: skip
+            ) or f"{error}; {validity.before(gg, grid[k - 1], book.Y[:, k - 1])}"  # fmt: skip
             raise SimulationError(f"at t = {grid[k]:.6g} s: {words}") from None
         book.put(k, y, means, factors, machine.fault)
         book.wave(t, w)

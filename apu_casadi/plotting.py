@@ -17,6 +17,7 @@ import numpy as np
 
 from apu_casadi.errors import DataError
 from apu_casadi.results import RPM, phases
+from apu_casadi.runwords import fault_phase, made_with
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -98,42 +99,8 @@ def _severity_note(ds: xr.Dataset) -> str:
     k = hit[-1]
     m, r, c = (float(ds[n].values[k]) for n in ("mu", "k_rf", "kappa"))
     kappa = f"κ = µ = {c:g}" if abs(c - m) < 1e-12 else f"κ = {c:g}"
-    where = _fault_phase(ds, float(ds["time"].values[k]))
+    where = fault_phase(ds, float(ds["time"].values[k]))
     return f"TTSC{where}: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
-
-
-def _rows(ds: xr.Dataset, name: str) -> list[dict[str, Any]]:
-    """Return an attribute that is a JSON list of tables; [] where it is absent."""
-    try:
-        found = json.loads(ds.attrs[name])
-    except (KeyError, TypeError, ValueError):
-        return []
-    return [r for r in found if isinstance(r, dict)] if isinstance(found, list) else []
-
-
-def _fault_phase(ds: xr.Dataset, t: float) -> str:
-    """Tell the phase of the stator fault that holds at ``t`` [s]; "" where it is not recorded."""
-    held = [r.get("phase") for r in _rows(ds, "faults") if float(r.get("t", 0.0)) < t - 1e-9]
-    return f" of phase {held[-1]}" if held and held[-1] else ""
-
-
-def _made_with(ds: xr.Dataset) -> str:
-    """Tell loads, ambient conditions, solver, exchange, seed and version of a run, if recorded."""
-    words = []
-    loads = list(dict.fromkeys(str(r.get("load")) for r in _rows(ds, "loads")))
-    if loads:
-        words.append(f"Load of each generator {', then '.join(loads)}")
-    try:
-        day, solver = json.loads(ds.attrs["ambient"]), json.loads(ds.attrs["solver"])
-        words.append(
-            f"{day['altitude']:g} m, Mach {day['Mach']:g}, ISA {day['dT_isa']:+g} K, "
-            f"war {day['war']:g}"
-        )
-        words.append(f"{solver['solver']}, exchange {solver['exchange']}, seed {ds.attrs['seed']}")
-        words.append(f"apu-casadi {ds.attrs['apu_casadi_version']}")
-    except (KeyError, TypeError, ValueError):
-        pass
-    return "; ".join(words) + "." if words else ""
 
 
 def _caption(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
@@ -144,7 +111,7 @@ def _caption(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
         words.append(f"Scenario “{name}”.")
     if key != "fig20_phases":
         words.append(_severity_note(ds))
-    words += [more, _made_with(ds)]
+    words += [more, made_with(ds)]
     text = textwrap.fill(" ".join(w for w in words if w), 160)
     fig.text(0.012, 0.10 / fig.get_figheight(), text, fontsize=8.2, color=_MUTED, va="bottom")
 

@@ -48,6 +48,7 @@ __all__ = [
     "EXCHANGE_LIMIT",
     "Departure",
     "ExchangeError",
+    "before",
     "conclude",
     "departures",
     "exchange_error",
@@ -204,9 +205,12 @@ def overload(
         most = trim_gas_generator(
             apu.gas_generator, {"N": apu.N_ref, "Wf": high}, theta=health, limits=Limits.none(),
             **ambient,
-        )["PW"]  # fmt: skip
-        gives = f"gives {most / 1e3:.1f} kW at the governed speed"
-        if math.isfinite(PW) and most >= PW:
+        )  # fmt: skip
+        gives = (
+            f"gives {most['PW'] / 1e3:.1f} kW at the governed speed (T4 = {most['T4']:.0f} K, "
+            f"SM = {most['SM']:.3f})"
+        )
+        if math.isfinite(PW) and most["PW"] >= PW:
             gives += ", and less at the speed to which it has fallen"
     except OperatingPointError as e:
         gives = f"has no steady point at the governed speed ({e})"
@@ -214,6 +218,16 @@ def overload(
         f"the load asks for more than the engine can give at the fuel limit: it asks for {asked}; "
         f"with Wf_max = {high:g} kg/s the engine {gives}; the speed has fallen to "
         f"N = {N * RPM:.0f} r/min, {100 * N / apu.N_ref:.1f} % of the governed one"
+    )
+
+
+def before(gg: GasGenerator, t: float, y: np.ndarray) -> str:
+    """Return how far from its limits the engine was at the last instant that was solved."""
+    v = gg.Y.unpack(y)
+    return (
+        f"the instant before, t = {t:.6g} s, had N = {v['N'] * RPM:.0f} r/min, T4 = "
+        f"{v['T4']:.0f} K, SM = {v['SM']:.3f}, and lay {max(v['off_c'], v['off_t']):.2f} table "
+        f"spans off the maps"
     )
 
 

@@ -19,7 +19,7 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 LAYERS = (
     ("errors", "conditions"),
     ("signals", "parameters"),
-    ("statespace", "results", "backend"),
+    ("statespace", "results", "backend", "runwords"),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
     ("gas", "mapfiles"),
@@ -47,7 +47,7 @@ NEIGHBOURS = {
 # uses matplotlib.
 ONLY = {
     "figstyle": set(),
-    "plotting": {"results", "errors", "figstyle"},
+    "plotting": {"results", "errors", "figstyle", "runwords"},
     # these two draw what they are given a model of: eigenvalues, operating lines on a map
     "eigenplot": {"errors", "figstyle", "linearisation"},
     "benchplot": {"errors", "figstyle"},

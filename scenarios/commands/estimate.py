@@ -85,7 +85,6 @@ def run(args: argparse.Namespace) -> int:
 def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi import results
-    from apu_casadi.conditions import day_words
     from apu_casadi.errors import ScenarioError
     from scenarios import notices, registry
     from scenarios.commands.run import _bar, _stoppable
@@ -116,13 +115,7 @@ def _joint(args: argparse.Namespace) -> int:
         return 0
     print(f"{s.name}, seed {args.seed}: estimate +- half width of the 95 % band\n")
     print(jointrun.table(report), "", *jointrun.words(report), sep="\n")
-    made_by, loads = report["truth_solver"] or {}, report["loads"] or []
-    print(
-        f"\nambient: {day_words(report['ambient'])}; load of each generator: "
-        + ", ".join(f"{x['load']} from {x['t']:g} s" for x in loads)
-        + f"; truth by {made_by.get('solver')}, exchange {made_by.get('exchange')} every "
-        f"{1e3 * made_by.get('dt', 0.0):g} ms; apu-casadi {report['apu_casadi_version']}"
-    )
+    print(f"\n{jointrun.made_words(report)}")
     if not args.quiet:
         print("\nwritten:", *(f"  {p}" for p in made), sep="\n")
     return 0

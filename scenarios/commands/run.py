@@ -167,7 +167,7 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 
 
 def made_with(report: dict[str, Any]) -> list[str]:
-    """Return the lines that tell what a run was made with, and what must be known of it."""
+    """Return the lines that tell what a run was made with, and whether the model holds."""
     from apu_casadi.conditions import day_words
     from apu_casadi.validity import exchange_words
 
@@ -183,9 +183,13 @@ def made_with(report: dict[str, Any]) -> list[str]:
         )
     if error is not None:
         lines.append(exchange_words(error, report["exchange"], report["dt"]))
-    if not report["validity"]:
-        lines.append("within the model's limits throughout")
-    lines += [f"warning: {text}" for text in report["warnings"]]
+    left = ", ".join(
+        f"{d['quantity']} for {d['duration']:.4g} s from t = {d['first']:.6g} s"
+        for d in report["validity"]
+    )
+    lines.append(
+        f"beyond the model's limits: {left}" if left else "within the model's limits throughout"
+    )
     return lines
 
 

@@ -174,6 +174,21 @@ def made_with(e: xr.Dataset) -> dict[str, Any]:
     return out | {"apu_casadi_version": e.attrs.get("apu_casadi_version", "")}
 
 
+def made_words(r: Mapping[str, Any]) -> str:
+    """Return what the truth of a report was simulated with, in words; "" if it is not recorded."""
+    from apu_casadi.conditions import day_words
+
+    if not (r.get("ambient") and r.get("loads")):
+        return ""
+    loads = ", ".join(f"{x['load']} from {x['t']:g} s" for x in r["loads"])
+    made_by = r.get("truth_solver") or {}
+    return (
+        f"Ambient {day_words(r['ambient'])}; load of each generator {loads}; truth by "
+        f"{made_by.get('solver')}, exchange {made_by.get('exchange')} every "
+        f"{1e3 * made_by.get('dt', 0.0):g} ms; apu-casadi {r['apu_casadi_version']}."
+    )
+
+
 def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:
     """First samples at which some true value differs from the one before."""
     true = np.array([e[f"{n}_true"].values for n in names])
@@ -376,5 +391,6 @@ def figure(kept: Mapping[str, Any]) -> Any:
         kept["t"],
         {n: np.array([np.nan if x is None else x for x in v]) for n, v in kept["curves"].items()},
         phases=[(p["name"], p["start"]) for p in r["phases"]], alarms=kept["alarms"],
-        note=f"Scenario {r['scenario']}, seed {r['seed']}; gain errors drawn for all sensors.",
+        note=f"Scenario {r['scenario']}, seed {r['seed']}; gain errors drawn for all sensors. "
+        + made_words(r),
     )  # fmt: skip
