@@ -363,10 +363,10 @@ def exchange_words(error: float, exchange: str, dt: float) -> str:
         return text
     if accepted(exchange, dt):
         return f"{text}, as the paper's scheme has it; exchange 'predicted' errs less"
-    finer = min(PAPER_STEP, dt / 4)
-    better = [] if exchange == "corrected" else ["exchange 'corrected'"]
-    better.append(f"a step of {1e3 * finer:.3g} ms or less")
-    return f"{text}; use {' and '.join(better)}"
+    if exchange in ("predicted", "corrected"):  # of second order: this gives half a percent
+        return f"{text}; use a step of {1e3 * dt * math.sqrt(0.005 / error):.2g} ms or less"
+    step = f" with a step of {1e3 * PAPER_STEP:g} ms or less" if dt > PAPER_STEP else ""
+    return f"{text}; use exchange 'predicted' or 'corrected'{step}"
 
 
 # ------------------------------------------------------------------------------ the end of a run
