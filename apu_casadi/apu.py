@@ -148,7 +148,7 @@ class Apu(Parametric):
     ) -> JointPoint:
         """Solve the steady unit at governed speed: healthy generators under a balanced load.
 
-        ``ambient`` is the paper's ground day, ISA + 5 K, by default.  ``limits`` are those of the
+        ``ambient`` is the default day if not given.  ``limits`` are those of the
         trim; by default without one of temperature, which is no reason not to simulate.
 
         Raises

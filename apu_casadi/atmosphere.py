@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
+from apu_casadi.conditions import RANGES
 from apu_casadi.gas import Gas
 
 G0 = 9.80665  # m/s2
@@ -18,7 +19,7 @@ R_ISA = 287.05287  # J/(kg K), the constant of the ISA definition
 T_SL, P_SL = 288.15, 101325.0  # K, Pa at sea level
 LAPSE = -0.0065  # K/m in the troposphere
 H_TROPOPAUSE = 11000.0  # m
-ALTITUDE_RANGE = (-1000.0, 15000.0)  # m, where this module is meant to be used
+ALTITUDE_RANGE = RANGES["altitude"]  # m, where this module is meant to be used
 
 
 class Ambient(NamedTuple):

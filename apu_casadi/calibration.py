@@ -32,6 +32,7 @@ import numpy as np
 
 from apu_casadi import files
 from apu_casadi.checked import number
+from apu_casadi.conditions import AMBIENT
 from apu_casadi.cycle import reynolds_index
 from apu_casadi.errors import (
     ApuError,
@@ -47,7 +48,6 @@ from apu_casadi.steadypoint import OperatingPoint
 from apu_casadi.trimming import trim_gas_generator
 
 SETS = ("compressor_map", "turbine_map")
-AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 COLUMNS = ("point", "role", "name", "value", "sigma")
 ROLES = ("ambient", "health", "fixed", "measured")
 SINGULAR = 1e10  # condition above which the points are said not to determine the numbers
@@ -64,7 +64,8 @@ class CalibrationPoint:
     ----------
     fixed : two outputs held, by name, SI: ``{"N": 3775.1, "PW": 221821.5}``.
     measured : outputs (value, standard deviation > 0) by name, SI: ``{"W2": (1.6817, 3e-5)}``.
-    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg); 0 where absent.
+    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg); of the default day where
+        absent.
     health : factors, 1 where absent.
     name : for messages.
 

@@ -1,7 +1,9 @@
 """PI speed governor on fuel flow, with limits and anti-windup.
 
 The paper calls its controller "a simple PI controller that uses speed feedback to control fuel"
-and gives no numbers; those here are assumed, with the reason beside them.
+and gives no numbers; those here are assumed, with the reason beside them.  It holds speed and
+limits fuel; no temperature is limited, and a run that gets too hot says so
+(:mod:`apu_casadi.validity`).
 """
 
 from __future__ import annotations
@@ -33,8 +35,10 @@ class GovernorParameters(Parameters):
         doc="lower fuel limit", lo=1e-5,
     )  # fmt: skip
     Wf_max: float = par(
-        0.060, unit="kg/s", source="assumed: 1.25 x design fuel, T4 below 1400 K at sea level",
-        doc="upper fuel limit", lo=1e-5,
+        0.060, unit="kg/s",
+        source="assumed: 1.24 x design fuel; steady T4 there 1345 K at governed speed on the "
+        "default day, more on a hot day, at altitude, with a fault or at a lower speed",
+        doc="upper fuel limit; it limits the fuel, not T4", lo=1e-5,
     )  # fmt: skip
     T_aw: float = par(
         0.1,

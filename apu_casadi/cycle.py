@@ -26,6 +26,7 @@ from apu_casadi.components.exhaust import exhaust, static_state
 from apu_casadi.components.inlet import inlet
 from apu_casadi.components.shaft import power_balance, rotor_acceleration
 from apu_casadi.components.turbine import mix_cooling, turbine
+from apu_casadi.conditions import CONDITIONS
 from apu_casadi.errors import OperatingPointError
 from apu_casadi.gas import Gas
 from apu_casadi.maps import N_CELL, N_SURGE_CELL, ScaledMap, surface_cell, surge_cell
@@ -37,16 +38,20 @@ from apu_casadi.signals import Signal, Signals
 RPM = math.pi / 30.0  # rad/s per r/min
 
 
+def _design(name: str, doc: str, source: str) -> Any:
+    """Declare an ambient condition of the design point: the default day, and its range."""
+    c = CONDITIONS[name]
+    return par(c.default, unit=c.unit, source=source, doc=doc, lo=c.lo, hi=c.hi)
+
+
 @dataclass(frozen=True)
 class GasGeneratorParameters(Parameters):
     """Design data of the gas generator (paper, Tables 3 and 4)."""
 
-    altitude: float = par(0.0, unit="m", source="Table 3", doc="design altitude", lo=-1e3, hi=15e3)
-    Mach: float = par(0.0, unit="1", source="Table 3", doc="design flight Mach number", lo=0, hi=1)
-    dT_isa: float = par(5.0, unit="K", source="Table 3", doc="design ISA deviation", lo=-80, hi=80)
-    war: float = par(
-        0.0, unit="kg/kg", source="Table 4 (SNOx)", doc="design humidity", lo=0, hi=0.1
-    )
+    altitude: float = _design("altitude", "design altitude", "Table 3")
+    Mach: float = _design("Mach", "design flight Mach number", "Table 3")
+    dT_isa: float = _design("dT_isa", "design ISA deviation", "Table 3")
+    war: float = _design("war", "design humidity", "Table 4 (SNOx)")
     N: float = par(36050.0 * RPM, unit="rad/s", source="Table 3", doc="design rotor speed", lo=1)
     W2: float = par(
         3.1442, unit="kg/s", source="Table 4; Table 3's corrected flow contradicts it",
@@ -128,15 +133,16 @@ class _Stations(NamedTuple):
     res: dict[str, Any]
 
 
+_NOMINAL = {"altitude": 1e4, "Mach": 1.0, "dT_isa": 30.0, "war": 0.01}
 X = Signals([Signal("N", "rad/s", "rotor speed", nominal=3775.0)])
 U = Signals(
     [
         Signal("Wf", "kg/s", "fuel flow", nominal=0.05),
         Signal("PW", "W", "shaft power to the load", nominal=5e5),
-        Signal("altitude", "m", "geopotential altitude", default=0.0, nominal=1e4),
-        Signal("Mach", "1", "flight Mach number", default=0.0),
-        Signal("dT_isa", "K", "deviation from ISA", default=0.0, nominal=30.0),
-        Signal("war", "kg/kg", "water per dry air", default=0.0, nominal=0.01),
+        *(
+            Signal(n, c.unit, c.doc, default=c.default, nominal=_NOMINAL[n])
+            for n, c in CONDITIONS.items()
+        ),
     ]
 )
 THETA = Signals(

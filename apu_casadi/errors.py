@@ -61,6 +61,18 @@ class DataError(ApuError, ValueError):
     """A file is missing, damaged, or lacks a column."""
 
 
+class ApuWarning(UserWarning):
+    """A result is given, but something about it must be known."""
+
+
+class ValidityWarning(ApuWarning):
+    """A run left the range in which the model holds."""
+
+
+class ExchangeWarning(ApuWarning):
+    """The exchange of speed and fuel errs by more than 1 % of the speed's excursion."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return ``"(did you mean X?)"`` for the valid name nearest to ``name``, or the list of all.
 

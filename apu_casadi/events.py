@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi import checked
+from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY
 from apu_casadi.errors import ScenarioError, nearest
 
 if TYPE_CHECKING:
@@ -85,30 +86,28 @@ class Ambient:
 
     Parameters
     ----------
-    altitude : pressure altitude [m], -500 to 20000.
-    Mach : flight Mach number [1], 0 to below 1.
+    altitude : pressure altitude [m].
+    Mach : flight Mach number [1].
     dT_isa : deviation from the standard day [K].
     war : water to dry air mass ratio [1].
+
+    Defaults and ranges are those of :data:`apu_casadi.conditions.CONDITIONS`, as everywhere.
 
     Raises
     ------
     ScenarioError : a value outside its range.
     """
 
-    altitude: float = 0.0
-    Mach: float = 0.0
-    dT_isa: float = 5.0
-    war: float = 0.0
+    altitude: float = DEFAULT_DAY["altitude"]
+    Mach: float = DEFAULT_DAY["Mach"]
+    dT_isa: float = DEFAULT_DAY["dT_isa"]
+    war: float = DEFAULT_DAY["war"]
 
     def __post_init__(self) -> None:
         """Check every value."""
-        values = {
-            "altitude": number(self.altitude, "altitude", lo=-500.0, hi=20000.0, unit="m"),
-            "Mach": number(self.Mach, "Mach", lo=0.0, hi=0.999),
-            "dT_isa": number(self.dT_isa, "dT_isa", lo=-80.0, hi=60.0, unit="K"),
-            "war": number(self.war, "war", lo=0.0, hi=0.1),
-        }
-        for name, value in values.items():
+        for name, c in CONDITIONS.items():
+            unit = "" if c.unit == "1" else c.unit
+            value = number(getattr(self, name), name, lo=c.lo, hi=c.hi, unit=unit)
             object.__setattr__(self, name, value)
 
 

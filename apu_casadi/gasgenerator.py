@@ -18,8 +18,8 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi import cycle
-from apu_casadi.atmosphere import ALTITUDE_RANGE
 from apu_casadi.backend import Caller, compiled
+from apu_casadi.conditions import RANGES
 from apu_casadi.cycle import RPM, Cycle, DesignPoint, GasGeneratorParameters, solve_design
 from apu_casadi.discretisation import linearly_implicit_midpoint
 from apu_casadi.errors import OperatingPointError, SimulationError
@@ -280,7 +280,7 @@ class GasGenerator(Parametric):
         SimulationError : the cycle could not be solved, or the exhaust is choked.
         """
         x1, y, z, r = (step or self._step_call)(x, u, theta, dt, z0)
-        self._check(float(r[0]), x1, u, theta, "step")
+        self._check(float(r[0]), x1 if np.isfinite(x1).all() else x, u, theta, "step")
         self._check_exit(y)
         return x1, y, z
 
@@ -289,10 +289,7 @@ class GasGenerator(Parametric):
         """Inputs that the model is meant for, by name: lowest and highest value."""
         return {
             "Wf": (1e-6, self.gas.FAR_stoichiometric * 0.89 * self.parameters.W2 * 3),
-            "altitude": ALTITUDE_RANGE,
-            "Mach": (0.0, 0.95),
-            "dT_isa": (-60.0, 60.0),
-            "war": (0.0, 0.1),
+            **RANGES,
         }
 
     def check_inputs(self, u: np.ndarray) -> None:

@@ -29,6 +29,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.apu import Apu, JointPoint
+from apu_casadi.conditions import AMBIENT
 from apu_casadi.control import governor
 from apu_casadi.errors import SignalError
 from apu_casadi.gasgenerator import GasGenerator
@@ -37,8 +38,6 @@ from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.statespace import StateSpace
-
-AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 
 # The angle enters f and g, and their derivatives by h at h = 0, through its first and second
 # harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.

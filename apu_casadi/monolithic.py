@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi import runrecord, validity
 from apu_casadi.apu import Apu
+from apu_casadi.conditions import AMBIENT
 from apu_casadi.control import governor
-from apu_casadi.errors import SimulationError
+from apu_casadi.errors import SimulationError, ValidityWarning
 from apu_casadi.events import (
     Ambient,
     Event,
@@ -43,7 +45,6 @@ if TYPE_CHECKING:
     from apu_casadi.machine.load import Load
     from apu_casadi.machine.ttsc import Ttsc
 
-_AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 _GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
@@ -75,7 +76,7 @@ def joint_state_space(
         *gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x,
         *(_integral(gen, name) for name in integrals),
     ])  # fmt: skip
-    U = Signals([*(gg.U[n] for n in _AMBIENT), *own_u])
+    U = Signals([*(gg.U[n] for n in AMBIENT), *own_u])
     TH, Y = Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
     x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
@@ -83,12 +84,12 @@ def joint_state_space(
     N, Wf_I, x_sg = x[0], x[1], x[2 : 2 + len(gen.x)]
     n_health = len(gg.THETA)
     health, fault = theta[:n_health], theta[n_health:]
-    inputs = dict(zip(own_u.names, ca.vertsplit(u[len(_AMBIENT) :]), strict=True))
+    inputs = dict(zip(own_u.names, ca.vertsplit(u[len(AMBIENT) :]), strict=True))
     u_sg = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
     y_sg = gen.g(x_sg, u_sg, fault)
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
     PW = apu.PW(y_sg[gen.y.index("P_total")])
-    u_gg = ca.vertcat(fuel.Wf, PW, u[: len(_AMBIENT)])
+    u_gg = ca.vertcat(fuel.Wf, PW, u[: len(AMBIENT)])
 
     def integrand(name: str) -> Any:
         base, square, _ = name.partition("^2")
@@ -154,11 +155,16 @@ def simulate_monolithic(
     Raises
     ------
     ScenarioError, OperatingPointError, SimulationError : as for ``simulate_joint``.
+
+    Warns
+    -----
+    ValidityWarning : as ``simulate_joint``.
     """
     gg, gen = apu.gas_generator, apu.generator
     ambient = Ambient() if ambient is None else ambient
     factors = {**dict.fromkeys(gg.THETA.names, 1.0), **health_factors(health or {})}
-    pending = list(in_order(events, duration))
+    events, first_load = in_order(events, duration), load
+    pending = list(events)
     grid = exchange_grid(duration, dt, pending)
     point = apu.steady_state(load, ambient=ambient, health=factors)
     V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
@@ -209,7 +215,10 @@ def simulate_monolithic(
             )  # fmt: skip
             x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(len(quad))]), len(sg.x)
         x[2 + n_sg :] = 0.0
-        r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
+        try:
+            r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
+        except SimulationError as error:
+            raise _explained(apu, error, x, Y[:, :k], ambient, factors, grid[: k + 1]) from None
         x = r.x_end.copy()
         j = ss.x.index("theta_e")
         x[j] = math.remainder(x[j], 2 * math.pi)
@@ -219,17 +228,41 @@ def simulate_monolithic(
             means[name][k] = total / h
         worst = max(worst, float(Y[gg.Y.index("residual"), k]))
         if not worst <= RESIDUAL_TOL:
-            raise SimulationError(
-                f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e} at t = {grid[k]:g} s"
-            )
+            failed = SimulationError(f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e}")
+            raise _explained(apu, failed, x, Y[:, :k], ambient, factors, grid[: k + 1])
         if progress is not None:
             progress(float(grid[k]), duration)
     values = dict(zip(gg.Y.names, Y, strict=True))
     values |= {name: means[name] for name in MEANS}
     values |= {name: np.sqrt(means[square]) for name, square in RMS.items()}
-    return dataset(
+    told = runrecord.asked(load=first_load, fault=None, ambient=ambient, events=events)
+    ds = dataset(
         {"time": grid},
         {"time": values},
         signals=gg.Y,
-        attrs={"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps},
+        attrs={"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps, **told},
     )
+    starved = validity.fuel_limited(apu, grid, values["N"], values["Wf"])
+    unserved = validity.unserved(first_load, events, grid, values["P_e"])
+    notes = [ValidityWarning(words) for words in (starved, unserved) if words]
+    return validity.conclude(ds, validity.departures(gg, grid, values), notes)
+
+
+def _explained(
+    apu: Apu,
+    error: SimulationError,
+    x: np.ndarray,
+    Y: np.ndarray,
+    ambient: Ambient,
+    health: Mapping[str, float],
+    t: np.ndarray,
+) -> SimulationError:
+    """Return the error at t[-1] with the overload where that is the reason; Y is before it."""
+    N = float(x[0])
+    fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=float(x[1]), par=apu.governor)
+    PW = float(Y[apu.gas_generator.Y.index("PW"), -1])
+    more = validity.overload(
+        apu, N=N, Wf=fuel.Wf, PW=PW, ambient=dataclasses.asdict(ambient), health=health
+    )
+    last = validity.before(apu.gas_generator, t[-2], Y[:, -1])
+    return SimulationError(f"at t = {t[-1]:.6g} s: {more or f'{error}; {last}'}")

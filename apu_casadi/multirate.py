@@ -25,15 +25,21 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import runrecord, validity
 from apu_casadi.apu import Apu
 from apu_casadi.checked import number
 from apu_casadi.control import governor
-from apu_casadi.errors import ScenarioError, SignalError, SimulationError, nearest
+from apu_casadi.errors import (
+    ScenarioError,
+    SignalError,
+    SimulationError,
+    ValidityWarning,
+    nearest,
+)
 from apu_casadi.events import (
     Ambient,
     Event,
@@ -154,6 +160,7 @@ def simulate_joint(
     progress: Callable[[float, float], None] | None = None,
     attrs: Mapping[str, Any] | None = None,
     storage: str | os.PathLike[str] = "auto",
+    warn_exchange: bool = True,
 ) -> xr.Dataset:
     """Simulate gas generator, two generators and governor together.
 
@@ -165,7 +172,8 @@ def simulate_joint(
     apu : the unit.
     duration : s.
     load : of each generator, from t = 0.
-    ambient : altitude, Mach, ISA deviation, humidity; the paper's ISA + 5 K by default.
+    ambient : altitude, Mach, ISA deviation, humidity; the default day where nothing is given
+        (:mod:`apu_casadi.conditions`).
     health : factors by name that hold from the start (trimmed with them).
     fault : stator fault from the start, None: healthy.
     events : :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`.
@@ -190,11 +198,21 @@ def simulate_joint(
         vanishes with the dataset, whose values are then read when they are asked for, each time
         anew; ``"auto"``: in memory up to :data:`~apu_casadi.runstorage.IN_MEMORY` bytes, beyond
         that in a file of the system's folder of temporary files where there is room.
+    warn_exchange : whether an estimated exchange error beyond 1 % of the speed's excursion is
+        warned of; the paper's exchange with steps up to its own 20 ms is not, see
+        :mod:`apu_casadi.validity`.
 
     Returns
     -------
     xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms); see
-    :mod:`apu_casadi.results`.
+    :mod:`apu_casadi.results`.  Attributes tell what was asked (:mod:`apu_casadi.runrecord`), the
+    estimated ``exchange_error`` (NaN with state noise or a hook), where the run left the limits of
+    the trim (``validity``), and all ``warnings``.
+
+    Warns
+    -----
+    ValidityWarning : the run left the limits of the trim, or ended with too little fuel.
+    ExchangeWarning : the estimated exchange error is beyond 1 % of the speed's excursion.
 
     Raises
     ------
@@ -297,19 +315,37 @@ def simulate_joint(
                     x = np.asarray(hook(k, x), float).reshape(1)
                 y, z = gg.output(x, u, theta, z0=z)
         except SimulationError as error:
-            raise SimulationError(f"at t = {grid[k]:.6g} s: {error}") from None
+            seen = book.last()
+            asked = float(u[1]) if math.isfinite(u[1]) else float(seen[gg.Y.index("PW")])
+            words = validity.overload(
+                apu, N=N, Wf=float(u[0]), PW=asked, ambient=dataclasses.asdict(ambient),
+                health=factors,
+            ) or f"{error}; {validity.before(gg, grid[k - 1], seen)}"  # fmt: skip
+            raise SimulationError(f"at t = {grid[k]:.6g} s: {words}") from None
         book.put(k, y, means, factors, machine.fault)
         book.wave(t, w)
         if progress is not None:
             progress(float(grid[k]), duration)
 
+    run = book.instants()
+    N_run, Wf_run, P_e = (np.asarray(run[n]) for n in ("N", "Wf", "P_e"))
+    lost = math.nan
+    if hook is None and not noise.N:  # state noise is drawn for each step: no other exchange has it
+        lost = validity.exchange_error(apu, point.gas, grid, N_run, Wf_run).error
     status = {
         "solver": solver, "rtol": rtol, "atol": atol, "dt": dt, "exchange": exchange,
         "nsteps_generator": machine.nsteps, "steps_propagated": machine.propagated,
         "residual_max": book.residual_max(), "seed": seed,
         "V_ref": machine.V_ref,
     }  # fmt: skip
-    return _collect(apu, book, noise, rng, attrs, status)
+    told = runrecord.asked(load=load, fault=fault, ambient=ambient, events=events, seed=seed)
+    told |= {"exchange_error": lost, **(attrs or {})}
+    ds = _collect(apu, book, run, noise, rng, told, status)
+    notes = validity.notes_of_exchange(lost, exchange, dt) if warn_exchange else []
+    starved = validity.fuel_limited(apu, grid, N_run, Wf_run)
+    unserved = validity.unserved(load, events, grid, P_e)
+    notes += [ValidityWarning(words) for words in (starved, unserved) if words]
+    return validity.conclude(ds, validity.departures(gg, grid, run), notes)
 
 
 class _Book:
@@ -424,8 +460,12 @@ class _Book:
         """Keep more values, where the others are."""
         return values if self.file is None else self.file.add(name, values)
 
+    def last(self) -> np.ndarray:
+        """Outputs of the gas generator at the last instant entered, shape (ny,)."""
+        return self.Y[:, self._end - self._first - 1]
+
     def instants(self) -> dict[str, Any]:
-        """All that is kept of the exchange instants, by name."""
+        """All that is kept of the exchange instants, by name; the run is complete."""
         if self.file is None:
             return {**dict(zip(self.gg.Y.names, self.Y, strict=True)), **self.slow()}
         self._flush()
@@ -482,6 +522,7 @@ def _balanced_part(load: Load) -> Load:
 def _collect(
     apu: Apu,
     book: _Book,
+    run: Mapping[str, Any],
     noise: Noise,
     rng: np.random.Generator,
     attrs: Mapping[str, Any] | None,
@@ -489,11 +530,8 @@ def _collect(
 ) -> xr.Dataset:
     """Put the run into a labelled dataset."""
     gg, grid = apu.gas_generator, book.grid
-    kept = book.instants()
     measured = {
-        f"{n}_meas": book.keep(
-            f"{n}_meas", np.asarray(kept[n]) + s * rng.standard_normal(grid.size)
-        )
+        f"{n}_meas": book.keep(f"{n}_meas", np.asarray(run[n]) + s * rng.standard_normal(grid.size))
         for n, s in noise.gas.items()
     }
     signals = [*gg.Y, *_phasor_signals()]
@@ -502,7 +540,7 @@ def _collect(
         for n in noise.gas
     ]
     times = {"time": grid}
-    values: dict[str, dict[str, Any]] = {"time": {**kept, **measured}}
+    values: dict[str, dict[str, Any]] = {"time": {**run, **measured}}
     t_w, w = book.samples()
     if w:
         times["time_w"] = t_w
@@ -515,10 +553,6 @@ def _collect(
                     dataclasses.replace(y_sg[n], name=f"{n}_meas", doc=f"measured: {y_sg[n].doc}")
                 )
         values["time_w"] = w
-    try:
-        installed = version("apu-casadi")
-    except PackageNotFoundError:  # running from a plain checkout
-        installed = "unknown"
     return dataset(
         times,
         values,
@@ -526,7 +560,6 @@ def _collect(
         attrs={
             "parameters": json.dumps(apu.parameters()),
             "solver": json.dumps(dict(status)),
-            "apu_casadi_version": installed,
             **(attrs or {}),
         },
     )

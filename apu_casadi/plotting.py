@@ -18,6 +18,7 @@ import numpy as np
 from apu_casadi import files
 from apu_casadi.errors import DataError
 from apu_casadi.results import RPM, phases
+from apu_casadi.runwords import fault_phase, made_with
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -99,7 +100,8 @@ def _severity_note(ds: xr.Dataset) -> str:
     k = hit[-1]
     m, r, c = (float(ds[n].values[k]) for n in ("mu", "k_rf", "kappa"))
     kappa = f"κ = µ = {c:g}" if abs(c - m) < 1e-12 else f"κ = {c:g}"
-    return f"TTSC: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
+    where = fault_phase(ds, float(ds["time"].values[k]))
+    return f"TTSC{where}: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
 
 
 def _caption(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
@@ -110,7 +112,7 @@ def _caption(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
         words.append(f"Scenario “{name}”.")
     if key != "fig20_phases":
         words.append(_severity_note(ds))
-    words.append(more)
+    words += [more, made_with(ds)]
     text = textwrap.fill(" ".join(w for w in words if w), 160)
     fig.text(0.012, 0.10 / fig.get_figheight(), text, fontsize=8.2, color=_MUTED, va="bottom")
 

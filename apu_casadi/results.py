@@ -297,6 +297,16 @@ class _Columns:
         return values
 
 
+def _holding(ds: xr.Dataset, attribute: str, key: str, end: float) -> str | None:
+    """Return what the run's attribute says of the time just before ``end`` [s]."""
+    try:
+        rows = json.loads(ds.attrs[attribute])
+        held = [r for r in rows if float(r["t"]) < end - 1e-9]
+        return None if held[-1][key] is None else str(held[-1][key])
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+
+
 def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     """Summarise a joint run phase by phase.
 
@@ -305,7 +315,8 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     SM_percent, V_a_rms ... [V], I_a_rms ... [A], and P_e and P_loss_fault [W] of one generator; the
     extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
     its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
-    (and h, which follows from them; k_rf and kappa are None when healthy).
+    (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
+    and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
 
     Raises
     ------
@@ -342,5 +353,7 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         end = int(np.flatnonzero(tail)[-1])
         row.update({v: float(col[v][end]) for v in _HEALTH})
         row.update(severity(*(float(col[v][end]) for v in ("mu", "k_rf", "kappa"))))
+        row["fault_phase"] = _holding(ds, "faults", "phase", p["end"]) if row["mu"] else None
+        row["load"] = _holding(ds, "loads", "load", p["end"])
         rows.append(row)
     return rows

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.checked import array
+from apu_casadi.conditions import DEFAULT_DAY
 from apu_casadi.errors import SignalError, nearest
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.steadypoint import (
@@ -179,7 +180,8 @@ def trim_batch(
     limits : as in :func:`trim_gas_generator`.
     outputs : outputs to keep, all by default; fewer take less memory.
     n_threads : default all cores that the process may use.
-    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg), numbers or arrays.
+    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg), numbers or arrays; the default day where
+        not given.
 
     Arrays are broadcast against each other; results have their common shape.
 
@@ -300,9 +302,9 @@ def _solve_chunk(
 def performance_deck(
     gg: GasGenerator,
     *,
-    altitude: Sequence[float] | np.ndarray = (0.0,),
-    Mach: Sequence[float] | np.ndarray = (0.0,),
-    dT_isa: Sequence[float] | np.ndarray = (0.0,),
+    altitude: Sequence[float] | np.ndarray = (DEFAULT_DAY["altitude"],),
+    Mach: Sequence[float] | np.ndarray = (DEFAULT_DAY["Mach"],),
+    dT_isa: Sequence[float] | np.ndarray = (DEFAULT_DAY["dT_isa"],),
     PW: Sequence[float] | np.ndarray = (5e5,),
     N: float | None = None,
     theta: Mapping[str, float] | None = None,
@@ -314,7 +316,8 @@ def performance_deck(
 
     Parameters
     ----------
-    altitude (m), Mach, dT_isa (K), PW (W) : 1-D axes of the grid.
+    altitude (m), Mach, dT_isa (K), PW (W) : 1-D axes of the grid; air is dry, and a condition that
+        is not given is that of the default day.
     N : speed, rad/s; design speed by default.
     theta, limits, outputs, n_threads : as in :func:`trim_batch`.
 
@@ -341,4 +344,4 @@ def performance_deck(
     }
     coords = {k: (k, v, {"units": (gg.U if k in gg.U else gg.Y)[k].unit}) for k, v in grid.items()}
     health = {n: float((theta or {}).get(n, 1.0)) for n in gg.THETA.names}
-    return xr.Dataset(data, coords=coords, attrs={"N": N, **health})
+    return xr.Dataset(data, coords=coords, attrs={"N": N, "war": DEFAULT_DAY["war"], **health})

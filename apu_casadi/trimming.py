@@ -73,7 +73,8 @@ def trim_gas_generator(
         :class:`LoadLaw`.
     theta : health factors by name, healthy by default.
     limits : beyond which a solved point is refused; :class:`Limits` by default.
-    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg).
+    ambient : altitude (m), Mach, dT_isa (K), war (kg/kg); the default day where not given
+        (:mod:`apu_casadi.conditions`).
 
     Raises
     ------

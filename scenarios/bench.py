@@ -182,6 +182,7 @@ def _plain_newton(gg: GasGenerator) -> Callable[..., tuple[np.ndarray, float, bo
     """Newton's method in Python around the plain equations with CasADi's own derivatives."""
     import casadi as ca
 
+    from apu_casadi.conditions import DEFAULT_DAY
     from apu_casadi.rootfinding import Newton
 
     n = len(gg.z)
@@ -193,12 +194,12 @@ def _plain_newton(gg: GasGenerator) -> Callable[..., tuple[np.ndarray, float, bo
     balance = y[gg.Y.index("P_acceleration")] / 5e5
     F = ca.Function("plain", [q, p], [ca.vertcat(alg, balance)])
     newton = Newton(F, scale=scale, lower=1e-3 * np.minimum(scale, 1.0), tol=1e-10)
-    names = ("altitude", "Mach", "dT_isa", "war")
+    names = tuple(DEFAULT_DAY)
 
     def solve(
         N: float, PW: float, ambient: Mapping[str, float], health: Mapping[str, float]
     ) -> tuple[np.ndarray, float, bool]:
-        air = [ambient.get(k, 0.0) for k in names]
+        air = [ambient.get(k, DEFAULT_DAY[k]) for k in names]
         given = np.array([N, PW, *air, *(health[k] for k in gg.THETA.names)])
         guess = gg.design.values["Wf"] * max(0.2, PW / 5e5)
         z0 = np.asarray(gg.similar(N, [guess, PW, *air])).ravel()
@@ -259,7 +260,7 @@ def derivatives(size: Size) -> list[Row]:
     dense = [ca.densify(o) for o in (*outs, z)]
     F = ca.Function("f_g_jacobians", [x, z0, u, theta], dense)
     call = Caller(compiled(F), copy=False)
-    point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": 4e5}, dT_isa=5.0)
+    point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": 4e5})
     rng = np.random.default_rng(0)
     w0 = np.concatenate([point.x, point.u, point.theta])
     spread = 1e-3 * np.concatenate([gg.X.nominals, gg.U.nominals, gg.THETA.nominals])

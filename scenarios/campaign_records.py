@@ -61,6 +61,11 @@ def wrong(record: Mapping[str, Any], name: str, phases: int) -> str:
         return ""
     if not _number(record.get("residual")):
         return f"residual {record.get('residual')!r}"
+    texts, lost = record.get("warnings"), record.get("exchange_error")
+    if not isinstance(texts, list) or not all(isinstance(w, str) for w in texts):
+        return f"warnings {texts!r}"
+    if not _number(lost) and not _is_nan(lost):  # not a number: not estimated
+        return f"exchange_error {lost!r}"
     rows = record.get("phases")
     if not isinstance(rows, list) or len(rows) != phases:
         return f"phases: {phases} rows expected"

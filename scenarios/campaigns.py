@@ -14,12 +14,14 @@ The processes are started afresh (spawn) and import this module, not the calling
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import logging
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -133,18 +135,23 @@ class _Task:
 
 def _run_one(task: _Task) -> dict[str, Any]:
     """Run one scenario; return its record, whatever happens."""
-    from apu_casadi.errors import OperatingPointError
+    from apu_casadi.errors import ApuWarning, OperatingPointError
     from apu_casadi.results import phase_summary, save
+    from apu_casadi.validity import found_in
 
     t = time.perf_counter()
     record: dict[str, Any] = {"key": task.key, "name": task.table["name"], "reason": ""}
     ds = None
     try:
         s = Scenario.from_dict(task.table)
-        ds = registry.run(s, solver=task.solver)
+        with warnings.catch_warnings():  # they are kept in the record, one list for each run
+            warnings.simplefilter("ignore", ApuWarning)
+            ds = registry.run(s, solver=task.solver)
         record["phases"] = [{k: row[k] for k in ("name", *COLUMNS)} for row in phase_summary(ds)]
         solver = json.loads(ds.attrs["solver"])
         record["residual"] = float(solver["residual_max"])
+        record["warnings"] = found_in(ds)
+        record["exchange_error"] = float(ds.attrs["exchange_error"])
         record["status"] = "done"
     except ApuError as e:
         kinds = {OperatingPointError: "refused", SimulationError: "failed"}
@@ -198,7 +205,7 @@ def run_campaign(
     -------
     xarray.Dataset on ``run`` and ``phase``: the quantities of
     :func:`apu_casadi.results.phase_summary` (NaN where there is none), ``status`` with ``reason``,
-    ``seed``, ``fault_phase``, ``seconds``, ``residual``.
+    ``seed``, ``fault_phase``, ``seconds``, ``residual``, ``exchange_error``, ``warnings``.
 
     Raises
     ------
@@ -382,6 +389,7 @@ def _whole(path: Path) -> bool:
 
 # ------------------------------------------------------------------------------ result
 
+_TEXTS = ("name", "fault_phase", "load")  # of a phase's summary: no numbers
 _UNITS: Mapping[str, tuple[str, str]] = {
     "start": ("s", "start of the phase"),
     "end": ("s", "end of the phase"),
@@ -403,11 +411,12 @@ def _dataset(
 ) -> xr.Dataset:  # fmt: skip
     import xarray as xr
 
+    from apu_casadi import runrecord
     from apu_casadi.results import CHANNELS
 
     n, m = len(records), max(len(s.phases) for s in scenarios)
     rows = [r.get("phases", ()) for r in records]
-    keys = dict.fromkeys(k for r in rows for row in r for k in row if k != "name")
+    keys = dict.fromkeys(k for r in rows for row in r for k in row if k not in _TEXTS)
     data: dict[str, Any] = {}
     for k in keys:
         a = np.full((n, m), np.nan)
@@ -441,16 +450,24 @@ def _dataset(
     data["reason"] = (
         "run", np.array([r["reason"] or "-" for r in records]), {"long_name": "of no result"}
     )  # fmt: skip
+    said = ["; ".join(r.get("warnings", ())) or "-" for r in records]
+    data["warnings"] = (
+        "run", np.array(said), {"long_name": "what must be known of the run; - nothing"}
+    )  # fmt: skip
     seeds = [-1 if s.seed is None else s.seed for s in scenarios]
     data["seed"] = ("run", np.array(seeds, dtype=np.int32), {"long_name": "of the noise; -1 none"})
     for k, unit, doc in (
         ("seconds", "s", "wall time of the run"),
         ("residual", "1", "largest scaled residual of the gas path equations in the run"),
+        ("exchange_error", "1", "estimated exchange error, of the speed's excursion"),
     ):
         a = np.array([r.get(k, np.nan) for r in records], dtype=float)
         data[k] = ("run", a, {"units": unit, "long_name": doc})
+    days = {json.dumps(dataclasses.asdict(s.ambient)) for s in scenarios}
+    made = {"solver": solver, "runs": n, "apu_casadi_version": runrecord.installed(),
+            "ambient": days.pop() if len(days) == 1 else "differs from run to run"}  # fmt: skip
     coords = {"run": [s.name for s in scenarios], "phase": np.arange(m, dtype=np.int32)}
-    return xr.Dataset(data, coords=coords, attrs={"solver": solver, "runs": n})
+    return xr.Dataset(data, coords=coords, attrs=made)
 
 
 def counts(ds: xr.Dataset) -> dict[str, int]:

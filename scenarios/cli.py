@@ -79,6 +79,7 @@ def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:
 
 def _run(argv: Sequence[str] | None, g: guard.Guard) -> int:
     from apu_casadi.errors import ScenarioError
+    from scenarios import notices
 
     try:
         args = parser().parse_args(argv)
@@ -91,7 +92,8 @@ def _run(argv: Sequence[str] | None, g: guard.Guard) -> int:
         guard.note(resume(args))
     g.raising = True
     try:
-        status: int = args.run(args)
+        with notices.as_lines():
+            status: int = args.run(args)
     except SystemExit as e:  # of code that a scenario brought along
         raise ScenarioError(f"the program was told to end with status {e.code!r}") from None
     return status

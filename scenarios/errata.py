@@ -134,7 +134,7 @@ def _fault_point(sign: str | None) -> OperatingPoint:
     """Steady point of the joint run before (None) or after the gas-path fault, at 100 kW each."""
     gg = _apu().gas_generator
     health = None if sign is None else HEALTH[sign]
-    return trim_gas_generator(gg, {"N": gg.parameters.N, "PW": _PW_100()}, theta=health, dT_isa=5.0)
+    return trim_gas_generator(gg, {"N": gg.parameters.N, "PW": _PW_100()}, theta=health)
 
 
 def turbine_flow_sign() -> str:
@@ -259,7 +259,7 @@ def _reachable(PW: float) -> bool:
     apu = _apu()
     gg = apu.gas_generator
     try:
-        point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": PW}, dT_isa=5.0)
+        point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": PW})
     except OperatingPointError:
         return False
     return point["Wf"] <= apu.governor.Wf_max

@@ -96,7 +96,7 @@ def gas_generator_transient(
         raise ScenarioError(f"route {route!r} {nearest(route, routes)}")
     gg = gg or GasGenerator()
     p, health = gg.parameters, HEALTH[turbine_flow]
-    point = trim_gas_generator(gg, {"N": p.N, "PW": 230e3}, theta=health, dT_isa=p.dT_isa)
+    point = trim_gas_generator(gg, {"N": p.N, "PW": 230e3}, theta=health)
     n, k_step = round(T_END / DT), round(T_STEP / DT)
     t = np.arange(n + 1) * DT
     before, after = point.u, point.u * np.where(np.arange(len(gg.U)) == 0, 1.10, 1.0)
@@ -284,7 +284,7 @@ def table10() -> list[Row]:
     for phase, p in phases.items():
         theta = {k: p[k] for k in gg.THETA.names}
         trim = trim_gas_generator(gg, {"N": p["N_rpm"] / 30 * math.pi, "PW": 1e3 * p["PW_kW"]},
-                                  theta=theta, dT_isa=5.0)  # fmt: skip
+                                  theta=theta)  # fmt: skip
         for name, unit in units.items():
             ref = trim[name] * (1e-3 if unit == "kPa" else 1.0)
             ours = p[name if unit != "kPa" else f"{name}_kPa"]

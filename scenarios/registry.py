@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable
 from importlib.resources import files
@@ -130,6 +131,7 @@ def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool
         ambient=s.ambient,
         events=s.events(),
         dt=s.dt,
+        exchange=s.exchange,
         waveform_dt=s.waveform_dt,
         noise=None if s.noise is None else s.noise.build(),
         seed=s.seed,
@@ -157,6 +159,7 @@ def name_of(ds: xr.Dataset) -> str:
 def summary(ds: xr.Dataset) -> dict[str, Any]:
     """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
     from apu_casadi.results import phase_summary
+    from apu_casadi.validity import found_in
 
     try:
         title = str(json.loads(ds.attrs["scenario"])["title"])
@@ -166,8 +169,37 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
         "scenario": name_of(ds),
         "title": title,
         "apu_casadi_version": str(ds.attrs.get("apu_casadi_version", "")),
+        **conditions(ds),
         "phases": phase_summary(ds),
+        "validity": json.loads(ds.attrs.get("validity", "[]")),
+        "warnings": found_in(ds),
     }
+
+
+def conditions(ds: xr.Dataset) -> dict[str, Any]:
+    """Return what a run was made with, ready for JSON: ambient, solver, exchange, seed.
+
+    What the dataset does not tell is None.
+    """
+    solver = _table(ds, "solver")
+    seed, error = ds.attrs.get("seed", "none"), ds.attrs.get("exchange_error", math.nan)
+    return {
+        "ambient": _table(ds, "ambient") or None,
+        "solver": {k: solver[k] for k in ("solver", "rtol", "atol") if k in solver} or None,
+        "exchange": solver.get("exchange"),
+        "dt": solver.get("dt"),
+        "exchange_error": float(error) if math.isfinite(error) else None,
+        "seed": None if isinstance(seed, str) else int(seed),
+    }
+
+
+def _table(ds: xr.Dataset, name: str) -> dict[str, Any]:
+    """Return an attribute that is a JSON table; {} where it is absent or something else."""
+    try:
+        found = json.loads(ds.attrs[name])
+    except (KeyError, TypeError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def write(

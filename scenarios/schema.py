@@ -63,6 +63,8 @@ LOAD_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 LARGEST_FILE = 1 << 24
 """Largest scenario file, bytes."""
+EXCHANGES = ("paper", "predicted", "corrected")
+"""Exchanges of speed and fuel that a scenario may ask for."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _PHASES = ("a", "b", "c")
@@ -489,6 +491,8 @@ class Scenario:
     changes : further changes inside the phases (``[[event]]`` in a file).
     dt : exchange step of the two parts [s]; a step before a change between two is shortened.
     waveform_dt : sampling step of the waveforms [s]; None for no waveforms (0 in a file).
+    exchange : how speed and fuel pass between the two parts: ``paper``, ``predicted`` or
+        ``corrected``, see :func:`apu_casadi.multirate.simulate_joint`.
     noise : process and measurement noise; None for none.
     seed : seed of the noise.
     parameters : changed parameters of the unit, by dotted name (``machine.r_s``).
@@ -507,6 +511,7 @@ class Scenario:
     changes: tuple[Change, ...] = ()
     dt: float = 0.02
     waveform_dt: float | None = 50e-6
+    exchange: str = "paper"
     noise: NoiseSpec | None = None
     seed: int | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -532,6 +537,11 @@ class Scenario:
             put("waveform_dt", step)
             if abs(self.dt / step - round(self.dt / step)) > 1e-6:
                 raise _PlacedError("waveform_dt", f"{step:g} s does not divide dt = {self.dt:g} s")
+        _text(self.exchange, "exchange")
+        if self.exchange not in EXCHANGES:
+            raise _PlacedError(
+                "exchange", f"unknown {self.exchange!r} {nearest(self.exchange, EXCHANGES)}"
+            )
         if self.seed is not None:
             whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
             _require(whole and self.seed >= 0, "seed", f"a whole number >= 0, got {self.seed!r}")
@@ -616,7 +626,7 @@ class Scenario:
     def _from_dict(cls, data: Any) -> Self:
         keys = (
             "name", "title", "doc", "duration", "phase", "event", "ambient", "dt", "waveform_dt",
-            "noise", "seed", "parameters",
+            "exchange", "noise", "seed", "parameters",
         )  # fmt: skip
         if not isinstance(data, Mapping):
             raise ScenarioError(f"a table is expected, got {data!r}")
@@ -726,6 +736,8 @@ class Scenario:
             "ambient": dataclasses.asdict(self.ambient),
             "phase": [p.to_dict() for p in self.phases],
         }
+        if self.exchange != "paper":
+            table["exchange"] = self.exchange
         if self.changes:
             table["event"] = [c.to_dict() for c in self.changes]
         if self.noise is not None:

@@ -36,3 +36,21 @@ def test_limits_in_wrong_order_are_refused():
     """Both numbers are in the message."""
     with pytest.raises(ParameterError, match=r"0\.07 .* 0\.06"):
         GovernorParameters(Wf_min=0.07)
+
+
+def test_the_fuel_limit_limits_fuel_and_says_what_T4_is_there():
+    """T4 "below 1400 K" was promised, 1478 K reached: the words name T4 at one point, no bound."""
+    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.steadypoint import Limits
+    from apu_casadi.trimming import trim_gas_generator
+
+    gg, words = GasGenerator(), next(r for r in P.table() if r[0] == "Wf_max")
+    at_limit = {"N": gg.parameters.N, "Wf": P.Wf_max}
+    T4 = trim_gas_generator(gg, at_limit, limits=Limits.none())["T4"]
+    assert f"T4 there {T4:.0f} K" in words[4]
+    assert f"{P.Wf_max / gg.design.values['Wf']:.2f} x design fuel" in words[4]
+    for other in ({"dT_isa": 35.0}, {"altitude": 3000.0}, {"theta": {"f_eta_c": 0.95}}):
+        assert trim_gas_generator(gg, at_limit, limits=Limits.none(), **other)["T4"] > T4 + 10
+    slow = {**at_limit, "N": 0.95 * gg.parameters.N}
+    assert trim_gas_generator(gg, slow, limits=Limits.none())["T4"] > T4 + 50
+    assert "below" not in words[4] and "not T4" in words[3]

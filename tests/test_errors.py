@@ -6,7 +6,8 @@ from apu_casadi import errors
 from apu_casadi.errors import ApuError, nearest
 
 FAMILY = [
-    e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, Exception)
+    e for e in vars(errors).values()
+    if isinstance(e, type) and issubclass(e, Exception) and not issubclass(e, Warning)
 ]  # fmt: skip
 
 

@@ -165,7 +165,7 @@ def test_signatures_are_the_steady_sensitivities(gg):
     f = linear_problem(3e5, 0.0, SHORT, gg)
     k = SHORT.first
     first = f.signature(k, k + 1)[0]
-    point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": 3e5})
+    point = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": 3e5}, dT_isa=0.0)
     P3 = FAULTS.index("gain_P3")
     assert_allclose(first[:, P3], [0, point["P3"], 0, 0, 0], rtol=1e-9, atol=1e-9)
     d = 1e-5

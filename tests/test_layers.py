@@ -18,10 +18,10 @@ PACKAGES = ("apu_casadi", "estimators", "scenarios")
 # says so.  "components" and "machine" stand for all modules in these folders.
 LAYERS = (
     ("interrupts",),
-    ("errors", "checked", "sharing"),
+    ("errors", "checked", "sharing", "conditions"),
     ("signals", "parameters", "mapcheck", "cachefolder", "calling", "files", "filearrays"),
     ("netcdf3", "runstorage"),
-    ("statespace", "results", "backend"),
+    ("statespace", "results", "backend", "runwords"),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
     ("gas", "maptable"),
@@ -37,8 +37,8 @@ LAYERS = (
     ("trimming", "trimbatch", "propagation"),
     ("calibration", "meanstep"),
     ("control", "events"),
-    ("apu",),
-    ("jointstep",),
+    ("apu", "runrecord"),
+    ("jointstep", "validity"),
     ("machinestep",),
     ("jointmodel", "multirate"),
     ("linearisation", "monolithic"),
@@ -52,7 +52,7 @@ NEIGHBOURS = {
 # uses matplotlib.
 ONLY = {
     "figstyle": set(),
-    "plotting": {"results", "errors", "figstyle", "files"},
+    "plotting": {"results", "errors", "figstyle", "files", "runwords"},
     # these two draw what they are given a model of: eigenvalues, operating lines on a map
     "eigenplot": {"errors", "figstyle", "linearisation"},
     "benchplot": {"errors", "figstyle"},

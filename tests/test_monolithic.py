@@ -52,7 +52,9 @@ def errors(ds, truth):
 
 
 def joint(exchange, dt, **options):
-    ds = load_step(simulate_joint, exchange=exchange, dt=dt, waveform_dt=None, **options)
+    ds = load_step(
+        simulate_joint, exchange=exchange, dt=dt, waveform_dt=None, warn_exchange=False, **options
+    )
     ds.attrs["dt_test"] = dt
     return ds
 

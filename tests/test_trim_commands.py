@@ -32,7 +32,7 @@ def test_trim_by_other_quantities(capsys):
     """Two fixed outputs, a cubic load, a temperature limit, an electrical load, one generator."""
     for argv in (
         ("--fix", "N_rpm=36050", "--fix", "T4=1150"),
-        ("--fix", "Wf=0.04,PW=cube"),
+        ("--fix", "Wf=0.045,PW=cube"),
         ("--max-power", "T5=720", "--altitude", "3000"),
         ("--load", "200e3", "--disa", "5"),
         ("--power", "300e3", "--health", "f_eta_c=0.97", "--limit", "T4_max=1500"),

@@ -11,6 +11,7 @@ campaign works in DIR this one waits, and takes over what that one has done.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shutil
 import sys
 import time
@@ -54,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the campaign; status 0 even if runs were refused, which the result tells."""
     from pathlib import Path
 
-    from scenarios import campaigns, registry
+    from apu_casadi.conditions import day_words
+    from scenarios import campaigns, notices, registry
 
     runs = campaigns.random_faults(args.runs, args.seed, base=registry.get(args.base))
     t = time.perf_counter()
@@ -85,16 +87,36 @@ def run(args: argparse.Namespace) -> int:
         for name, why, s in zip(*(ds[k].values for k in ("run", "reason", "status")), strict=True)
         if s
     }
+    warned = {
+        str(name): str(words)
+        for name, words in zip(ds["run"].values, ds["warnings"].values, strict=True)
+        if words != "-"
+    }
+    base = registry.get(args.base)
+    made = {
+        "base": base.name, "ambient": dataclasses.asdict(base.ambient),
+        "solver": ds.attrs["solver"], "exchange": base.exchange,
+        "apu_casadi_version": ds.attrs["apu_casadi_version"],
+    }  # fmt: skip
     path = Path(args.out) / campaigns.DATASET
     if args.json:
         report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": n}
-        jsontext.show({**report, "reasons": reasons, "file": str(path)})
+        report |= {**made, "reasons": reasons, "warnings": warned, "file": str(path)}
+        jsontext.show(report)
         return 0
     print(f"{args.runs} runs in {t:.1f} s: " + ", ".join(f"{v} {k}" for k, v in n.items() if v))
     for name, why in list(reasons.items())[:10]:
         print(f"  {name}: {why}")
     if len(reasons) > 10:
         print(f"  ... and {len(reasons) - 10} more, in the file")
+    for name, words in list(warned.items())[:10]:
+        notices.tell([f"{name}: {words}"])
+    if warned:
+        print(f"{len(warned)} runs come with warnings, in the file")
+    print(
+        f"base {base.name}, seed {args.seed}, {day_words(made['ambient'])}, solver "
+        f"{made['solver']}, exchange {base.exchange}, apu-casadi {made['apu_casadi_version']}"
+    )
     print(f"written: {path}")
     return 0
 

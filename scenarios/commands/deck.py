@@ -15,7 +15,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from apu_casadi.conditions import DEFAULT_DAY
 from scenarios import jsontext
+from scenarios.commands.given import program
 
 NAME = "deck"
 HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
@@ -26,7 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--altitude", default="0:12000:7", metavar="AXIS", help="m")
     parser.add_argument("--mach", default="0:0.8:5", metavar="AXIS", help="flight Mach number")
-    parser.add_argument("--disa", default="0", metavar="AXIS", help="ISA deviation, K")
+    parser.add_argument(
+        "--disa", default=f"{DEFAULT_DAY['dT_isa']:g}", metavar="AXIS",
+        help="ISA deviation, K (default %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--power", default="0:500e3:11", metavar="AXIS", help="shaft power, W")
     parser.add_argument("--outputs", metavar="A,B", help="outputs to keep (default: all)")
     parser.add_argument("--out", default="deck.nc", metavar="FILE", help="netCDF file")
@@ -58,15 +63,25 @@ def run(args: argparse.Namespace) -> int:
         GasGenerator(), **axes, outputs=keep, n_threads=args.threads
     )  # fmt: skip
     t = time.perf_counter() - t
+    deck.attrs["apu_casadi_version"] = program().split()[1]
     results.save(deck, args.out)
     status = deck["status"].values
     counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}
     if args.json:
-        jsontext.show({"points": points, "seconds": t, "counts": counts, "file": args.out})
+        report = {"points": points, "seconds": t, "counts": counts, "file": args.out}
+        jsontext.show(report | {"axes": axes, "assumed": dict(deck.attrs)})
         return 0
     print(f"{points} points in {t:.2f} s ({1e6 * t / points:.0f} us each)")
     for name, n in counts.items():
         print(f"  {name:<24}{n:8d}")
+    a = deck.attrs
+    health = all(a[n] == 1.0 for n in GasGenerator.THETA.names)
+    print(
+        f"speed {a['N'] * 30 / math.pi:.1f} r/min, {'healthy' if health else 'faulty'} engine, "
+        f"war = {a['war']:g}, ISA deviation "
+        + ", ".join(f"{v:g}" for v in axes["dT_isa"])
+        + f" K; {program()}"
+    )
     print(f"written: {args.out}")
     return 0
 

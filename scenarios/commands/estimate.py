@@ -92,7 +92,7 @@ def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi import results
     from apu_casadi.errors import ScenarioError
-    from scenarios import registry
+    from scenarios import notices, registry
     from scenarios.commands.run import _bar
     from scenarios.estimation import jointrun
     from scenarios.pages import write_text
@@ -108,6 +108,7 @@ def _joint(args: argparse.Namespace) -> int:
         print("estimating ...", file=sys.stderr)
     e = jointrun.estimate(truth, args.seed)
     report = jointrun.report(e)
+    notices.tell(report["warnings"] or [])
     made = [results.save(e, folder / f"estimate_{s.name}.nc")]
     text = jsontext.dumps(report)
     made.append(write_text(folder / "estimate.json", text + "\n"))
@@ -119,6 +120,7 @@ def _joint(args: argparse.Namespace) -> int:
         return 0
     print(f"{s.name}, seed {args.seed}: estimate +- half width of the 95 % band\n")
     print(jointrun.table(report), "", *jointrun.words(report), sep="\n")
+    print(f"\n{jointrun.made_words(report)}")
     if not args.quiet:
         print("\nwritten:", *(f"  {p}" for p in made), sep="\n")
     return 0

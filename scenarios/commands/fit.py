@@ -26,8 +26,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.conditions import DEFAULT_DAY
 from apu_casadi.errors import DataError, ParameterError, nearest
 from scenarios import jsontext
+from scenarios.commands.given import ambient_arguments, ambient_given, program
 
 if TYPE_CHECKING:
     from estimators.fit import Profile
@@ -77,11 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fix", metavar="NAME=VALUE", action="append", default=[], help="a known health factor"
     )
-    for name, unit, text in (
-        ("altitude", "M", "altitude, m"), ("mach", "MACH", "flight Mach number"),
-        ("disa", "K", "deviation from ISA, K"), ("war", "RATIO", "water per dry air"),
-    ):  # fmt: skip
-        parser.add_argument(f"--{name}", metavar=unit, type=float, help=f"{text} (else a column)")
+    ambient_arguments(parser, otherwise="a column, what the run file says, else ")
     parser.add_argument(
         "--profile", action="store_true", help="intervals from the profile likelihood too"
     )
@@ -130,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
     from estimators.fit import profile
     from scenarios.estimation import fitting
     from scenarios.estimation.recorded import parse_mapping, read_table
+    from scenarios.estimation.runfiles import recorded_ambient
 
     mapping = parse_mapping(args.column)
     _known_targets(mapping)
@@ -141,7 +140,11 @@ def run(args: argparse.Namespace) -> int:
     if len({t is None for t in times}) > 1:
         raise DataError("some files have a time column and some not; --steady takes rows as points")
     steady = times[0] is None
-    data = [_data(table, t, sensors, args) for table, t in zip(tables, times, strict=True)]
+    said = [recorded_ambient(f) for f in args.files]
+    data = [
+        _data(table, t, sensors, args, day)
+        for table, t, day in zip(tables, times, said, strict=True)
+    ]
     ignored = _ignored(tables, sensors, args.time)
     estimate = _names(args.estimate)
     if args.readings < 1:
@@ -172,6 +175,11 @@ def run(args: argparse.Namespace) -> int:
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["read_as"] = [*notes, *_unheeded(tables, times, args)]
+    found["recorded_ambient"] = {
+        t.source: taken for t, day in zip(tables, said, strict=True)
+        if (taken := _recorded(t, day, args))
+    }  # fmt: skip
+    found["apu_casadi_version"] = program().split()[1]
     if args.json:
         jsontext.show(found)
         return 0
@@ -280,8 +288,13 @@ def _known_targets(mapping: Mapping[str, Any]) -> None:
             raise DataError(f"--column {name}=...: unknown quantity {nearest(name, valid)}")
 
 
-def _data(table: Table, t: Any, sensors: SensorSet, args: argparse.Namespace) -> EngineData:
-    """Take from a table what the sensors measure, and the ambient conditions."""
+def _data(
+    table: Table, t: Any, sensors: SensorSet, args: argparse.Namespace, said: Mapping[str, float]
+) -> EngineData:
+    """Take from a table what the sensors measure, and the ambient conditions.
+
+    An option goes before a column, and that before what a run file says of itself.
+    """
     import numpy as np
 
     from apu_casadi.gasgenerator import GasGenerator
@@ -296,12 +309,14 @@ def _data(table: Table, t: Any, sensors: SensorSet, args: argparse.Namespace) ->
             f"({', '.join(n for n in sensors.names if n not in INPUTS)}); name them with --column"
         )
     ambient: dict[str, Any] = {}
-    given = {"altitude": args.altitude, "Mach": args.mach, "dT_isa": args.disa, "war": args.war}
+    given = ambient_given(args)
     for name in AMBIENT:
-        if given[name] is not None:
-            ambient[name] = given[name]
+        if (option := given[name]) is not None:
+            ambient[name] = option
         elif name in table:
             ambient[name] = table.get(name, U[name].unit, difference=name == "dT_isa")
+        elif name in said:
+            ambient[name] = said[name]
     rows = np.arange(table.size, dtype=float) if t is None else t - t[0]
     # rows in which nothing was read are no points
     there = np.any([np.isfinite(readings[n]) for n in measured], axis=0)
@@ -314,11 +329,15 @@ def _data(table: Table, t: Any, sensors: SensorSet, args: argparse.Namespace) ->
 
 def _assumed(data: Sequence[EngineData]) -> dict[str, float]:
     """Ambient conditions that neither option nor column gave, at the values that were taken."""
-    from apu_casadi.gasgenerator import GasGenerator
-    from scenarios.estimation.fitting import AMBIENT
+    return {n: v for n, v in DEFAULT_DAY.items() if any(n not in d.ambient for d in data)}
 
-    U = GasGenerator.U
-    return {n: U[n].default or 0.0 for n in AMBIENT if any(n not in d.ambient for d in data)}
+
+def _recorded(
+    table: Table, said: Mapping[str, float], args: argparse.Namespace
+) -> dict[str, float]:
+    """Ambient conditions that were taken from what a run file says of itself."""
+    given = ambient_given(args)
+    return {n: v for n, v in said.items() if given[n] is None and n not in table}
 
 
 def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Namespace) -> list[str]:
@@ -501,6 +520,11 @@ def text(found: Mapping[str, Any]) -> str:
             "condition is taken for a change of health"
         )
     lines += [f"read: {n}" for n in found.get("read_as", ())]
+    for file, values in found.get("recorded_ambient", {}).items():
+        taken = ", ".join(f"{n} = {v:g}" for n, v in values.items())
+        lines.append(f"ambient conditions as the run file says, {file}: {taken}")
+    if "apu_casadi_version" in found:
+        lines.append(f"apu-casadi {found['apu_casadi_version']}")
     if found["ignored_columns"]:
         lines.append(f"columns not used: {', '.join(found['ignored_columns'])}")
     return "\n".join(lines)

@@ -16,7 +16,9 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.conditions import DEFAULT_DAY, day_words
 from scenarios import jsontext
+from scenarios.commands.given import program
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,6 +118,9 @@ def run(args: argparse.Namespace) -> int:
             "eta_bias": args.eta_bias / 100,
             "gain_errors": args.gain_errors,
             "sensors": list(sensors),
+            "points": {n: _condition(n) for n in _names(args.point)},
+            "trial_seeds": [10_000, 10_000 + args.trials] if args.trials else None,
+            "apu_casadi_version": program().split()[1],
             "sentences": comparison["these"].sentences(),
             "rank": comparison["these"].rank,
             "rank_in_noise": comparison["these"].rank_in_noise,
@@ -181,7 +186,19 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
         f"gain errors: {gains};",
         f"true speed and fuel flow unknown; efficiency behind PW known to {args.eta_bias:g} %; "
         "noise: scenarios.estimation.sensors.",
-    ]
+        *(f"{n}: shaft power {c['PW'] / 1e3:g} kW, {day_words(c['ambient'])}; healthy engine"
+          for n, c in ((n, _condition(n)) for n in _names(args.point))),
+        f"{program()}" + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
+    ]  # fmt: skip
+
+
+def _condition(point: str) -> dict[str, Any]:
+    """Shaft power and all ambient conditions of a named point."""
+    from scenarios.estimation.identify import POINTS
+
+    given = POINTS[point]
+    return {"PW": given["PW"],
+            "ambient": {n: given.get(n, v) for n, v in DEFAULT_DAY.items()}}  # fmt: skip
 
 
 def _known(r: Identifiability) -> list[str]:

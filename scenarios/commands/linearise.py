@@ -11,7 +11,15 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.conditions import day_words
 from scenarios import jsontext
+from scenarios.commands.given import (
+    ambient_arguments,
+    ambient_given,
+    ambient_line,
+    ambient_of,
+    program,
+)
 
 if TYPE_CHECKING:
     from apu_casadi.linearisation import LinearModel
@@ -28,11 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="load of each generator at 230 V (default %(default)s)")  # fmt: skip
     parser.add_argument("--power-factor", metavar="PF", type=float, default=1.0, help="default 1")
     parser.add_argument("--constant-power", action="store_true", help="a load that holds its power")
-    parser.add_argument("--altitude", metavar="M", type=float, default=0.0, help="default 0 m")
-    parser.add_argument("--mach", metavar="MA", type=float, default=0.0, help="default 0")
-    parser.add_argument(
-        "--disa", metavar="K", type=float, default=5.0, help="ISA deviation, default 5 K"
-    )
+    ambient_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON, with all matrices")
     parser.add_argument(
         "--out", metavar="DIR", default="results/linearise", help="default %(default)s"
@@ -49,16 +53,33 @@ def run(args: argparse.Namespace) -> int:
         from apu_casadi.eigenplot import plot_eigenvalues
         from scenarios import registry
 
-        label = f"{args.power:g} kW each, {args.altitude:g} m, Mach {args.mach:g}"
+        label = f"{_load(args)}, {day_words(ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
         files.save_figure(plot_eigenvalues({label: model}), path)
     if args.json:
-        jsontext.show(report(model))
+        given = {
+            "ambient": ambient_of(args),
+            "assumed": [n for n, v in ambient_given(args).items() if v is None],
+            "load": {
+                "power": 1e3 * args.power, "power_factor": args.power_factor,
+                "constant_power": args.constant_power,
+            },
+            "apu_casadi_version": program().split()[1],
+        }  # fmt: skip
+        jsontext.show(report(model) | given)
         return 0
     print(table(model))
+    if args.model != "generator":
+        print(f"\n{ambient_line(ambient_given(args))}")
+    print(f"load of each generator: {_load(args)}; healthy; {program()}")
     if path is not None:
         print(f"\n{path}")
     return 0
+
+
+def _load(args: argparse.Namespace) -> str:
+    kind = "constant power" if args.constant_power else f"power factor {args.power_factor:g}"
+    return f"{args.power:g} kW each at 230 V, {kind}"
 
 
 def linear_model(args: argparse.Namespace) -> LinearModel:
@@ -81,8 +102,7 @@ def linear_model(args: argparse.Namespace) -> LinearModel:
     if args.model == "generator":
         w_r = apu.w_r(apu.N_ref)
         return linearise_generator(apu.generator, apu.generator.steady_state(load, w_r=w_r))
-    ambient = Ambient(altitude=args.altitude, Mach=args.mach, dT_isa=args.disa)
-    point = apu.steady_state(load, ambient=ambient)
+    point = apu.steady_state(load, ambient=Ambient(**ambient_of(args)))
     if args.model == "gas":
         return linearise_gas_generator(apu.gas_generator, point.gas)
     return linearise_joint(apu, point)

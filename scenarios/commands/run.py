@@ -37,27 +37,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--solver", default="cvodes", metavar="NAME",
         help="cvodes (default), idas, or propagator: exact and fast where the load is linear",
     )  # fmt: skip
+    parser.add_argument(
+        "--exchange", metavar="NAME",
+        help="of speed and fuel between the parts: paper, predicted (errs less at the same price), "
+        "or corrected; default: the scenario's",
+    )  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the scenario and write its results."""
-    from scenarios import registry
+    from scenarios import notices, registry
 
     s = registry.get(args.scenario)
     if args.no_waveforms:
         s = s.change(waveform_dt=None)
+    if args.exchange is not None:
+        s = s.change(exchange=args.exchange)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with _bar(s.name, s.duration, show=show) as progress:
         ds = registry.run(s, progress=progress, solver=args.solver, phasors=args.phasors)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
+    notices.tell(report["warnings"])
     if args.json:
         jsontext.show(report)
         return 0
     print(f"{s.name}: {s.title}" if s.title else s.name)
     print(table(report["phases"]))
+    print("", *made_with(report), sep="\n")
     if not args.quiet:
         print("\nwritten:")
         for path in made:
@@ -94,6 +103,7 @@ def _faulty(value: float | None, form: str) -> str:
 
 _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("phase [s]", lambda r: f"{r['start']:g} to {r['end']:g}"),
+    ("load of each", lambda r: r["load"] or "-"),
     ("shaft speed [r/min]", lambda r: f"{r['N_rpm']:.1f}"),
     ("  lowest", lambda r: f"{r['N_rpm_min']:.1f}"),
     ("  highest", lambda r: f"{r['N_rpm_max']:.1f}"),
@@ -118,10 +128,38 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("f_eta_c, f_W_c", lambda r: f"{r['f_eta_c']:g}, {r['f_W_c']:g}"),
     ("f_eta_t, f_W_t", lambda r: f"{r['f_eta_t']:g}, {r['f_W_t']:g}"),
     ("TTSC mu [%]", lambda r: f"{100 * r['mu']:g}" if r["mu"] else "healthy"),
+    ("  phase", lambda r: r["fault_phase"] or "-"),
     ("  k_rf", lambda r: _faulty(r["k_rf"], "g")),
     ("  kappa", lambda r: _faulty(r["kappa"], "g")),
     ("  h = mu/(k_rf + 1 - mu)", lambda r: _faulty(r["h"] or None, ".5f")),
 )
+
+
+def made_with(report: dict[str, Any]) -> list[str]:
+    """Return the lines that tell what a run was made with, and whether the model holds."""
+    from apu_casadi.conditions import day_words
+    from apu_casadi.validity import exchange_words
+
+    solver, error = report["solver"] or {}, report["exchange_error"]
+    lines = []
+    if report["ambient"]:
+        lines.append(f"ambient: {day_words(report['ambient'])}")
+    if solver:
+        lines.append(
+            f"solver {solver['solver']}, rtol {solver['rtol']:g}, atol {solver['atol']:g}; seed "
+            f"{'none' if report['seed'] is None else report['seed']}; apu-casadi "
+            f"{report['apu_casadi_version']}"
+        )
+    if error is not None:
+        lines.append(exchange_words(error, report["exchange"], report["dt"]))
+    left = ", ".join(
+        f"{d['quantity']} for {d['duration']:.4g} s from t = {d['first']:.6g} s"
+        for d in report["validity"]
+    )
+    lines.append(
+        f"beyond the model's limits: {left}" if left else "within the model's limits throughout"
+    )
+    return lines
 
 
 def table(rows: list[dict[str, Any]]) -> str:

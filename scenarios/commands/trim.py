@@ -7,7 +7,7 @@ The gas generator at governed speed against a shaft power, through 8 km at Mach 
 Two others instead, by the names of the outputs (SI units):
 
   apu trim --fix N_rpm=36050 --fix T4=1200
-  apu trim --fix Wf=0.04 --fix PW=cube
+  apu trim --fix Wf=0.045 --fix PW=cube
 
 The whole unit under an electrical load of each generator, or one generator at a terminal voltage:
 
@@ -24,6 +24,13 @@ from typing import Any
 
 from apu_casadi.errors import OperatingPointError, SignalError, nearest
 from scenarios import jsontext
+from scenarios.commands.given import (
+    ambient_arguments,
+    ambient_given,
+    ambient_line,
+    ambient_of,
+    program,
+)
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -37,10 +44,7 @@ SHOWN = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     number = float
-    parser.add_argument("--altitude", type=number, default=0.0, metavar="M", help="m")
-    parser.add_argument("--mach", type=number, default=0.0, help="flight Mach number")
-    parser.add_argument("--disa", type=number, default=0.0, metavar="K", help="ISA deviation, K")
-    parser.add_argument("--humidity", type=number, default=0.0, help="water per dry air, kg/kg")
+    ambient_arguments(parser)
     parser.add_argument("--power", type=number, metavar="W", help="shaft power, W")
     parser.add_argument("--speed", type=number, metavar="RPM", help="r/min (default: governed)")
     parser.add_argument("--load", type=number, metavar="W", help="electrical load per generator, W")
@@ -147,9 +151,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
     from apu_casadi.cycle import Y
     from apu_casadi.trimming import maximum_power, trim_gas_generator
 
-    ambient = {
-        "altitude": args.altitude, "Mach": args.mach, "dT_isa": args.disa, "war": args.humidity,
-    }  # fmt: skip
+    ambient = ambient_of(args)
     health, limits = _numbers("--health", args.health), _limits(args.limit)
     extra: dict[str, float] = {}
     if mode == "--load":
@@ -195,6 +197,9 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         report = {
             "outputs": values, "generator": extra, "residual": point.residual,
             "iterations": point.iterations, "inputs": {**ambient, "health": health},
+            "assumed": [n for n, v in ambient_given(args).items() if v is None],
+            "load": _load(args), "limits": _plain(limits),
+            "apu_casadi_version": program().split()[1],
         }  # fmt: skip
         if point.second is not None:
             report["second"] = point.second.values
@@ -212,6 +217,9 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
             + "; the one above is on the design point's side of the extreme value between them, "
             "unless that side is beyond a limit"
         )
+    print(ambient_line(ambient_given(args)))
+    ill = ", ".join(f"{n} = {v:g}" for n, v in health.items())
+    print(f"health: {ill or 'healthy'}; {_load_words(args)}{program()}")
     return 0
 
 
@@ -227,11 +235,40 @@ def _generator(args: argparse.Namespace) -> int:
     point = gen.steady_state(load, w_r=w_r, V_t=args.voltage)
     values = {"V_t": point.V_t, "V_ref": point.V_ref, **_scalars(point.y)}
     if args.json:
-        jsontext.show({"generator": values, "residual": point.residual})
+        report = {"generator": values, "residual": point.residual, "load": _load(args),
+                  "apu_casadi_version": program().split()[1]}  # fmt: skip
+        jsontext.show(report)
         return 0
     print(_table(values, list(values)))
     print(f"\nresidual {point.residual:.1e} 1/s")
+    print(f"{_load_words(args)}{program()}")
     return 0
+
+
+def _load(args: argparse.Namespace) -> dict[str, float] | None:
+    """The electrical load of each generator; None for the gas generator alone."""
+    if args.load is None:
+        return None
+    return {"power": args.load, "power_factor": args.power_factor}
+
+
+def _load_words(args: argparse.Namespace) -> str:
+    if args.load is None:
+        return ""
+    return (
+        f"load of each generator: {args.load / 1e3:g} kW at 230 V, power factor "
+        f"{args.power_factor:g}; "
+    )
+
+
+def _plain(limits: Any) -> dict[str, float | None]:
+    """The limits as they were applied; None where there is none."""
+    import dataclasses
+
+    return {
+        n: float(v) if v is not None and math.isfinite(v) else None
+        for n, v in dataclasses.asdict(limits).items()
+    }
 
 
 def _scalars(y: Mapping[str, Any]) -> dict[str, float]:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi import files
+from apu_casadi.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.control import GovernorParameters, governor
 from apu_casadi.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
@@ -49,7 +50,6 @@ __all__ = [
 
 HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
 INPUTS = ("Wf", "PW")
-AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 OPEN = 10.0  # standard deviation of an input that is not measured, of its magnitude: tells nothing
 SMOOTH = 0.4  # s; readings are averaged over this to find the noise that is relative to them
 MAX_DT = 0.2  # s; the model takes one step from sample to sample
@@ -357,13 +357,12 @@ def steady_truth(gg: GasGenerator, theta: np.ndarray) -> EngineData:
     """Steady points of a true engine at rated speed, by the trim solver; no noise."""
     points = [
         trim_gas_generator(
-            gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, theta, strict=True)),
-            dT_isa=5.0,
+            gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, theta, strict=True))
         )
         for PW in POWERS
     ]  # fmt: skip
     readings = {n: np.array([p[n] for p in points]) for n in (*OUTPUTS, *INPUTS)}
-    return EngineData("steady", np.arange(len(points), dtype=float), readings, {"dT_isa": 5.0})
+    return EngineData("steady", np.arange(len(points), dtype=float), readings, dict(DEFAULT_DAY))
 
 
 def transient_truth(
@@ -375,8 +374,7 @@ def transient_truth(
     """
     ss, par = gg.state_space, GovernorParameters()
     start = trim_gas_generator(
-        gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True)),
-        dT_isa=5.0,
+        gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True))
     )  # fmt: skip
     run = stepper(ss, 1, rtol=1e-9, atol=1e-11)
     x, Wf_I = start.x.copy(), float(start["Wf"])
@@ -384,14 +382,14 @@ def transient_truth(
     for k in range(K):
         PW = STEP[0] if t[k] < 0.3 else STEP[1]
         out = governor(N=float(x[0]), N_ref=gg.parameters.N, Wf_I=Wf_I, par=par)
-        u = ss.u.pack({"Wf": out.Wf, "PW": PW, "dT_isa": 5.0})
+        u = ss.u.pack({"Wf": out.Wf, "PW": PW})
         y = ss.y.unpack(np.array(ss.g(x, u, theta)).ravel())
         rows.append([y[n] for n in (*OUTPUTS, *INPUTS)])
         x = run(x, u, theta, dt).x_end
         Wf_I += dt * float(out.Wf_I_dot)
     values = np.array(rows).T
     readings = dict(zip((*OUTPUTS, *INPUTS), values, strict=True))
-    return EngineData("load step", t, readings, {"dT_isa": 5.0})
+    return EngineData("load step", t, readings, dict(DEFAULT_DAY))
 
 
 def noisy(

@@ -31,6 +31,7 @@ import casadi as ca
 import numpy as np
 from scipy.stats import chi2
 
+from apu_casadi.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.control import GovernorParameters
 from apu_casadi.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
@@ -62,7 +63,6 @@ __all__ = [
 DT = 0.02  # s; step of the gas-path filter (paper, section 3.3)
 HEALTH = GasGenerator.THETA.names
 OUTPUTS = ("N", "P3", "T3", "T5")
-AMBIENT = ("altitude", "Mach", "dT_isa", "war")
 GAINED = ("P3", "T3", "T5", "Wf")
 POWER = ("measured", "unknown")
 GOVERNOR = GovernorParameters()
@@ -313,7 +313,7 @@ class GasPathFilter(Parametric):
         gains : actual relative gain errors by sensor.
         power : measured mean shaft power, W, of each window and its standard deviation, shapes
             (K,) or (K - 1,), instead of the sensor set's.
-        ambient : altitude, Mach, dT_isa, war; the paper's ISA + 5 K by default.
+        ambient : altitude, Mach, dT_isa, war; the default day where nothing is given.
         jumps : instants, s, at which the filter is told that the health may have jumped.
         power_jumps : instants, s, and relative standard deviations of a change of ``gain_PW``,
             where that is estimated.
@@ -365,7 +365,7 @@ class GasPathFilter(Parametric):
         inputs |= {"Wf": (t, reading["Wf"]), "sigma_Wf": (t, sigma["Wf"])}
         if self.known_power:
             inputs |= {"PW": (t, reading["PW"]), "sigma_PW": (t, sigma["PW"])}
-        given = {"dT_isa": 5.0} | dict(ambient or {})
+        given = {**DEFAULT_DAY, **(ambient or {})}
         return record(
             self.model,
             outputs={n: (t, reading[n]) for n in OUTPUTS},
@@ -508,10 +508,10 @@ def null_direction(filt: GasPathFilter, x: Mapping[str, float], u: Mapping[str, 
     ----------
     filt : the filter.
     x : N and health factors.
-    u : Wf and ambient; the paper's ISA + 5 K by default.
+    u : Wf and ambient; the default day where nothing is given.
     """
     gg = filt.gg
-    v = gg.U.pack({"PW": 0.0, "dT_isa": 5.0, **u})
+    v = gg.U.pack({"PW": 0.0, **u})
     theta = gg.THETA.pack({n: x.get(n, 1.0) for n in HEALTH})
     N = np.array([x["N"]])
     z = engine_function(gg)(N, v, theta)[3]

@@ -29,6 +29,7 @@ from scipy.stats import chi2
 
 from apu_casadi.apu import Apu
 from apu_casadi.backend import Caller, compiled
+from apu_casadi.conditions import DEFAULT_DAY
 from apu_casadi.control import GovernorParameters, governor
 from apu_casadi.errors import EstimationError
 from apu_casadi.events import LoadChange
@@ -45,7 +46,6 @@ from estimators.recording import Recording
 from estimators.smoother import rts_smoother
 from estimators.ukf import unscented_kalman_filter
 from scenarios.estimation.gaspath import (
-    AMBIENT,
     DT,
     GAINED,
     HEALTH,
@@ -218,8 +218,8 @@ class MatchedTruth(Parametric):
         x, Wf_I, PW, jump, xi = carry[:nx], carry[nx], given[0], given[1:5], given[5:]
         fuel = governor(N=x[0], N_ref=N_ref, Wf_I=Wf_I, par=gov)
         u = model.u.stack(
-            dict.fromkeys(AMBIENT, ca.MX(0))
-            | {"dT_isa": ca.MX(5), "Wf": fuel.Wf, "PW": PW, "sigma_Wf": ca.MX(0),
+            {n: ca.MX(v) for n, v in DEFAULT_DAY.items()}
+            | {"Wf": fuel.Wf, "PW": PW, "sigma_Wf": ca.MX(0),
                "sigma_PW": ca.MX(0), "jump": ca.MX(1)}
         )  # fmt: skip
         w, p = ca.MX.zeros(len(model.w)), ca.MX(0, 1)
@@ -271,14 +271,14 @@ class EngineTruth(Parametric):
             N=N + dt / 2 * N_dot, N_ref=gg.parameters.N, Wf_I=Wf_I + dt / 2 * now.Wf_I_dot, par=gov
         )
         u = gg.U.stack(
-            dict.fromkeys(AMBIENT, ca.MX(0)) | {"dT_isa": ca.MX(5), "Wf": mid.Wf, "PW": given[0]}
+            {n: ca.MX(v) for n, v in DEFAULT_DAY.items()} | {"Wf": mid.Wf, "PW": given[0]}
         )
         N1, _, z1, residual = gg.step(N, u, given[1:], dt, z)
         Wf_I1 = Wf_I + dt * mid.Wf_I_dot
         # a meter reads the fuel of the instant
         end = governor(N=N1, N_ref=gg.parameters.N, Wf_I=Wf_I1, par=gov)
         y_end, _ = gg.g(N1, gg.U.stack(
-            dict.fromkeys(AMBIENT, ca.MX(0)) | {"dT_isa": ca.MX(5), "Wf": end.Wf, "PW": given[0]}
+            {n: ca.MX(v) for n, v in DEFAULT_DAY.items()} | {"Wf": end.Wf, "PW": given[0]}
         ), given[1:], z1)  # fmt: skip
         step = ca.Function(
             "engine_truth", [carry, given],
@@ -316,7 +316,7 @@ def _trimmed(gg: GasGenerator, health: np.ndarray, PW: float) -> Any:
     # without them the truth would be drawn from a narrower prior than the filter's
     return trim_gas_generator(
         gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, health.tolist(), strict=True)),
-        limits=Limits(T4_max=math.inf), dT_isa=5.0,
+        limits=Limits(T4_max=math.inf),
     )  # fmt: skip
 
 

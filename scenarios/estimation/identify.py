@@ -65,12 +65,13 @@ __all__ = [
     "snapshot_trials",
 ]
 
-#: Steady points by name: shaft power, W, and ambient conditions.  The first two are Tables 4 and 5.
+#: Steady points by name: shaft power, W, and ambient conditions, those of the default day where
+#: none are named.  The first two are Tables 4 and 5.
 POINTS: dict[str, dict[str, float]] = {
-    "design": {"PW": 500e3, "dT_isa": 5.0},
+    "design": {"PW": 500e3},
     "offdesign": {"PW": 222e3, "dT_isa": 5.0, "altitude": 8000.0, "Mach": 0.7},
-    "partload": {"PW": 222e3, "dT_isa": 5.0},
-    "idle": {"PW": 20e3, "dT_isa": 5.0},
+    "partload": {"PW": 222e3},
+    "idle": {"PW": 20e3},
 }
 
 #: What a gas-path filter has without the generators.
@@ -260,10 +261,7 @@ def gas_path_transient(
     dt, K = 0.02, round(seconds / 0.02)
     t = dt * np.arange(K)
     PW = from_power + (to_power - from_power) * np.clip((t - 0.5) / RAMP, 0, 1)
-    ends = [
-        trim_gas_generator(gg, {"N": gg.parameters.N, "PW": P}, dT_isa=5.0)
-        for P in (from_power, to_power)
-    ]
+    ends = [trim_gas_generator(gg, {"N": gg.parameters.N, "PW": P}) for P in (from_power, to_power)]
     Wf = np.interp(PW, [from_power, to_power], [e["Wf"] for e in ends])
     noise = {"Wf": sensors["Wf"].noise * ends[1]["Wf"]}
     noise["PW"] = power_noise * to_power if power else UNKNOWN_PW
@@ -276,7 +274,7 @@ def gas_path_transient(
     theta = np.ones(len(gg.THETA))
     for k in range(K):
         fuel = float(Wf[k]) + FUEL_GAIN * (gg.parameters.N - float(at[0]))
-        u[:, k] = gg.U.pack({"Wf": fuel, "PW": float(PW[k]), "dT_isa": 5.0})
+        u[:, k] = gg.U.pack({"Wf": fuel, "PW": float(PW[k])})
         x[0, k] = at[0]
         if k + 1 < K:
             at, _, z = gg.advance(at, u[:, k], theta, z, dt)

@@ -108,6 +108,11 @@ def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
         "gas_gains": json.dumps(case.gas_gains),
         "electrical_gains": json.dumps(case.electrical_gains),
     }  # fmt: skip
+    told = ("ambient", "loads", "faults", "solver", "apu_casadi_version", "exchange_error",
+            "validity", "warnings")  # fmt: skip
+    found.attrs |= {
+        f"truth_{n}" if n == "solver" else n: ds.attrs[n] for n in told if n in ds.attrs
+    }
     return found
 
 
@@ -157,9 +162,32 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         })  # fmt: skip
     return {
         "scenario": scenario["name"], "title": scenario.get("title", ""), "seed": e.attrs["seed"],
-        "phases": rows, "short_circuit": _short_circuit(e), "health": _health(e),
+        **made_with(e), "phases": rows, "short_circuit": _short_circuit(e), "health": _health(e),
         "cross_talk": _cross_talk(e),
     }  # fmt: skip
+
+
+def made_with(e: xr.Dataset) -> dict[str, Any]:
+    """Return what the truth was simulated with and what must be known of it, ready for JSON."""
+    told = {"ambient": "ambient", "loads": "loads", "validity": "validity", "warnings": "warnings",
+            "truth_solver": "truth_solver"}  # fmt: skip
+    out: dict[str, Any] = {k: json.loads(e.attrs.get(a, "null")) for k, a in told.items()}
+    return out | {"apu_casadi_version": e.attrs.get("apu_casadi_version", "")}
+
+
+def made_words(r: Mapping[str, Any]) -> str:
+    """Return what the truth of a report was simulated with, in words; "" if it is not recorded."""
+    from apu_casadi.conditions import day_words
+
+    if not (r.get("ambient") and r.get("loads")):
+        return ""
+    loads = ", ".join(f"{x['load']} from {x['t']:g} s" for x in r["loads"])
+    made_by = r.get("truth_solver") or {}
+    return (
+        f"Ambient {day_words(r['ambient'])}; load of each generator {loads}; truth by "
+        f"{made_by.get('solver')}, exchange {made_by.get('exchange')} every "
+        f"{1e3 * made_by.get('dt', 0.0):g} ms; apu-casadi {r['apu_casadi_version']}."
+    )
 
 
 def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:
@@ -363,5 +391,6 @@ def figure(kept: Mapping[str, Any]) -> Any:
         kept["t"],
         {n: np.array([np.nan if x is None else x for x in v]) for n, v in kept["curves"].items()},
         phases=[(p["name"], p["start"]) for p in r["phases"]], alarms=kept["alarms"],
-        note=f"Scenario {r['scenario']}, seed {r['seed']}; gain errors drawn for all sensors.",
+        note=f"Scenario {r['scenario']}, seed {r['seed']}; gain errors drawn for all sensors. "
+        + made_words(r),
     )  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from apu_casadi.conditions import AMBIENT
 from apu_casadi.errors import ParameterError, nearest
 from apu_casadi.gasgenerator import GasGenerator
 from estimators.belief import Belief
@@ -43,7 +44,7 @@ def recording_of(model: FilterModel, w: Windows, i: int, protocol: Protocol) -> 
         protocol.noise * (protocol.h_noise if n == "h" else sensors.sigma(n, float(np.mean(v))))
         for n, v in zip(OUTPUTS, np.nan_to_num(y), strict=True)
     ])  # fmt: skip
-    inputs = dict(zip(("altitude", "Mach", "dT_isa", "war"), w.ambient[:, i], strict=True))
+    inputs = dict(zip(AMBIENT, w.ambient[:, i], strict=True))
     inputs |= {
         "sigma_Wf": protocol.noise * sensors.sigma("Wf", float(np.mean(Wf))),
         "sigma_PW": protocol.noise * sensors.sigma("PW", float(np.mean(PW))),

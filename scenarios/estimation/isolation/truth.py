@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.backend import backend_in_use, compiled, mapped
+from apu_casadi.conditions import AMBIENT
 from apu_casadi.control import GovernorParameters
 from apu_casadi.errors import EstimationError
 from apu_casadi.gasgenerator import RESIDUAL_TOL, GasGenerator
@@ -167,7 +168,7 @@ def simulate_windows(
         raise EstimationError(f"isolation study: the engine's residual is {worst:.1e}")
     if not pr.electrical:
         reading[OUTPUTS.index("h")] = np.nan
-    ambient = u0[gg.U.indices(("altitude", "Mach", "dT_isa", "war"))]
+    ambient = u0[gg.U.indices(AMBIENT)]
     return Windows(np.asarray(labels, int), sizes, onset, reading, ambient)
 
 
