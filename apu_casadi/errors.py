@@ -50,6 +50,14 @@ class DataError(ApuError, ValueError):
     """A file is missing, damaged, or lacks a column."""
 
 
+class ApuWarning(UserWarning):
+    """A result is given, but something about it must be known."""
+
+
+class ValidityWarning(ApuWarning):
+    """A run left the range in which the model holds."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return ``"(did you mean X?)"`` for the valid name nearest to ``name``, or the list of all.
 

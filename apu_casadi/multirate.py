@@ -21,6 +21,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -30,7 +31,7 @@ import numpy as np
 
 from apu_casadi.apu import Apu
 from apu_casadi.control import governor
-from apu_casadi.errors import ScenarioError, SignalError, SimulationError, nearest
+from apu_casadi.errors import ApuWarning, ScenarioError, SignalError, SimulationError, nearest
 from apu_casadi.events import (
     Ambient,
     Event,
@@ -48,13 +49,11 @@ from apu_casadi.machinestep import (
     EXCHANGES,
     GRID_TOL,
     MEANS,
-    PHASORS,
-    RMS,
     WAVEFORMS,
     MachineStep,
-    phasors_of,
     ramped,
 )
+from apu_casadi.means import PARTS, PHASORS, RMS
 from apu_casadi.results import dataset
 from apu_casadi.signals import Signal
 
@@ -218,14 +217,11 @@ def simulate_joint(
     y, z = gg.output(x, u, theta, z0=point.gas.z)
     Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
     hot = gg.stepper if solver == "propagator" else None
-    book = _Book(gg, grid, machine.samples(grid), len(machine.quad))
+    book = _Book(gg, grid, machine.samples(grid), len(machine.kept))
     book.put(0, y, machine.means_at_rest(point.generator), factors, None)
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
     slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
-    if load != start_load or fault is not None:
-        machine.switch(load, fault)
-        slope = None
 
     free = hook is None and not (noise.N or noise.w1 or noise.w2)
     k = 0
@@ -238,9 +234,13 @@ def simulate_joint(
                 factors.update(event.factors)
                 theta = gg.THETA.pack(factors)
             elif isinstance(event, LoadChange):
-                machine.switch(event.load, machine.fault)
+                load = event.load
             elif isinstance(event, FaultChange):
-                machine.switch(machine.load, event.fault)
+                fault = event.fault
+        # all that comes at one instant is one switch, whatever its order
+        if load != machine.load or fault != machine.fault:
+            machine.switch(load, fault, t0)
+            slope = None
         until = pending[0].t if pending else duration
         if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + GRID_TOL:
             done = machine.block(x, z, Wf_I, u, theta, grid[k - 1 : k + BLOCK])
@@ -290,7 +290,10 @@ def simulate_joint(
         "residual_max": float(book.Y[gg.Y.index("residual")].max()), "seed": seed,
         "V_ref": machine.V_ref,
     }  # fmt: skip
-    return _collect(apu, book, noise, rng, attrs, status)
+    told = machine.warnings
+    for text in told:
+        warnings.warn(text, ApuWarning, stacklevel=2)
+    return _collect(apu, book, noise, rng, {"warnings": json.dumps(told), **(attrs or {})}, status)
 
 
 class _Book:
@@ -343,9 +346,9 @@ class _Book:
         """Means, rms values, phasors, health and severity by name."""
         d = dict(zip(MEANS, self.means, strict=False))
         n = len(MEANS) + len(RMS)
-        d |= dict(zip(RMS, np.sqrt(self.means[len(MEANS) : n]), strict=True))
+        d |= dict(zip(RMS, self.means[len(MEANS) : n], strict=True))
         if self.means.shape[0] > n:
-            d |= phasors_of(self.means[n:])
+            d |= dict(zip(PARTS, self.means[n:], strict=True))
         d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
         return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
 

@@ -20,6 +20,7 @@ LAYERS = (
     ("errors",),
     ("signals", "parameters"),
     ("statespace", "results", "backend"),
+    ("means",),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
     ("gas", "mapfiles"),
