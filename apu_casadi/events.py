@@ -80,6 +80,9 @@ def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
     return checked
 
 
+SAME_INSTANT = 1e-9  # s; events closer than this are at one instant
+
+
 @dataclass(frozen=True)
 class Ambient:
     """Ambient and flight conditions.
@@ -188,16 +191,27 @@ class FaultChange:
 Event = LoadChange | HealthChange | FaultChange
 
 
+def _refuse_second(i: int, e: Event, other: Event) -> None:
+    """Refuse what contradicts an event of its kind at its instant: the order would decide."""
+    if not isinstance(e, HealthChange) or not isinstance(other, HealthChange):
+        raise ScenarioError(f"events[{i}]: second {type(e).__name__} at t = {e.t:g} s")
+    for name, value in e.factors.items():
+        if other.factors.get(name, value) != value:
+            raise ScenarioError(
+                f"events[{i}]: at t = {e.t:g} s {name} = {value:g}, but {other.factors[name]:g} by "
+                "another event at that instant"
+            )
+
+
 def in_order(events: Iterable[Event], duration: float) -> tuple[Event, ...]:
     """Return the events sorted by time, equal times in the order given.
 
     Raises
     ------
-    ScenarioError : something that is no event, an event at or beyond ``duration`` [s], or two
-        load or two fault changes at one instant.
+    ScenarioError : something that is no event, an event at or beyond ``duration`` [s], two load or
+        two fault changes at one instant, or two values of one health factor.
     """
     events = tuple(events)
-    seen: set[tuple[type, float]] = set()
     for i, e in enumerate(events):
         if not isinstance(e, LoadChange | HealthChange | FaultChange):
             raise ScenarioError(
@@ -207,8 +221,12 @@ def in_order(events: Iterable[Event], duration: float) -> tuple[Event, ...]:
             raise ScenarioError(
                 f"events[{i}]: t = {e.t:g} s is not before the end of the run at {duration:g} s"
             )
-        key = (type(e), e.t)
-        if key in seen and not isinstance(e, HealthChange):
-            raise ScenarioError(f"events[{i}]: second {type(e).__name__} at t = {e.t:g} s")
-        seen.add(key)
-    return tuple(sorted(events, key=lambda e: e.t))
+    order = sorted(range(len(events)), key=lambda i: events[i].t)
+    for k, i in enumerate(order):
+        for m in range(k - 1, -1, -1):
+            j = order[m]
+            if events[i].t - events[j].t > SAME_INSTANT:
+                break
+            if type(events[i]) is type(events[j]):
+                _refuse_second(i, events[i], events[j])
+    return tuple(events[i] for i in order)

@@ -20,6 +20,7 @@ are the effective currents.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +34,15 @@ from apu_casadi.checked import number
 from apu_casadi.errors import OperatingPointError, ParameterError, SignalError, nearest
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import ttsc, wrsg
-from apu_casadi.machine.load import KINDS, V_MIN, ConstantPowerLoad, Load, OpenLoad, SeriesLoad
+from apu_casadi.machine.load import (
+    KINDS,
+    V_MIN,
+    ConstantPowerLoad,
+    Load,
+    OpenLoad,
+    SeriesLoad,
+    fineness,
+)
 from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
 from apu_casadi.machine.park import (
     Abc,
@@ -51,6 +60,11 @@ from apu_casadi.statespace import StateSpace
 
 FAULTS = (None, "coupled", "leaky")
 NEUTRALS = ("grounded", "isolated")
+
+SAME_INSTANT = 1e-9  # s; switches closer than this are one
+#: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to
+#: less than half of it makes 2.3.
+SPIKE = 3.0
 
 #: Mean phase voltage of Table 7's reference column at 225 kW, V rms: sets the default V_ref.
 V_TABLE_7 = (229.6704 + 229.6903 + 229.6704) / 3.0
@@ -230,29 +244,68 @@ class Generator(Parametric):
         u: Any,
         theta: Any,
         u_target: Any,
+        theta_target: Any = (),
     ) -> np.ndarray:
         """Return the state of ``target`` just after a switch, from that of ``source`` before it.
 
         States carry over by name: flux linkages, rotor angle, exciter.  A new i_fault starts from
-        the algebraic i_fault of the source if it had a fault, else from zero; a new load
-        conductance starts where it draws its power from the source's terminal voltage.
+        the algebraic i_fault of the source if it had a fault in that phase, else from zero; a new
+        load conductance starts where it draws its power from the source's terminal voltage.
 
         Parameters
         ----------
         x, u, theta : state, inputs and parameters of the source at the switch.
-        u_target : inputs of the target.
+        u_target, theta_target : inputs and parameters of the target; a fault without
+            ``theta_target`` is taken to be in the phase it was in.
         """
         values = source.x.unpack(np.asarray(x, dtype=float))
+        angles = [
+            s.theta.unpack(np.asarray(t, dtype=float))["phase_angle"]
+            for s, t in ((source, theta), (target, theta_target))
+            if len(s.theta) and np.size(t)
+        ]
+        moved = len(angles) == 2 and angles[0] != angles[1]
+        if moved:  # another branch: the one that was there is gone, with its current
+            values.pop("i_fault", None)
         new = [n for n in target.x.names if n not in values]
         if new:
             z = source.z.unpack(source.z_of(x, u, theta).full().ravel())
             y = source.y.unpack(source.g(x, u, theta).full().ravel())
-            start = {"i_fault": z.get("i_fault", 0.0)}
+            start = {"i_fault": 0.0 if moved else z.get("i_fault", 0.0)}
             if "G_load" in new:
                 V_2 = max(3.0 * y["V_t"] ** 2, 3.0 * (V_MIN * self.machine.V_rated_rms) ** 2)
                 start["G_load"] = target.u.unpack(np.asarray(u_target))["P_load"] / V_2
             values |= {n: start[n] for n in new}
         return target.x.pack({n: values[n] for n in target.x.names})
+
+    def spike(
+        self, ss: StateSpace, x: Any, u: Any, theta: Any, *, t: float, load: Load
+    ) -> str | None:
+        """Return a warning of a voltage spike just after a switch; None without one.
+
+        The flux linkages stay at a switch, hence also the currents, and a load of large resistance
+        gets R times the current that flowed before.  The model lets that current die away within
+        the subtransient inductance over R, nanoseconds for an open generator: so does the energy of
+        the magnetic field become heat in it.  What the spike's area does, to flux linkages and
+        voltage regulator, is right; its height is the model's alone, for an arc limits a real one.
+        No rms value and no phasor has it (:mod:`apu_casadi.means`).
+
+        Parameters
+        ----------
+        ss, x, u, theta : variant, state, inputs and parameters just after the switch.
+        t, load : its instant, s, and the load from then on; for the text.
+        """
+        y = ss.y.unpack(ss.g(x, u, theta).full().ravel())
+        k = max("abc", key=lambda p: abs(y[f"v_{p}"]))
+        v, rated = abs(y[f"v_{k}"]), math.sqrt(2.0) * self.machine.V_rated_rms
+        if v <= SPIKE * rated:
+            return None
+        return (
+            f"at t = {t:.6g} s a switch to {load!r} drives the {abs(y[f'i_{k}']):.4g} A of phase "
+            f"{k} through it: the model's voltage jumps to {v:.3g} V there, {v / rated:.3g} times "
+            "the rated peak, until that current has died away; a real switch arcs instead. Rms "
+            "values and phasors leave the spike out, single samples may not"
+        )
 
     # -- steady state -----------------------------------------------------------------------
 
@@ -403,15 +456,15 @@ class Generator(Parametric):
         t_end : end, s.
         switches : pairs (instant in s, what comes): a load replaces the load, a :class:`Ttsc`
             replaces the fault, None clears it, a mapping changes inputs (``w_r``, ``V_ref``,
-            process noise).  Several may share an instant; they then act in the order given.
+            process noise).  Several that share an instant are one switch, whatever their order.
         w_r, V_ref : as for :meth:`steady_state`.
         dt_out : output interval, s.
         solver, rtol, atol : as for :func:`apu_casadi.simulation.simulate`.
 
         Returns
         -------
-        xarray.Dataset : see :func:`apu_casadi.simulation.simulate`; attributes hold V_ref and the
-            switches.
+        xarray.Dataset : see :func:`apu_casadi.simulation.simulate`; attributes hold V_ref, the
+            switches and, as a JSON list, ``warnings`` (:meth:`spike`).
         """
         point = self.steady_state(load, w_r=w_r, V_ref=V_ref)
         n = round(t_end / dt_out)
@@ -423,33 +476,27 @@ class Generator(Parametric):
         fault: Ttsc | None = None
         other: dict[str, float] = {"w_r": point.u[0], "V_ref": point.V_ref}
         plan, ss, u, theta = [], point.ss, point.u, np.zeros(0)
-        for t, change in sorted(switches, key=lambda s: s[0]):
-            if change is None or isinstance(change, Ttsc):
-                fault = change
-            elif isinstance(change, SeriesLoad | ConstantPowerLoad | OpenLoad):
-                load = change
-            elif isinstance(change, Mapping):
-                other = {**other, **change}
-            else:
-                raise ParameterError(
-                    f"switch at t = {t:g} s: a load, a Ttsc, None or a mapping of inputs is "
-                    f"needed, got {change!r}"
-                )
+        loads, told = [load], list[str]()
+        for t, changes in _instants(switches):
+            fault = changes.get("fault", fault)
+            load = changes.get("load", load)
+            other = {**other, **changes.get("inputs", {})}
+            loads.append(load)
             new = self.variant(load, fault)
             u_new = self.inputs(load, **other)
             theta_new = self.fault_vector(load, fault)
-            plan.append(
-                simulation.Switch(
-                    float(t), u_new, theta_new, new, _Transfer(self, ss, new, u, theta, u_new)
-                )
-            )
+            transfer = _Transfer(self, ss, new, u, theta, u_new, theta_new, t, load, told)
+            plan.append(simulation.Switch(t, u_new, theta_new, new, transfer))
             ss, u, theta = new, u_new, theta_new
+        fine = min(fineness(each) for each in loads)
+        rtol, atol = fine * rtol, fine * atol
         data = simulation.simulate(
             point.ss, point.x, grid, point.u, switches=plan, solver=solver, rtol=rtol, atol=atol
         )
         data.attrs |= {
             "V_ref": point.V_ref,
             "neutral": self.neutral,
+            "warnings": json.dumps(told),
             "switches": "; ".join(f"{t:g} s: {c!r}" for t, c in switches),
         }
         return data
@@ -465,11 +512,56 @@ class _Transfer:
     u: np.ndarray
     theta: np.ndarray
     u_target: np.ndarray
+    theta_target: np.ndarray
+    t: float
+    load: Load
+    told: list[str]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        return self.generator.transfer(
-            x, self.source, self.target, u=self.u, theta=self.theta, u_target=self.u_target
+        after = self.generator.transfer(
+            x, self.source, self.target, u=self.u, theta=self.theta, u_target=self.u_target,
+            theta_target=self.theta_target,
+        )  # fmt: skip
+        text = self.generator.spike(
+            self.target, after, self.u_target, self.theta_target, t=self.t, load=self.load
         )
+        if text is not None:
+            self.told.append(text)
+        return after
+
+
+def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[str, Any]]]:
+    """Return the switches instant by instant, each with its load, fault and inputs.
+
+    Raises
+    ------
+    ParameterError : something that is no change, or two of a kind at one instant, whose order would
+        decide.
+    """
+    grouped: list[tuple[float, dict[str, Any]]] = []
+    for t, change in sorted(switches, key=lambda s: s[0]):
+        if not grouped or t - grouped[-1][0] > SAME_INSTANT:
+            grouped.append((float(t), {}))
+        now = grouped[-1][1]
+        if change is None or isinstance(change, Ttsc):
+            kind, twice = "fault", "fault" in now
+        elif isinstance(change, SeriesLoad | ConstantPowerLoad | OpenLoad):
+            kind, twice = "load", "load" in now
+        elif isinstance(change, Mapping):
+            kind, before = "inputs", now.get("inputs", {})
+            twice = any(before.get(k, v) != v for k, v in change.items())
+            change = {**before, **change}
+        else:
+            raise ParameterError(
+                f"switch at t = {t:g} s: a load, a Ttsc, None or a mapping of inputs is "
+                f"needed, got {change!r}"
+            )
+        if twice and now[kind] != change:
+            raise ParameterError(
+                f"two different changes of the {kind} at t = {t:g} s: {now[kind]!r} and {change!r}"
+            )
+        now[kind] = change
+    return grouped
 
 
 def _star(load: Load, V: float) -> tuple[float, float]:

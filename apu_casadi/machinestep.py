@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -20,8 +20,10 @@ from apu_casadi.apu import Apu
 from apu_casadi.errors import SimulationError
 from apu_casadi.generator import GeneratorPoint
 from apu_casadi.jointstep import BLOCK, BlockResult, JointBlock
+from apu_casadi.machine.load import fineness
+from apu_casadi.means import PARTS, RMS, as_dict, settled, wanted
 from apu_casadi.meanstep import MeanStep
-from apu_casadi.propagation import Propagator
+from apu_casadi.propagation import SPEED_RANGE, Propagator
 from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
 from apu_casadi.simulation import stepper
@@ -32,12 +34,7 @@ if TYPE_CHECKING:
     from apu_casadi.machine.ttsc import Ttsc
 
 WAVEFORMS = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_total")
-RMS = {"V_a_rms": "v_a^2", "V_b_rms": "v_b^2", "V_c_rms": "v_c^2",
-        "I_a_rms": "i_a^2", "I_b_rms": "i_b^2", "I_c_rms": "i_c^2"}  # fmt: skip
 MEANS = ("P_total", "P_e", "P_loss_fault")
-#: What phasors are made of: the means of products with cosine and sine of the rotor angle.
-PHASORS = {f"{q.upper()}_{p}": f"{q}_{p}" for q in "vi" for p in "abc"}
-MOMENTS = ("cos_cos", "cos_sin", *(f"{q}_{f}" for q in PHASORS.values() for f in ("cos", "sin")))
 
 
 class Exchange(NamedTuple):
@@ -67,6 +64,8 @@ EXCHANGES = {
 #: Samples in an exchange step of exact propagation when no waveforms are kept and a
 #: :class:`MeanStep` does not hold, by "is healthy".
 SUMMARY_SAMPLES = {True: 160, False: 200}
+#: Power of the torques over that of eq. (8), shares of the rated power, that is warned of.
+EXCESS = 0.01
 FINE_SAMPLE = 50e-6  # s; what stored waveforms are computed with, at most
 SETTLED = 5e-3  # s; so long after a switch CVODES goes on, in the middle of a step if need be
 _LOG = logging.getLogger("apu_casadi")
@@ -98,43 +97,6 @@ def ramped(ss: StateSpace) -> StateSpace:
     )
 
 
-@kept
-def with_moments(ss: StateSpace) -> StateSpace:
-    """Return a generator variant with the products in ``MOMENTS`` as further outputs."""
-    Y = Signals([*ss.y, *(Signal(n, "1", "product with the rotor angle's cosine or sine",
-                                 nominal=1.0 if n.startswith("cos") else ss.y[n[:3]].nominal)
-                          for n in MOMENTS)])  # fmt: skip
-    x, u, theta = (ca.SX.sym(k, len(s)) for k, s in (("x", ss.x), ("u", ss.u), ("t", ss.theta)))
-    y, angle = ss.g(x, u, theta), x[ss.x.index("theta_e")]
-    cos, sin = ca.cos(angle), ca.sin(angle)
-    products = [cos * cos, cos * sin]
-    for name in PHASORS.values():
-        products += [y[ss.y.index(name)] * cos, y[ss.y.index(name)] * sin]
-    g = ca.Function(f"{ss.name}_moments_g", [x, u, theta], [ca.vertcat(y, *products)])
-    return dataclasses.replace(ss, name=f"{ss.name}_moments", y=Y, g=g)
-
-
-def phasors_of(moments: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the fundamental phasors by name, ``V_a_re``, ``V_a_im``, ..., rms values.
-
-    v_a = sqrt(2) Re(V_a exp(j theta_e)) with theta_e the rotor angle, in the sense of least squares
-    over the step: exact for a sinusoid at any speed, whatever part of a turn the step ends with.
-
-    Parameters
-    ----------
-    moments : means over each step, in the order of ``MOMENTS``, shape (14, steps).
-    """
-    cc, cs = moments[:2]
-    ss = 1.0 - cc
-    found = {}
-    for k, name in enumerate(PHASORS):
-        c, s = moments[2 + 2 * k : 4 + 2 * k]
-        determinant = math.sqrt(2.0) * (cc * ss - cs * cs)
-        found[f"{name}_re"] = (ss * c - cs * s) / determinant
-        found[f"{name}_im"] = -(cc * s - cs * c) / determinant
-    return found
-
-
 class MachineStep:
     """One of the two equal generators.
 
@@ -146,7 +108,7 @@ class MachineStep:
     dt : length of a whole exchange step, s.
     waveform_dt : sampling of the waveforms, s; None: none are wanted.
     solver, rtol, atol : integrator and its tolerances.
-    moments : whether the means of ``MOMENTS`` are wanted too.
+    phasors : whether phasors are wanted too.
     """
 
     def __init__(
@@ -160,7 +122,7 @@ class MachineStep:
         solver: str,
         rtol: float,
         atol: float,
-        moments: bool = False,
+        phasors: bool = False,
     ) -> None:
         """Take over the steady state; see the class."""
         self.apu, self.gen, self.way = apu, apu.generator, way
@@ -171,9 +133,12 @@ class MachineStep:
         self.fault: Ttsc | None = None
         self.dt, self.waveform_dt = dt, waveform_dt
         self.solver, self.rtol, self.atol = solver, rtol, atol
-        self.moments = moments
-        self.quad = (*MEANS, *RMS.values(), *(MOMENTS if moments else ()))
+        self.phasors = phasors
+        self.kept = (*MEANS, *RMS, *(PARTS if phasors else ()))  # what a step's means are
+        self._short = (1 - SPEED_RANGE) * self.gen.machine.w_rated * dt < 2 * math.pi
         self.nsteps = self.propagated = 0
+        self.spikes: list[str] = []
+        self.excess = (0.0, 0.0, 0.0, 0.0)  # largest of torque power over (8), both, instant
         self._fast: dict[str, Propagator | MeanStep | None] = {}
         self._kept = slice(None)
         self._block: JointBlock | None = None
@@ -187,7 +152,6 @@ class MachineStep:
         return self.solver == "propagator" and self.way == EXCHANGES["paper"]
 
     def _index(self) -> None:
-        self.model = with_moments(self.ss) if self.moments else self.ss
         self._angle = self.ss.x.index("theta_e")
         self._w = self.ss.u.index("w_r")
         self._rows = self.ss.y.indices(WAVEFORMS)
@@ -205,26 +169,73 @@ class MachineStep:
     def means_at_rest(self, point: GeneratorPoint) -> np.ndarray:
         """What a step's means would be in the steady state of a balanced load."""
         y = point.y
-        I2 = sum(y[f"i_{p}"] ** 2 for p in "abc") / 3
-        means = [*(y[n] for n in MEANS), *[y["V_t"] ** 2] * 3, *[I2] * 3]
-        if self.moments:
-            means += [0.5, 0.0]
+        I = math.sqrt(sum(y[f"i_{p}"] ** 2 for p in "abc") / 3)
+        means = [*(y[n] for n in MEANS), *[y["V_t"]] * 3, *[I] * 3]
+        if self.phasors:
             for q in "vi":
                 for p, ahead, behind in ("acb", "bac", "cba"):
                     # at rotor angle zero, where a steady state starts: v_a = a cos + b sin, and
                     # the other phases are a third of a turn before and behind it
                     b = (y[f"{q}_{ahead}"] - y[f"{q}_{behind}"]) / math.sqrt(3.0)
-                    means += [y[f"{q}_{p}"] / 2, b / 2]
+                    means += [y[f"{q}_{p}"] / math.sqrt(2.0), -b / math.sqrt(2.0)]
         return np.array(means)
 
-    def switch(self, load: Load, fault: Ttsc | None) -> None:
-        """Change load or fault at this instant; the flux linkages stay."""
-        target = self.gen.variant(load, fault)
+    def _quad(self, *, short: bool) -> tuple[str, ...]:
+        means = wanted(phasors=self.phasors, short=short, symmetric=self.symmetric)
+        return (*MEANS, *means, "T_e")
+
+    @property
+    def quad(self) -> tuple[str, ...]:
+        """What is averaged over a whole step."""
+        return self._quad(short=self._short)
+
+    def _settled(self, quad: tuple[str, ...], means: np.ndarray, turn: Any, t: Any) -> np.ndarray:
+        """Return what is kept of the means of steps that end at t, s, as ``kept``.
+
+        ``turn`` are the electrical periods in a step.
+        """
+        n, by_name = len(MEANS), as_dict(quad, means)
+        values = settled(by_name, turn=turn, symmetric=self.symmetric, phasors=self.phasors)
+        torque = 2.0 * by_name["T_e"] * self.w_r / self.gen.machine.n_pp
+        excess = np.atleast_1d(torque - by_name["P_total"])
+        k = int(np.argmax(excess))
+        if excess[k] > self.excess[0]:
+            both = (np.atleast_1d(v)[k] for v in (torque, by_name["P_total"], t))
+            self.excess = (float(excess[k]), *(float(v) for v in both))  # type: ignore[assignment]
+        return np.concatenate([means[:n], values])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What must be known of the steps so far."""
+        told = list(self.spikes)
+        more, torque, power, t = self.excess
+        if more > EXCESS * 2.0 * self.gen.machine.P_rated:
+            told.append(
+                f"eq. (8) gives too little: in the step that ends at t = {t:.6g} s the torque of "
+                f"the two generators takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
+                f"the gas generator is loaded, {power / 1e3:.4g} kW; {more / 1e3:.3g} kW are more "
+                f"than {100 * EXCESS:g} % of the rated power. Eq. (8) holds output and extra loss "
+                "of the fault only: near a short circuit the machine's own loss is missing"
+            )
+        return told
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the phases differ by rotation only."""
+        return self.fault is None and self.load.balanced and not self._noisy
+
+    def switch(self, load: Load, fault: Ttsc | None, t: float = 0.0) -> None:
+        """Change load and fault at the instant t, s; the flux linkages stay."""
+        target, theta = self.gen.variant(load, fault), self.gen.fault_vector(load, fault)
         u_new = self.gen.inputs(load, w_r=self.w_r, V_ref=self.V_ref)
         self.x = self.gen.transfer(
-            self.x, self.ss, target, u=self.u, theta=self.theta, u_target=u_new
-        )
-        self.ss, self.u, self.theta = target, u_new, self.gen.fault_vector(load, fault)
+            self.x, self.ss, target, u=self.u, theta=self.theta, u_target=u_new,
+            theta_target=theta,
+        )  # fmt: skip
+        self.ss, self.u, self.theta = target, u_new, theta
+        text = self.gen.spike(target, self.x, u_new, theta, t=t, load=load)
+        if text is not None:
+            self.spikes.append(text)
         self.load, self.fault = load, fault
         self._fast, self._block = {}, None
         self._since = 0.0
@@ -239,47 +250,61 @@ class MachineStep:
     def step(
         self, N: float, slope: float, h: float, t0: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Advance over [t0, t0 + h]: end state, means, sample times and waveforms.
+        """Advance over [t0, t0 + h]: end state, means as ``kept``, sample times and waveforms.
 
         The own state is left as it was: the caller may repeat the step.
         """
+        x, quad, means, t, w = self._step(N, slope, h, t0)
+        return x, self._settled(quad, means, h * self.w_r / (2 * math.pi), t0 + h), t, w
+
+    def _step(
+        self, N: float, slope: float, h: float, t0: float
+    ) -> tuple[np.ndarray, tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+        """Advance as :meth:`step`; with the raw means their names."""
         self.w_r = self.apu.w_r(N)
         self.u[self._w] = self.w_r
         full = abs(h - self.dt) < GRID_TOL
         if full and self._ready:
             done = self._propagate(t0)
             if done is not None:
-                return done
+                x, means, t, w = done
+                return x, self.quad, means.ravel(), t, w
         if full and self._may_follow:
             done = self._follow(t0)
             if done is not None:
                 self._since += h
-                return done
+                x, means, t, w = done
+                return x, self.quad, means, t, w
         self._since += h
-        x, means, t, w, nsteps = self._integrate(slope, h, t0)
+        quad = self._quad(short=h * self.w_r < 2 * math.pi)
+        x, means, t, w, nsteps = self._integrate(slope, h, t0, quad)
         self.nsteps += nsteps
-        return self._wrapped(x), means, t, w
+        return self._wrapped(x), quad, means, t, w
 
     def _integrate(
-        self, slope: float, h: float, t0: float
+        self, slope: float, h: float, t0: float, quad: tuple[str, ...], share: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-        """Integrate over h: end state, means, sample times, waveforms, steps of the solver."""
-        model = ramped(self.model) if self.way.ramp else self.model
+        """Integrate over h: end state, means, sample times, waveforms, steps of the solver.
+
+        h is the first ``share`` of the step.
+        """
+        model, fine = ramped(self.ss) if self.way.ramp else self.ss, fineness(self.load)
+        within = (0.0, share)
         run = stepper(
             model,
             self.n_out(h),
-            quad=self.quad,
+            quad=quad,
             solver="cvodes" if self.solver == "propagator" else self.solver,
-            rtol=self.rtol,
-            atol=self.atol,
+            rtol=fine * self.rtol,
+            atol=fine * self.atol,
         )
         if self.way.ramp:
             u = self.u.copy()
             u[self._w] = self.apu.w_r(slope)
-            r = run(np.append(self.x, self.w_r), u, self.theta, h, t0=t0)
+            r = run(np.append(self.x, self.w_r), u, self.theta, h, t0=t0, within=within)
         else:
-            r = run(self.x, self.u, self.theta, h, t0=t0)
-        means = np.array([r.mean[k] for k in self.quad])
+            r = run(self.x, self.u, self.theta, h, t0=t0, within=within)
+        means = np.array([r.mean[k] for k in quad])
         return r.x_end[: len(self.ss.x)], means, r.t, r.y[self._rows], int(r.stats.get("nsteps", 0))
 
     def _follow(self, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
@@ -287,15 +312,15 @@ class MachineStep:
         rest = self._means(self.dt - SETTLED)
         if rest is None or not rest.valid(self.w_r):
             return None
-        x, first, t, w, nsteps = self._integrate(0.0, SETTLED, t0)
+        share = SETTLED / self.dt
+        x, first, t, w, nsteps = self._integrate(0.0, SETTLED, t0, self.quad, share)
         try:
             x, then = rest(x, self.u, t0=t0 + SETTLED)
         except SimulationError as error:
             _LOG.debug("exact propagation refused the rest of a step: %s", error)
             return None
         self.nsteps += nsteps
-        share = SETTLED / self.dt
-        return self._wrapped(x), share * first + (1 - share) * then, t, w
+        return self._wrapped(x), share * first + (1 - share) * then.ravel(), t, w
 
     def block(
         self,
@@ -316,10 +341,15 @@ class MachineStep:
             return None
         if self._block is None:
             self._block = JointBlock(self.apu, fast)
+        N = x[0]
         done = self._block(x, z, Wf_I, self.x, u, theta, self.u)
         if done is not None:
             self.x = done.x_sg
             self.propagated += BLOCK
+            self.w_r = self.apu.w_r(float(N))
+            turn = self.dt * self.w_r / (2 * math.pi)
+            kept = self._settled(self.quad, done.means, turn, grid[1:])
+            done = done._replace(means=kept)
             if self.waveform_dt is not None:
                 n = fast.n_out
                 kept = np.arange(n)[self._kept]
@@ -355,9 +385,11 @@ class MachineStep:
         if key not in self._fast:
             dt = self.dt if length is None else length
             try:
+                first = 1 - dt / self.dt
                 self._fast[key] = MeanStep(
-                    self.gen, self.model, self.u, self.theta, dt=dt, quad=self.quad
-                )
+                    self.gen, self.ss, self.u, self.theta, dt=dt, quad=self.quad,
+                    within=(first, 1 - first),
+                )  # fmt: skip
             except SimulationError as error:
                 _LOG.info("samples are needed also for means: %s", error)
                 self._fast[key] = None
@@ -379,7 +411,7 @@ class MachineStep:
             self._kept = slice(every - 1, None, every)
             try:
                 self._fast[key] = Propagator(
-                    self.gen, self.model, self.u, self.theta, n_out=n, dt=self.dt,
+                    self.gen, self.ss, self.u, self.theta, n_out=n, dt=self.dt,
                     outputs=outputs, quad=self.quad, fine=fine,
                 )  # fmt: skip
             except SimulationError as error:

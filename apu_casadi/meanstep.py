@@ -25,6 +25,7 @@ import numpy as np
 from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import SimulationError
 from apu_casadi.generator import Generator
+from apu_casadi.means import Term, window
 from apu_casadi.propagation import (
     SPEED_RANGE,
     applicable,
@@ -83,17 +84,20 @@ def _filon(w: Any, h: float, k: int) -> tuple[list[Any], list[Any]]:
     return c, s
 
 
-def _constant_weights(dt: Any, w: Any, theta0: Any) -> Any:
-    """Weights (5, samples) of c0, c1, s1, c2, s2 in the mean over a step, the start included."""
+def _constant_weights(dt: Any, w: Any, theta0: Any, highest: int) -> Any:
+    """Weights of c0, c1, s1, ... in the mean over a step, the start included.
+
+    Shape (2 highest + 1, samples).
+    """
     intervals = [n * 4 for n, _ in PANELS]
-    weights = [[ca.SX(0)] * (1 + sum(intervals)) for _ in range(5)]
+    weights = [[ca.SX(0)] * (1 + sum(intervals)) for _ in range(2 * highest + 1)]
     t, first = 0.0, 0
     for number, share in PANELS:
         h = share / 4
-        local = [_filon(w * dt, h, k) for k in range(3)]
+        local = [_filon(w * dt, h, k) for k in range(highest + 1)]
         for _ in range(number):
             middle = theta0 + w * dt * (t + 2 * h)
-            for k in range(3):
+            for k in range(highest + 1):
                 c, s = ca.cos(k * middle), ca.sin(k * middle)
                 for i, (a, b) in enumerate(zip(*local[k], strict=True)):
                     # exp(j k (middle + w t)): real part with c_k, imaginary part with s_k
@@ -106,8 +110,57 @@ def _constant_weights(dt: Any, w: Any, theta0: Any) -> Any:
     return ca.vertcat(*(ca.horzcat(*row) for row in weights))
 
 
-def _harmonics(ss: StateSpace, x: Any, u: Any, th: Any, terms: Any, weights: Any) -> Any:
-    """Sum of the harmonics of some terms at one sample, each with its weight; shape (terms,)."""
+def _shares() -> np.ndarray:
+    """Share of the step that has passed at each sample of a step with constant coefficients."""
+    ends = np.cumsum([0.0, *(share for n, share in PANELS for _ in range(n))])
+    inside = ends[:-1, None] + np.diff(ends)[:, None] * np.arange(1, 5) / 4
+    return np.append(0.0, inside.ravel())
+
+
+def _shifted(weights: Any, term: Term, highest: int) -> list[Any]:
+    """Weights of c0, c1, s1, ... in the mean of a term's value times its harmonic.
+
+    By the addition theorems, from those of all harmonics; ``highest`` is that of the value itself.
+    """
+    m = term.k
+
+    def C(k: int) -> Any:
+        return weights[max(0, 2 * abs(k) - 1)]
+
+    def S(k: int) -> Any:
+        return (1 if k > 0 else -1) * weights[2 * abs(k)] if k else ca.SX(0)
+
+    if not term.trig:
+        return [weights[i] for i in range(2 * highest + 1)]
+    out = []
+    for k in range(highest + 1):
+        cos = C(k - m) + C(k + m) if term.trig == "cos" else S(m + k) + S(m - k)
+        sin = S(k + m) + S(k - m) if term.trig == "cos" else C(k - m) - C(k + m)
+        out += [cos / 2, sin / 2] if k else [cos / 2]
+    return out
+
+
+def _harmonics(
+    ss: StateSpace, at_sample: tuple[Any, Any, Any], quad: Sequence[str], weights: Any, share: Any
+) -> Any:
+    """What each mean of ``quad`` gets from one sample (x, u, theta); shape (means,)."""
+    x, u, th = at_sample
+    asked = [Term.of(q) for q in quad]
+    own = list(dict.fromkeys((q.base, q.power) for q in asked))
+    y = ss.g(x, u, th)
+    values = ca.vertcat(*(Term(b, n, "", 0, False).value(ss, y) for b, n in own))
+    parts = _parts(ss, x, u, th, ca.Function("terms", [x, u, th], [values]))
+    light = weights * window(share)
+    total = []
+    for q in asked:
+        own_parts = parts[own.index((q.base, q.power))]
+        factors = _shifted(light if q.weighted else weights, q, len(own_parts) // 2)
+        total.append(sum(f * p for f, p in zip(factors, own_parts, strict=True)))
+    return ca.vertcat(*total)
+
+
+def _parts(ss: StateSpace, x: Any, u: Any, th: Any, terms: ca.Function) -> list[list[Any]]:
+    """Coefficients c0, c1, s1, c2, s2 of each term, at one sample; c0 alone where that is all."""
     at = ss.x.index("theta_e")
     phi = 2 * math.pi * np.arange(_PHASES) / _PHASES
     values = []
@@ -123,10 +176,10 @@ def _harmonics(ss: StateSpace, x: Any, u: Any, th: Any, terms: Any, weights: Any
         xd[at] = angle
         seen.append(np.asarray(terms(xd, ud, np.ones(len(ss.theta)))).ravel())
     plain = np.ptp(seen, axis=0) <= 1e-9 * np.abs(seen).max(axis=0)
-    total = []
+    found = []
     for i, flat in enumerate(plain):
         if flat:
-            total.append(weights[0] * values[0][i])
+            found.append([values[0][i]])
             continue
         f = [v[i] for v in values]
         parts = [sum(f) / _PHASES]
@@ -134,15 +187,15 @@ def _harmonics(ss: StateSpace, x: Any, u: Any, th: Any, terms: Any, weights: Any
             for trig in (np.cos, np.sin):
                 parts.append(sum(2 / _PHASES * float(trig(k * p)) * v
                                  for p, v in zip(phi, f, strict=True)))  # fmt: skip
-        total.append(sum(weights[j] * p for j, p in enumerate(parts)))
-    return ca.vertcat(*total)
+        found.append(parts)
+    return found
 
 
 def _constant_step(gen: Generator, ss: StateSpace, quad: tuple[str, ...]) -> ca.Function:
     nx, nu, n_P = len(ss.x), len(ss.u), parity(ss, 1).even.size
     X0, U, dt = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("dt")
     series = ca.MX.sym("series", len(PANELS) * 4 * n_P)
-    ranges = ca.MX.sym("range", 2)
+    ranges = ca.MX.sym("range", 4)  # of the speed; and where the step lies in a longer one
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
     s = (w - ranges[0]) / ranges[1]
     powers = ca.vertcat(1, s, s**2, s**3)
@@ -164,13 +217,16 @@ def _constant_step(gen: Generator, ss: StateSpace, quad: tuple[str, ...]) -> ca.
             samples.append(four)
     X = ca.horzcat(*samples)
     w_, d_, t_ = ca.SX.sym("w"), ca.SX.sym("dt"), ca.SX.sym("theta0")
-    weights = ca.Function("weights", [d_, w_, t_], [_constant_weights(d_, w_, t_)], {"cse": True})
-    W = ca.SX.sym("W", 5)
+    highest = 2 + max((Term.of(q).k for q in quad), default=0)  # a square has two
+    rows = _constant_weights(d_, w_, t_, highest)
+    weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
+    W, share = ca.SX.sym("W", 2 * highest + 1), ca.SX.sym("share")
     means = ca.Function(
-        "harmonics", [x, W, u], [_harmonics(ss, x, u, ca.SX(0, 1), _terms(ss, quad), W)],
+        "harmonics", [x, W, share, u], [_harmonics(ss, (x, u, ca.SX(0, 1)), quad, W, share)],
         {"cse": True},
     )  # fmt: skip
-    each = means.map("each", "serial", X.shape[1], [2], [])(X, weights(dt, w, X0[at]), U)
+    shares = ranges[2] + ranges[3] * ca.DM(_shares()).T
+    each = means.map("each", "serial", X.shape[1], [3], [])(X, weights(dt, w, X0[at]), shares, U)
     return ca.Function(
         f"means_{ss.name}",
         [X0, ca.vertcat(series, ranges), U, dt],
@@ -178,17 +234,6 @@ def _constant_step(gen: Generator, ss: StateSpace, quad: tuple[str, ...]) -> ca.
         ["x0", "series", "u", "dt"],
         ["x", "mean", "miss"],
     )
-
-
-def _terms(ss: StateSpace, quad: Sequence[str]) -> ca.Function:
-    """Function (x, u, theta) -> what is to be averaged: outputs, or squares (``"v_a^2"``)."""
-    x, u, th = (ca.SX.sym(k, len(s)) for k, s in (("x", ss.x), ("u", ss.u), ("t", ss.theta)))
-    y, terms = ss.g(x, u, th), []
-    for q in quad:
-        base, _, power = q.partition("^")
-        v = y[ss.y.index(base)]
-        terms.append(v**2 if power else v)
-    return ca.Function("terms", [x, u, th], [ca.vertcat(*terms)])
 
 
 # ------------------------------------------------------------------------------ periodic
@@ -298,9 +343,9 @@ def _periodic_step(
     pairs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
     sizes = 4 * 2 * pairs[0] * n_even, 4 * 2 * pairs[1] * n_odd
     X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
-    parameters, DT = ca.MX.sym("series", sum(sizes) + 2), ca.MX.sym("dt")
+    parameters, DT = ca.MX.sym("series", sum(sizes) + 4), ca.MX.sym("dt")
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
-    s = (w - parameters[-2]) / parameters[-1]
+    s = (w - parameters[-4]) / parameters[-3]
     theta0, stride = X0[at], 2 * math.pi / STRIDES
     # transition matrices of the strides in half a turn, the same for every half turn
     half_turn = STRIDES // 2
@@ -337,9 +382,13 @@ def _periodic_step(
     length = DT / h_now
     weights = _end_weights(turn)(length)
     held, HELD = ([u, th], [U, TH]) if nt else ([u], [U])
-    V_t = ss.g(x, u, th)[ss.y.index("V_t")]
-    y = ca.Function("y", [x, *held], [ca.vertcat(_terms(ss, quad)(x, u, th), V_t)], {"cse": True})
-    Y = y.map("ys", "serial", turn.samples, list(range(1, 1 + len(held))), [])(X, *HELD)
+    outputs, share = ss.g(x, u, th), ca.SX.sym("share")
+    terms = [Term.of(q).expression(ss, x, outputs, share) for q in quad]
+    terms.append(outputs[ss.y.index("V_t")])
+    y = ca.Function("y", [x, share, *held], [ca.vertcat(*terms)], {"cse": True})
+    # beyond the end of the step the weight goes on as the polynomial that it is
+    shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
+    Y = y.map("ys", "serial", turn.samples, list(range(2, 2 + len(held))), [])(X, shares, *HELD)
     mean = ca.mtimes(Y[:-1, :], weights[0, :].T) / length
     # the end of the step, with the phases as they are after so many half turns
     tail = np.arange(turn.first, turn.samples)
@@ -399,7 +448,8 @@ class MeanStep(Rebuilt):
     gen, ss : generator and its model variant (:meth:`Generator.variant`).
     u, theta : inputs and fault parameters; only w_r and V_ref may change afterwards.
     dt : length of every step, s.
-    quad : outputs (or squares, ``"v_a^2"``) whose mean over the step is returned.
+    quad : what is averaged over the step, see :mod:`apu_casadi.means`.
+    within : where this step begins in a longer one, and which share of it it is; for weights.
 
     Raises
     ------
@@ -419,6 +469,7 @@ class MeanStep(Rebuilt):
         *,
         dt: float,
         quad: Sequence[str],
+        within: tuple[float, float] = (0.0, 1.0),
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
         if not applicable(ss):
@@ -446,7 +497,7 @@ class MeanStep(Rebuilt):
             full = [(tables[0].even, harmonics + 2), (tables[0].odd, harmonics)]
             series = [_filled(part, terms) for part, terms in full]
         self._range = tables[0].centre, tables[0].half
-        self.parameters = np.concatenate([*series, self._range])
+        self.parameters = np.concatenate([*series, self._range, within])
         shape = 0.0 if self.constant else dt  # the panels are shares of the step
         self.layout = (gen, ss, self.quad, shape, harmonics)
         self.advance = _function(*self.layout)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,9 @@ from apu_casadi.events import (
     in_order,
 )
 from apu_casadi.gasgenerator import RESIDUAL_TOL
-from apu_casadi.multirate import MEANS, RMS, exchange_grid
+from apu_casadi.machine.load import fineness
+from apu_casadi.means import RMS, Term, as_dict, settled, wanted
+from apu_casadi.multirate import MEANS, exchange_grid
 from apu_casadi.results import dataset
 from apu_casadi.sharing import kept
 from apu_casadi.signals import Signal, Signals
@@ -66,17 +69,21 @@ def joint_state_space(
     ----------
     apu : the unit.
     load_kind, faulted : variant of the generator, see :mod:`apu_casadi.generator`.
-    integrals : outputs of the generator (``"P_total"``, ``"v_a^2"`` for a square) whose time
-        integrals are carried as further states ``int_P_total``, ``int_v_a_2``.  As states they cost
-        IDAS nothing; as quadratures every step would solve the gas path once more.
+    integrals : what of the generator is to be averaged, see :mod:`apu_casadi.means`: the time
+        integrals are carried as further states ``int_P_total``, ``int_v_a^2``, and with them the
+        time ``t_step`` since the step's start; the step's length ``h_step`` is then an input.  As
+        states they cost IDAS nothing; as quadratures every step would solve the gas path once more.
     """
     gg, gen = apu.gas_generator, apu.generator.state_space(load_kind, faulted)
     own_u = Signals([s for s in gen.u if s.name != "w_r"])
+    clock_signal = Signal("t_step", "s", "time since the step's start", nominal=0.02)
     X = Signals([
         *gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x,
+        *([clock_signal] if integrals else []),
         *(_integral(gen, name) for name in integrals),
     ])  # fmt: skip
-    U = Signals([*(gg.U[n] for n in AMBIENT), *own_u])
+    length = [Signal("h_step", "s", "length of the step", nominal=0.02)] if integrals else []
+    U = Signals([*(gg.U[n] for n in AMBIENT), *own_u, *length])
     TH, Y = Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
     x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
@@ -84,22 +91,21 @@ def joint_state_space(
     N, Wf_I, x_sg = x[0], x[1], x[2 : 2 + len(gen.x)]
     n_health = len(gg.THETA)
     health, fault = theta[:n_health], theta[n_health:]
-    inputs = dict(zip(own_u.names, ca.vertsplit(u[len(AMBIENT) :]), strict=True))
+    own = u[len(AMBIENT) : len(AMBIENT) + len(own_u)]
+    inputs = dict(zip(own_u.names, ca.vertsplit(own), strict=True))
     u_sg = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
     y_sg = gen.g(x_sg, u_sg, fault)
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
     PW = apu.PW(y_sg[gen.y.index("P_total")])
     u_gg = ca.vertcat(fuel.Wf, PW, u[: len(AMBIENT)])
 
-    def integrand(name: str) -> Any:
-        base, square, _ = name.partition("^2")
-        value = y_sg[gen.y.index(base)]
-        return value**2 if square else value
+    clock = [ca.MX(1.0)] if integrals else []
+    share = x[X.index("t_step")] / u[U.index("h_step")] if integrals else ca.MX(0)
 
     def model(z: Any) -> tuple[Any, Any, Any]:
         N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
-        rates = [integrand(name) for name in integrals]
-        ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_sg, u_sg, fault), *rates)
+        rates = [Term.of(name).expression(gen, x_sg, y_sg, share) for name in integrals]
+        ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_sg, u_sg, fault), *clock, *rates)
         return ode, alg, ca.vertcat(y_gg, y_sg)
 
     z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
@@ -110,15 +116,14 @@ def joint_state_space(
 
 
 def _integral(gen: StateSpace, name: str) -> Signal:
-    base, square, _ = name.partition("^2")
-    signal, power = gen.y[base], 2 if square else 1
+    term = Term.of(name)
+    unit = "1" if term.base == "1" else gen.y[term.base].unit
     # over one output interval, some 20 ms, and not over the run: hence the factor
-    unit = f"{signal.unit}^2 s" if square else f"{signal.unit} s"
     return Signal(
-        f"int_{name.replace('^2', '_2')}",
-        unit,
+        f"int_{re.sub(r'[~^*]', '_', name)}",
+        f"{unit}^2 s" if term.power == 2 else f"{unit} s",
         f"time integral of {name}",
-        nominal=0.02 * signal.nominal**power,
+        nominal=0.02 * term.nominal(gen),
     )
 
 
@@ -168,7 +173,7 @@ def simulate_monolithic(
     grid = exchange_grid(duration, dt, pending)
     point = apu.steady_state(load, ambient=ambient, health=factors)
     V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
-    quad = (*MEANS, *RMS.values())
+    quad = (*MEANS, *wanted(phasors=False, short=True, symmetric=False))
     amb = dataclasses.astuple(ambient)
     fault: Ttsc | None = None
 
@@ -178,33 +183,33 @@ def simulate_monolithic(
         u_sg = gen.inputs(load, w_r=w_r, V_ref=V_ref)
         rest = np.delete(u_sg, gen.variant(load, fault).u.index("w_r"))
         theta = np.concatenate([gg.THETA.pack(factors), gen.fault_vector(load, fault)])
-        return ss, gen.variant(load, fault), np.concatenate([amb, rest]), theta
+        return ss, gen.variant(load, fault), np.concatenate([amb, rest, [dt]]), theta
 
     ss, sg, u, theta = variant()
-    x = np.concatenate([point.gas.x, [point.gas["Wf"]], point.generator.x, np.zeros(len(quad))])
+    zero = np.zeros(1 + len(quad))
+    x = np.concatenate([point.gas.x, [point.gas["Wf"]], point.generator.x, zero])
     K = grid.size - 1
     Y = np.empty((len(gg.Y), K + 1))
-    means = {name: np.empty(K + 1) for name in quad}
+    averages = {name: np.empty(K + 1) for name in (*MEANS, *RMS)}
     Y[:, 0] = point.gas.y
     y0 = point.generator.y
-    I_2 = sum(y0[f"i_{p}"] ** 2 for p in "abc") / 3
-    first = {**y0, **dict.fromkeys(("v_a^2", "v_b^2", "v_c^2"), y0["V_t"] ** 2)}
-    first |= dict.fromkeys(("i_a^2", "i_b^2", "i_c^2"), I_2)
-    for name in quad:
-        means[name][0] = first[name]
+    I = math.sqrt(sum(y0[f"i_{p}"] ** 2 for p in "abc") / 3)
+    for name in averages:
+        averages[name][0] = y0.get(name, y0["V_t"] if name[0] == "V" else I)
     worst, nsteps = 0.0, 0
     for k in range(1, K + 1):
         t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
         n_sg = len(sg.x)
+        old_load, old_fault, old, changed = load, fault, sg, False
         while pending and pending[0].t <= t0 + _GRID_TOL:
-            event = pending.pop(0)
-            old_load, old_fault, old = load, fault, sg
+            event, changed = pending.pop(0), True
             if isinstance(event, HealthChange):
                 factors.update(event.factors)
             elif isinstance(event, LoadChange):
                 load = event.load
             elif isinstance(event, FaultChange):
                 fault = event.fault
+        if changed:  # all that comes at one instant is one switch
             w_r = apu.w_r(float(x[0]))
             ss, sg, u, theta = variant()
             x_sg = gen.transfer(
@@ -212,20 +217,28 @@ def simulate_monolithic(
                 u=gen.inputs(old_load, w_r=w_r, V_ref=V_ref),
                 theta=gen.fault_vector(old_load, old_fault),
                 u_target=gen.inputs(load, w_r=w_r, V_ref=V_ref),
+                theta_target=gen.fault_vector(load, fault),
             )  # fmt: skip
-            x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(len(quad))]), len(sg.x)
-        x[2 + n_sg :] = 0.0
+            x, n_sg = np.concatenate([x[:2], x_sg, zero]), len(sg.x)
+        x[2 + n_sg :], u[-1] = 0.0, h
+        angle = float(x[ss.x.index("theta_e")])
+        fine = fineness(load)
+        run = stepper(ss, 1, solver=solver, rtol=fine * rtol, atol=fine * atol)
         try:
-            r = stepper(ss, 1, solver=solver, rtol=rtol, atol=atol)(x, u, theta, h, t0=t0)
+            r = run(x, u, theta, h, t0=t0)
         except SimulationError as error:
             raise _explained(apu, error, x, Y[:, :k], ambient, factors, grid[: k + 1]) from None
         x = r.x_end.copy()
         j = ss.x.index("theta_e")
+        turn = (x[j] - angle) / (2 * math.pi)
         x[j] = math.remainder(x[j], 2 * math.pi)
         nsteps += int(r.stats["nsteps"])
         Y[:, k] = r.y[: len(gg.Y), -1]
-        for name, total in zip(quad, x[2 + n_sg :], strict=True):
-            means[name][k] = total / h
+        means = as_dict(quad, x[3 + n_sg :, None] / h)
+        symmetric = fault is None and load.balanced
+        rms = settled(means, turn=turn, symmetric=symmetric, phasors=False)
+        for name, value in zip(averages, (*(means[n] for n in MEANS), *rms), strict=True):
+            averages[name][k] = value.item()
         worst = max(worst, float(Y[gg.Y.index("residual"), k]))
         if not worst <= RESIDUAL_TOL:
             failed = SimulationError(f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e}")
@@ -233,8 +246,7 @@ def simulate_monolithic(
         if progress is not None:
             progress(float(grid[k]), duration)
     values = dict(zip(gg.Y.names, Y, strict=True))
-    values |= {name: means[name] for name in MEANS}
-    values |= {name: np.sqrt(means[square]) for name, square in RMS.items()}
+    values |= averages
     told = runrecord.asked(load=first_load, fault=None, ambient=ambient, events=events)
     ds = dataset(
         {"time": grid},

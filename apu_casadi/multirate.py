@@ -34,6 +34,7 @@ from apu_casadi.apu import Apu
 from apu_casadi.checked import number
 from apu_casadi.control import governor
 from apu_casadi.errors import (
+    ApuWarning,
     ScenarioError,
     SignalError,
     SimulationError,
@@ -57,13 +58,11 @@ from apu_casadi.machinestep import (
     EXCHANGES,
     GRID_TOL,
     MEANS,
-    PHASORS,
-    RMS,
     WAVEFORMS,
     MachineStep,
-    phasors_of,
     ramped,
 )
+from apu_casadi.means import PARTS, PHASORS, RMS
 from apu_casadi.results import dataset
 from apu_casadi.runstorage import PIECE, RowFile, place, row_file
 from apu_casadi.signals import Signal
@@ -253,14 +252,11 @@ def simulate_joint(
     y, z = gg.output(x, u, theta, z0=point.gas.z)
     Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
     hot = gg.stepper if solver == "propagator" else None
-    book = _Book(gg, grid, machine.samples(grid), len(machine.quad), storage)
+    book = _Book(gg, grid, machine.samples(grid), len(machine.kept), storage)
     book.put(0, y, machine.means_at_rest(point.generator), factors, None)
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
     slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
-    if load != start_load or fault is not None:
-        machine.switch(load, fault)
-        slope = None
 
     free = hook is None and not (noise.N or noise.w1 or noise.w2)
     k = 0
@@ -273,9 +269,13 @@ def simulate_joint(
                 factors.update(event.factors)
                 theta = gg.THETA.pack(factors)
             elif isinstance(event, LoadChange):
-                machine.switch(event.load, machine.fault)
+                load = event.load
             elif isinstance(event, FaultChange):
-                machine.switch(machine.load, event.fault)
+                fault = event.fault
+        # all that comes at one instant is one switch, whatever its order
+        if load != machine.load or fault != machine.fault:
+            machine.switch(load, fault, t0)
+            slope = None
         until = pending[0].t if pending else duration
         if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + GRID_TOL:
             done = machine.block(x, z, Wf_I, u, theta, grid[k - 1 : k + BLOCK])
@@ -341,7 +341,8 @@ def simulate_joint(
     told = runrecord.asked(load=load, fault=fault, ambient=ambient, events=events, seed=seed)
     told |= {"exchange_error": lost, **(attrs or {})}
     ds = _collect(apu, book, run, noise, rng, told, status)
-    notes = validity.notes_of_exchange(lost, exchange, dt) if warn_exchange else []
+    notes = [ApuWarning(words) for words in machine.warnings]
+    notes += validity.notes_of_exchange(lost, exchange, dt) if warn_exchange else []
     starved = validity.fuel_limited(apu, grid, N_run, Wf_run)
     unserved = validity.unserved(load, events, grid, P_e)
     notes += [ValidityWarning(words) for words in (starved, unserved) if words]
@@ -485,9 +486,9 @@ class _Book:
         """Means, rms values, phasors, health and severity by name."""
         d = dict(zip(MEANS, self.means, strict=False))
         n = len(MEANS) + len(RMS)
-        d |= dict(zip(RMS, np.sqrt(self.means[len(MEANS) : n]), strict=True))
+        d |= dict(zip(RMS, self.means[len(MEANS) : n], strict=True))
         if self.means.shape[0] > n:
-            d |= phasors_of(self.means[n:])
+            d |= dict(zip(PARTS, self.means[n:], strict=True))
         d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
         return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
 

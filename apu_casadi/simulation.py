@@ -21,12 +21,18 @@ from apu_casadi.calling import Buffers
 from apu_casadi.checked import array
 from apu_casadi.errors import SignalError, SimulationError, nearest
 from apu_casadi.interrupts import watched
+from apu_casadi.means import Term
 from apu_casadi.sharing import PerThread, Rebuilt, building, keep, twin
 from apu_casadi.statespace import StateSpace
 
 SOLVERS = ("cvodes", "idas")
 RTOL = 1e-8
 ATOL = 1e-10
+
+#: How far the exact algebraic start is moved off, nominal units, before IDAS makes it consistent.
+#: From a residual of zero its line search can but fail; which start it dislikes is chance, so that
+#: there are several.
+_MOVES = (1e-6, -1e-5, 1e-4, 0.0)
 
 _CAUSES = {
     "TOO_MUCH_WORK": "the step limit was reached: a solution that grows without bound, or a very "
@@ -79,8 +85,9 @@ class Stepper(Rebuilt):
     ----------
     ss : the model.
     grid : increasing output instants as fractions of the step, the last one 1, shape (n,).
-    quad : outputs whose mean over the step is wanted; ``"v_a^2"`` means the square of ``v_a``.
-        They are integrated with the states and kept under error control.
+    quad : outputs whose mean over the step is wanted; ``"v_a^2"`` means the square of ``v_a``,
+        :mod:`apu_casadi.means` describes the rest.  They are integrated with the states and kept
+        under error control.
     solver : ``"cvodes"`` (explicit ODE) or ``"idas"`` (DAE).
     rtol, atol : tolerances; the absolute one is in units of the signals' nominal values.
     max_steps : solver steps allowed between two outputs.
@@ -126,8 +133,9 @@ class Stepper(Rebuilt):
         ss = self.ss
         sym = _symbols(ss)
         nx, nz, nu, nt = (len(s) for s in (ss.x, ss.z, ss.u, ss.theta))
-        p = sym.sym("p", nu + nt + 1)
+        p, time = sym.sym("p", nu + nt + 3), sym.sym("time")
         u, theta, dt = p[:nu], p[nu : nu + nt], p[nu + nt]
+        share = p[nu + nt + 1] + p[nu + nt + 2] * time
         xs = sym.sym("xs", nx)
         x = xs * ss.x.nominals
         dae = {"x": xs, "p": p}
@@ -150,28 +158,46 @@ class Stepper(Rebuilt):
             # good as the states: see OpenLoad.
             options |= {"suppress_algebraic": True, "calc_ic": True, "first_time": 1e-3}
         if self.quad:
-            y, terms = ss.g(x, u, theta), []
-            for name in self.quad:
-                base, _, power = name.partition("^")
-                if power not in ("", "2"):
-                    raise SignalError(f"mean of {name!r}: only a name or name^2 is understood")
-                value = y[ss.y.index(base)] / ss.y[base].nominal
-                terms.append(value**2 if power else value)
-            dae["quad"] = ca.vertcat(*terms)
+            y, asked = ss.g(x, u, theta), [Term.of(name) for name in self.quad]
+            terms = [q.expression(ss, x, y, share) / q.nominal(ss) for q in asked]
+            dae |= {"t": time, "quad": ca.vertcat(*terms)}
         name = f"{ss.name}_{self.solver}"
         F = ca.integrator(name, self.solver, dae, 0.0, list(self.grid), options)
         return _Buffered(F, ("x0", "p", "z0"), ("xf", "qf"))
 
-    def _solve(self, x0: np.ndarray, u: Any, theta: Any, dt: float) -> tuple[np.ndarray, ...]:
+    def _solve(
+        self,
+        x0: np.ndarray,
+        u: Any,
+        theta: Any,
+        dt: float,
+        within: tuple[float, float] = (0.0, 1.0),
+    ) -> tuple[np.ndarray, ...]:
         """Return states at the outputs, shape (nx, n), and the means asked for, scaled."""
-        z0 = np.zeros(0)
-        if self.solver == "idas":
-            z0 = self.ss.z_of(x0, u, theta).full().ravel() / self.ss.z.nominals
-        xf, qf = self._F(x0 / self.ss.x.nominals, np.concatenate([u, theta, [dt]]), z0)
+        scaled, p = x0 / self.ss.x.nominals, np.concatenate([u, theta, [dt], within])
+        if self.solver != "idas":
+            xf, qf = self._F(scaled, p, np.zeros(0))
+            return xf * self.ss.x.nominals[:, None], qf
+        z0 = self.ss.z_of(x0, u, theta).full().ravel() / self.ss.z.nominals
+        for last, move in enumerate(_MOVES, 1 - len(_MOVES)):
+            try:
+                xf, qf = self._F(scaled, p, z0 * (1.0 + move) + move)
+            except RuntimeError as error:
+                if last == 0 or "IDACalcIC" not in str(error):
+                    raise
+            else:
+                break
         return xf * self.ss.x.nominals[:, None], qf
 
     def __call__(
-        self, x0: Any, u: Any, theta: Any = (), dt: float = 0.02, *, t0: float = 0.0
+        self,
+        x0: Any,
+        u: Any,
+        theta: Any = (),
+        dt: float = 0.02,
+        *,
+        t0: float = 0.0,
+        within: tuple[float, float] = (0.0, 1.0),
     ) -> StepResult:
         """Integrate from ``t0`` to ``t0 + dt``.
 
@@ -181,6 +207,8 @@ class Stepper(Rebuilt):
             ``ss.x.pack`` and its like; shapes (nx,), (nu,), (nt,).
         dt : length of the step, s, > 0.
         t0 : time of the start, s; for the output instants and messages only.
+        within : where this step begins in a longer one, and which share of it it is; for the
+            weight of weighted means.
 
         Raises
         ------
@@ -196,7 +224,7 @@ class Stepper(Rebuilt):
             raise SimulationError(f"{ss.name}: step length must be > 0, got {dt!r} s")
         try:
             with watched():
-                x, means = self._solve(x0, u, theta, dt)
+                x, means = self._solve(x0, u, theta, dt, within)
         except RuntimeError as error:
             raise self._failure(error, x0, u, theta, dt, t0) from None
         if not np.all(np.isfinite(x)):
@@ -204,8 +232,7 @@ class Stepper(Rebuilt):
         mean: dict[str, float] = {}
         if self.quad:
             for name, value in zip(self.quad, means[:, -1], strict=True):
-                base, _, power = name.partition("^")
-                mean[name] = float(value) * ss.y[base].nominal ** (2 if power else 1)
+                mean[name] = float(value) * Term.of(name).nominal(ss)
         (y,) = self._g(x, u, theta)
         return StepResult(t0 + dt * self.grid, x, y, mean, self._F.stats())
 

@@ -22,6 +22,7 @@ LAYERS = (
     ("signals", "parameters", "mapcheck", "cachefolder", "calling", "files", "filearrays"),
     ("netcdf3", "runstorage"),
     ("statespace", "results", "backend", "runwords"),
+    ("means",),
     # solvers: they know nothing of turbines or windings, since those come above
     ("rootfinding", "discretisation", "simulation"),
     ("gas", "maptable"),

@@ -16,6 +16,12 @@ from apu_casadi.errors import ParameterError
 
 KINDS = ("resistive", "inductive", "constant_power")
 
+#: Largest resistance, ohm, of a phase.  Its voltage is R i, with a current that is a difference of
+#: flux linkages: the larger R, the more of the voltage is the integrator's error.
+R_MAX = 1e6
+#: Resistance, ohm, beyond which the tolerances of an integrator are tightened in proportion.
+R_FINE = 1e3
+
 
 def _check(where: str, value: object, *, above: float | None = None) -> None:
     value = number(where, value, error=ParameterError)
@@ -25,6 +31,16 @@ def _check(where: str, value: object, *, above: float | None = None) -> None:
         raise ParameterError(f"{where} = {value:g} must be >= 0")
     if above is not None and not value > above:
         raise ParameterError(f"{where} = {value:g} must be > {above:g}")
+
+
+def _check_R(where: str, value: object) -> None:
+    _check(where, value, above=0.0)
+    if float(value) > R_MAX:  # type: ignore[arg-type]
+        raise ParameterError(
+            f"{where} = {value:g} is beyond {R_MAX:g} ohm, where the voltage of an open phase "
+            f"would be rounding times resistance; give an open phase {R_MAX:g} ohm or less: at "
+            "230 V that draws 0.23 mA, which moves no voltage by 1e-5"
+        )
 
 
 def _three(where: str, values: object) -> None:
@@ -38,7 +54,7 @@ class SeriesLoad:
 
     Parameters
     ----------
-    R : ohm by phase, > 0.
+    R : ohm by phase, > 0, at most ``R_MAX``: an open phase is 1e5 or 1e6 ohm.
     L : H by phase, >= 0.
 
     Raises
@@ -54,7 +70,7 @@ class SeriesLoad:
         _three("SeriesLoad.R [ohm]", self.R)
         _three("SeriesLoad.L [H]", self.L)
         for k, r, l in zip("abc", self.R, self.L, strict=True):
-            _check(f"SeriesLoad.R_{k} [ohm]", r, above=0.0)
+            _check_R(f"SeriesLoad.R_{k} [ohm]", r)
             _check(f"SeriesLoad.L_{k} [H]", l)
 
     @classmethod
@@ -158,13 +174,13 @@ V_MIN = 0.3
 class OpenLoad:
     """No load: a bleed resistance per phase stands for the voltmeter.
 
-    Terminal voltage is then a small current times a large resistance.  CVODES gives it to its
-    tolerance; IDAS, whose error test sees the flux linkages only, to some 0.4 V with 10 kohm and
-    the default rtol = 1e-8: lower rtol or R in a comparison of the two.
+    Terminal voltage is then a small current times a large resistance, and an integrator sees the
+    current only: :func:`fineness` tightens its tolerances.
 
     Parameters
     ----------
-    R : ohm per phase, > 0; 1e4 ohm draws 16 W in all at rated voltage, 7e-5 of the rating.
+    R : ohm per phase, > 0, at most ``R_MAX``; 1e4 ohm draws 16 W in all at rated voltage, 7e-5 of
+        the rating.
     """
 
     R: float = 1e4
@@ -172,7 +188,7 @@ class OpenLoad:
 
     def __post_init__(self) -> None:
         """Check the range."""
-        _check("OpenLoad.R [ohm]", self.R, above=0.0)
+        _check_R("OpenLoad.R [ohm]", self.R)
 
     @property
     def inputs(self) -> dict[str, float]:
@@ -186,3 +202,15 @@ class OpenLoad:
 
 
 Load = SeriesLoad | ConstantPowerLoad | OpenLoad
+
+
+def fineness(load: Load) -> float:
+    """Return the factor, at most 1, on an integrator's tolerances that this load asks for.
+
+    ``R_FINE`` over the largest resistance, but not below 1e-2, where rounding begins: 1e-10 and
+    1e-12 beside the defaults.  An open phase's voltage is then right to 1e-5 up to ``R_MAX``.
+    """
+    if isinstance(load, ConstantPowerLoad):
+        return 1.0
+    R = max(load.R) if isinstance(load, SeriesLoad) else load.R
+    return min(1.0, max(1e-2, R_FINE / R))
