@@ -411,6 +411,22 @@ class _Book:
         now = self.Y[self.gg.Y.index("residual"), : self._end - self._first]
         return max(self._residual, float(now.max()))
 
+    def output(self, name: str) -> np.ndarray:
+        """One row of the run so far, by name: an output of the gas generator, a mean, ..."""
+        if self.file is None:
+            at = self.gg.Y.index(name) if name in self.gg.Y else None
+            row: np.ndarray = self.slow()[name] if at is None else self.Y[at]
+            return row[: self._end]
+        self._flush()
+        return self.file.read(name, 0, self._end)
+
+    def outputs_at(self, k: int) -> np.ndarray:
+        """The gas generator's outputs at instant k, in their order."""
+        if k >= self._first:
+            return self.Y[:, k - self._first].copy()
+        assert self.file is not None
+        return np.array([self.file.read(n, k, k + 1)[0] for n in self.gg.Y.names])
+
     def keep(self, name: str, values: np.ndarray) -> Any:
         """Keep more values, where the others are."""
         return values if self.file is None else self.file.add(name, values)
