@@ -23,7 +23,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -420,6 +420,10 @@ class _Book:
         self._flush()
         return self.file.read(name, 0, self._end)
 
+    def outputs(self) -> Mapping[str, np.ndarray]:
+        """The gas generator's outputs by name, each read when it is asked for."""
+        return _Outputs(self)
+
     def outputs_at(self, k: int) -> np.ndarray:
         """The gas generator's outputs at instant k, in their order."""
         if k >= self._first:
@@ -457,6 +461,24 @@ class _Book:
             d |= phasors_of(self.means[n:])
         d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
         return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
+
+
+class _Outputs(Mapping[str, np.ndarray]):
+    """Rows of a book by name."""
+
+    def __init__(self, book: _Book) -> None:
+        self._book = book
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._book.gg.Y:
+            raise KeyError(name)
+        return self._book.output(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._book.gg.Y.names)
+
+    def __len__(self) -> int:
+        return len(self._book.gg.Y)
 
 
 def _severity(fault: Ttsc | None) -> tuple[float, float, float]:

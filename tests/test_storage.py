@@ -265,6 +265,9 @@ def test_rows_and_columns_of_a_run_under_way(storage, tmp_path, monkeypatch):
         assert row.tolist() == [2 + 100.0 * j for j in range(k + 1)]
         for j in {0, k // 2, k}:
             assert book.outputs_at(j).tolist() == (np.arange(n) + 100.0 * j).tolist()
+    rows = book.outputs()
+    assert list(rows) == list(names) and "P_e" not in rows
+    assert rows[names[2]].tolist() == row.tolist()
     assert book.output("P_e").tolist() == [4.0 * k for k in range(K)]
     assert book.output("mu").tolist() == [0.0] * K
 
