@@ -251,6 +251,27 @@ def test_a_run_kept_in_a_file_has_the_same_bits(in_memory, piece, tmp_path, monk
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.nc", "b.nc"]
 
 
+@pytest.mark.parametrize("storage", ["memory", "file"])
+def test_rows_and_columns_of_a_run_under_way(storage, tmp_path, monkeypatch):
+    """What is asked of a run while it goes on does not depend on where its results are."""
+    monkeypatch.setattr(multirate, "PIECE", 11)
+    gg, K = Apu().gas_generator, 25
+    names, n = gg.Y.names, len(gg.Y)
+    where = "memory" if storage == "memory" else tmp_path
+    book = multirate._Book(gg, np.arange(K) * 0.02, 0, 9, where)
+    for k in range(K):
+        book.put(k, np.arange(n) + 100.0 * k, np.full(9, 4.0 * k), dict.fromkeys("abcd", 1.0), None)
+        row = book.output(names[2])
+        assert row.tolist() == [2 + 100.0 * j for j in range(k + 1)]
+        for j in {0, k // 2, k}:
+            assert book.outputs_at(j).tolist() == (np.arange(n) + 100.0 * j).tolist()
+    rows = book.outputs()
+    assert list(rows) == list(names) and "P_e" not in rows
+    assert rows[names[2]].tolist() == row.tolist()
+    assert book.output("P_e").tolist() == [4.0 * k for k in range(K)]
+    assert book.output("mu").tolist() == [0.0] * K
+
+
 def test_large_results_go_to_a_file_by_themselves(monkeypatch, tmp_path, caplog):
     kw = dict(duration=0.2, load=SeriesLoad.from_power(1e5), solver="propagator", waveform_dt=None)
     small = simulate_joint(Apu(), **kw)
