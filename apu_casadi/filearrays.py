@@ -224,11 +224,6 @@ class RowFile:
             raise DataError(f"row {name}: elements {start} to {start + a.size} of {n}")
         self.file.write(at + 8 * start, memoryview(a).cast("B") if a.size else b"")
 
-    def read(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Return elements of a row that have been written."""
-        at, n = self._rows[name]
-        return read(self.file, at, (n,), np.dtype(float), (slice(start, stop),))
-
     def add(self, name: str, values: np.ndarray) -> Any:
         """Write one more row at the end of the file; return it as a lazy array."""
         self._rows[name] = (self.size, values.size)

@@ -23,7 +23,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -457,26 +457,6 @@ class _Book:
         now = self.Y[self.gg.Y.index("residual"), : self._end - self._first]
         return max(self._residual, float(now.max()))
 
-    def output(self, name: str) -> np.ndarray:
-        """One row of the run so far, by name: an output of the gas generator, a mean, ..."""
-        if self.file is None:
-            at = self.gg.Y.index(name) if name in self.gg.Y else None
-            row: np.ndarray = self.slow()[name] if at is None else self.Y[at]
-            return row[: self._end]
-        self._flush()
-        return self.file.read(name, 0, self._end)
-
-    def outputs(self) -> Mapping[str, np.ndarray]:
-        """The gas generator's outputs by name, each read when it is asked for."""
-        return _Outputs(self)
-
-    def outputs_at(self, k: int) -> np.ndarray:
-        """The gas generator's outputs at instant k, in their order."""
-        if k >= self._first:
-            return self.Y[:, k - self._first].copy()
-        assert self.file is not None
-        return np.array([self.file.read(n, k, k + 1)[0] for n in self.gg.Y.names])
-
     def keep(self, name: str, values: np.ndarray) -> Any:
         """Keep more values, where the others are."""
         return values if self.file is None else self.file.add(name, values)
@@ -511,24 +491,6 @@ class _Book:
             d |= dict(zip(PARTS, self.means[n:], strict=True))
         d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
         return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
-
-
-class _Outputs(Mapping[str, np.ndarray]):
-    """Rows of a book by name."""
-
-    def __init__(self, book: _Book) -> None:
-        self._book = book
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self._book.gg.Y:
-            raise KeyError(name)
-        return self._book.output(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._book.gg.Y.names)
-
-    def __len__(self) -> int:
-        return len(self._book.gg.Y)
 
 
 def _severity(fault: Ttsc | None) -> tuple[float, float, float]:

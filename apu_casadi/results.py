@@ -285,7 +285,8 @@ class _Columns:
         if v.dims != ("time",) or v.dtype.kind not in "fiu":
             where = ", ".join(map(str, v.dims)) or "no dimension"
             raise DataError(
-                f"{_source(self.ds)}{name}: numbers on time expected, {v.dtype} on {where} found"
+                f"{_source(self.ds)}{name}: numbers on time are expected, "
+                f"{v.dtype} on {where} found"
             )
         values: np.ndarray = v.values
         if name not in _HEALTHY_NAN and not np.isfinite(values).all():

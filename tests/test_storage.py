@@ -252,24 +252,20 @@ def test_a_run_kept_in_a_file_has_the_same_bits(in_memory, piece, tmp_path, monk
 
 
 @pytest.mark.parametrize("storage", ["memory", "file"])
-def test_rows_and_columns_of_a_run_under_way(storage, tmp_path, monkeypatch):
-    """What is asked of a run while it goes on does not depend on where its results are."""
+def test_the_last_instant_is_at_hand_wherever_results_are(storage, tmp_path, monkeypatch):
+    """An error in the middle of a long run tells of the instant before."""
     monkeypatch.setattr(multirate, "PIECE", 11)
     gg, K = Apu().gas_generator, 25
-    names, n = gg.Y.names, len(gg.Y)
+    n = len(gg.Y)
     where = "memory" if storage == "memory" else tmp_path
     book = multirate._Book(gg, np.arange(K) * 0.02, 0, 9, where)
     for k in range(K):
         book.put(k, np.arange(n) + 100.0 * k, np.full(9, 4.0 * k), dict.fromkeys("abcd", 1.0), None)
-        row = book.output(names[2])
-        assert row.tolist() == [2 + 100.0 * j for j in range(k + 1)]
-        for j in {0, k // 2, k}:
-            assert book.outputs_at(j).tolist() == (np.arange(n) + 100.0 * j).tolist()
-    rows = book.outputs()
-    assert list(rows) == list(names) and "P_e" not in rows
-    assert rows[names[2]].tolist() == row.tolist()
-    assert book.output("P_e").tolist() == [4.0 * k for k in range(K)]
-    assert book.output("mu").tolist() == [0.0] * K
+        assert book.last().tolist() == (np.arange(n) + 100.0 * k).tolist()
+    rows = book.instants()
+    assert np.asarray(rows[gg.Y.names[2]]).tolist() == [2 + 100.0 * k for k in range(K)]
+    assert np.asarray(rows["P_e"]).tolist() == [4.0 * k for k in range(K)]
+    assert np.asarray(rows["mu"]).tolist() == [0.0] * K
 
 
 def test_large_results_go_to_a_file_by_themselves(monkeypatch, tmp_path, caplog):
