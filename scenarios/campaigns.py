@@ -389,7 +389,6 @@ def _whole(path: Path) -> bool:
 
 # ------------------------------------------------------------------------------ result
 
-_TEXTS = ("name", "fault_phase", "load")  # of a phase's summary: no numbers
 _UNITS: Mapping[str, tuple[str, str]] = {
     "start": ("s", "start of the phase"),
     "end": ("s", "end of the phase"),
@@ -416,7 +415,7 @@ def _dataset(
 
     n, m = len(records), max(len(s.phases) for s in scenarios)
     rows = [r.get("phases", ()) for r in records]
-    keys = dict.fromkeys(k for r in rows for row in r for k in row if k not in _TEXTS)
+    keys = dict.fromkeys(k for r in rows for row in r for k in row if k != "name")
     data: dict[str, Any] = {}
     for k in keys:
         a = np.full((n, m), np.nan)
