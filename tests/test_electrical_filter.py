@@ -205,8 +205,13 @@ HOLES = {
 }
 
 
-@pytest.mark.parametrize("gains", ["none", "estimate", "consider"])
-@pytest.mark.parametrize("hole", HOLES)
+SOME = ("a current", "every other voltage", "everything for eight periods")
+
+
+@pytest.mark.parametrize(
+    ("hole", "gains"),
+    [*((h, "none") for h in HOLES), *((h, g) for h in SOME for g in ("estimate", "consider"))],
+)
 def test_belief_stays_sound_over_missing_samples(hole, gains):
     """Every state within six of its standard deviations of the truth, at all instants.
 

@@ -228,7 +228,8 @@ NO_TIMES = {
     "two figures": ([f"00:{i:02d}" for i in k], "give --time-format %M:%S or %H:%M"),
     "half zoned": ([f"2024-01-01 00:00:{i:02d}{'Z' * (i % 2)}" for i in k], "some not"),
     "summer time": ([f"2024-03-31 01:59:{54 + i}" for i in k[:6]]
-                    + [f"2024-03-31 03:00:0{i}" for i in k[:6]], "clock jumps by an hour.*--time-zone"),
+                    + [f"2024-03-31 03:00:0{i}" for i in k[:6]],
+                    "clock jumps by an hour.*--time-zone"),
     "dates as numbers": (20240101 + k, "may be a date or seconds: give --time-format %Y%m%d"),
     "spreadsheet": ([f"{45382 + i / 86400:.8f}" for i in k], "may be days of a spreadsheet"),
     "doubled": ([0, 1, 1, *range(3, K)], "data row 3 has 1 s after 1 s"),
