@@ -378,3 +378,21 @@ def test_the_command_says_how_it_read(tmp_path, capsys):
     path.write_text(flagged, encoding="utf-8")
     assert main(["fit", str(path)]) == 0
     assert "column valid is not heeded: 1 of 12 rows" in capsys.readouterr().out
+
+
+def test_calibration_points_have_the_same_ranges(tmp_path, capsys):
+    """A pressure in kPa; a NaN; a cell that never ends: file, point or line, and no traceback."""
+    path = tmp_path / "points.csv"
+    start = "point,role,name,value,sigma\nA,fixed,N,3775.1,\nA,fixed,PW,4e5,\n"
+    for line, words in (
+        ("A,measured,P3,802,1\n", "point 'A': P3 = 802 Pa is not plausible (40000 to 2e+06)"),
+        ("A,measured,P3,nan,1\n", "line 4: P3: 'nan' is not a number"),
+        ("A,measured,P3,8_0,1\n", "line 4: P3: '8_0' is not a number"),
+        ("A,measured,P3,8e5," + "1" * 200_000 + "\n", "no CSV file"),
+        ('A,measured,P3,"8e5,1\nA,measured,T3,560,1\n', "a quote missing"),
+        ("A,measured,P3,8e5,-1\n", "points.csv: A: measured P3"),
+    ):
+        path.write_text(start + line, encoding="utf-8")
+        assert main(["calibrate", str(path)]) == 2
+        err = capsys.readouterr().err
+        assert words in err and len(err) < 400
