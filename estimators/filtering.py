@@ -91,7 +91,7 @@ class FilterStep:
                        self.function.size2_in(i)) for i in range(len(STEP_IN))]  # fmt: skip
         P = ca.SX.sym("P", s[1].shape[0], s[1].shape[0])
         root = ca.Function("root", [P], [ca.densify(cholesky_semidefinite(P))])
-        out = list(self.function(s[0], root(s[1]), *s[2:]))
+        out = list(self.function(s[0], root(s[1]), *s[2:]))[: len(STEP_OUT)]
         P1 = out[1] @ out[1].T
         out[1] = ca.densify(ca.tril(P1) + ca.tril(P1, False).T)
         name = f"{self.function.name()}_plain"
