@@ -143,6 +143,10 @@ class FilterResult:
     roots: tuple[np.ndarray, ...] | None = field(default=None, repr=False)
     again: Callable[[], FilterResult] | None = field(default=None, repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: numbers and names, not the filter behind ``again``."""
+        return {**self.__dict__, "again": None}
+
     def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (mean, standard deviation) of one state, each of shape (K,)."""
         i = self.x.index(name)
