@@ -72,6 +72,10 @@ class Belief:
             raise SignalError(
                 f"belief: no covariance, its correlations have the eigenvalue {low:.1e} < 0"
             )
+        if self.root is not None:
+            L = np.asarray(self.root, dtype=float) / scale[:, None]
+            if L.shape != (n, n) or not np.allclose(L @ L.T, corr, rtol=0, atol=1e-9):
+                raise SignalError("belief: the root is none of the covariance; leave it out")
 
     @classmethod
     def of(cls, x: Signals, mean: Mapping[str, float], sigma: Mapping[str, float]) -> Belief:

@@ -92,7 +92,7 @@ class FilterStep(Parametric):
                        self.function.size2_in(i)) for i in range(len(STEP_IN))]  # fmt: skip
         P = ca.SX.sym("P", s[1].shape[0], s[1].shape[0])
         root = ca.Function("root", [P], [ca.densify(cholesky_semidefinite(P))])
-        out = list(self.function(s[0], root(s[1]), *s[2:]))
+        out = list(self.function(s[0], root(s[1]), *s[2:]))[: len(STEP_OUT)]
         P1 = out[1] @ out[1].T
         out[1] = ca.densify(ca.tril(P1) + ca.tril(P1, False).T)
         name = f"{self.function.name()}_plain"
@@ -143,6 +143,10 @@ class FilterResult:
     innovation_cov: np.ndarray | None = None
     roots: tuple[np.ndarray, ...] | None = field(default=None, repr=False)
     again: Callable[[], FilterResult] | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: numbers and names, not the filter behind ``again``."""
+        return {**self.__dict__, "again": None}
 
     def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (mean, standard deviation) of one state, each of shape (K,)."""

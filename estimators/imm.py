@@ -30,11 +30,12 @@ from apu_casadi.backend import Caller, backend_in_use, compiled
 from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.sharing import kept
 from apu_casadi.signals import Signals
-from estimators.algebra import graded_lower, root_of
+from estimators.algebra import root_of
 from estimators.belief import Belief
 from estimators.ekf import ekf_step
 from estimators.filtering import (
     BLOCK,
+    NARROW,
     WIDE,
     FilterResult,
     FilterStep,
@@ -43,6 +44,7 @@ from estimators.filtering import (
     padded,
     run,
 )
+from estimators.mixing import log_sum, plain_mixer, root_mixer
 from estimators.model import CHECK_TOL, FilterModel
 from estimators.recording import Recording
 
@@ -231,101 +233,12 @@ class ImmResult:
         }
 
 
-def _log_sum(v: ca.SX) -> ca.SX:
-    top = v[0]
-    for i in range(1, v.numel()):
-        top = ca.fmax(top, v[i])
-    return top + ca.log(ca.sum1(ca.exp(v - top)))
-
-
-def _mixer(x: Sequence[Signals]) -> ca.Function:
-    """Mixing as an SX Function (logs, m, P, logT) -> (logs, m, P); m, P of all modes stacked.
-
-    What a mode lacks it takes no part in: into mode j it carries j's own belief of that state,
-    uncorrelated with the rest (Yuan et al. 2012, unbiased mixing).
-    """
-    M, n = len(x), [len(s) for s in x]
-    logs, logT = ca.SX.sym("logs", M), ca.SX.sym("logT", M * M)
-    ms = [ca.SX.sym(f"m{i}", k) for i, k in enumerate(n)]
-    Ps = [ca.SX.sym(f"P{i}", k, k) for i, k in enumerate(n)]
-    T = ca.reshape(logT, M, M)  # column-major: T[i, j] from i to j
-    predicted, m_out, P_out = [], [], []
-    for j in range(M):
-        c = _log_sum(logs + T[:, j])
-        predicted.append(c)
-        weights = ca.exp(logs + T[:, j] - c)
-        carried = []
-        for i in range(M):
-            if x[i].names == x[j].names:
-                carried.append((ms[i], Ps[i]))
-                continue
-            m, P = ca.SX(ms[j]), ca.SX(Ps[j])
-            here = [b for b, s in enumerate(x[j].names) if s in x[i]]
-            there = [x[i].index(x[j].names[b]) for b in here]
-            rest = [b for b in range(n[j]) if b not in here]
-            m[here] = ms[i][there]
-            P[here, here] = Ps[i][there, there]
-            P[here, rest] = 0
-            P[rest, here] = 0
-            carried.append((m, P))
-        mean, cov = ca.SX(n[j], 1), ca.SX(n[j], n[j])
-        for i, (m, _) in enumerate(carried):
-            mean += weights[i] * m
-        for i, (m, P) in enumerate(carried):
-            cov += weights[i] * (P + (m - mean) @ (m - mean).T)
-        m_out.append(mean)
-        P_out.append(ca.vec(cov))
-    m_in, P_in = ca.vertcat(*ms), ca.vertcat(*(ca.vec(P) for P in Ps))
-    out = [ca.vertcat(*predicted), ca.vertcat(*m_out), ca.vertcat(*P_out)]
-    return ca.Function("mix", [logs, m_in, P_in, logT], [ca.densify(o) for o in ca.cse(out)])
-
-
-def _root_mixer(x: Sequence[Signals]) -> ca.Function:
-    """The same as :func:`_mixer` with lower triangular roots in place of P.
-
-    A root of the mixture is that of [sqrt(w_i) L_i, sqrt(w_i) (m_i - mean)], side by side.
-    """
-    M, n = len(x), [len(s) for s in x]
-    logs, logT = ca.SX.sym("logs", M), ca.SX.sym("logT", M * M)
-    ms = [ca.SX.sym(f"m{i}", k) for i, k in enumerate(n)]
-    dense = [ca.SX.sym(f"L{i}", k, k) for i, k in enumerate(n)]
-    Ls = [ca.tril(L) for L in dense]
-    T = ca.reshape(logT, M, M)
-    predicted, m_out, L_out = [], [], []
-    for j in range(M):
-        c = _log_sum(logs + T[:, j])
-        predicted.append(c)
-        share = ca.exp((logs + T[:, j] - c) / 2)  # roots of the weights
-        carried = []
-        for i in range(M):
-            m, L = ca.SX(ms[j]), ca.SX(n[j], n[i])
-            here = [b for b, s in enumerate(x[j].names) if s in x[i]]
-            there = [x[i].index(x[j].names[b]) for b in here]
-            rest = [b for b in range(n[j]) if b not in here]
-            m[here] = ms[i][there]
-            L[here, :] = Ls[i][there, :]
-            if rest:
-                own = ca.SX(n[j], n[j])
-                own[rest, :] = Ls[j][rest, :]
-                L = ca.horzcat(L, own)
-            carried.append((m, L))
-        mean = ca.SX(n[j], 1)
-        for i, (m, _) in enumerate(carried):
-            mean += share[i] ** 2 * m
-        wide = [share[i] * ca.horzcat(L, m - mean) for i, (m, L) in enumerate(carried)]
-        m_out.append(mean)
-        L_out.append(ca.vec(ca.densify(graded_lower(ca.sparsify(ca.horzcat(*wide))))))
-    m_in, L_in = ca.vertcat(*ms), ca.vertcat(*(ca.vec(L) for L in dense))
-    out = [ca.vertcat(*predicted), ca.vertcat(*m_out), ca.vertcat(*L_out)]
-    return ca.Function("root_mix", [logs, m_in, L_in, logT], [ca.densify(o) for o in ca.cse(out)])
-
-
 def _weigher(x: Sequence[Signals], common: Signals) -> ca.Function:
     """SX Function (logs, logliks, m_f, P_f) -> (logs, loglik, mean, variance) of the mixture."""
     M, n = len(x), [len(s) for s in x]
     logs, ll = ca.SX.sym("logs", M), ca.SX.sym("ll", M)
     m_in, P_in = ca.SX.sym("m", sum(n)), ca.SX.sym("P", sum(k * k for k in n))
-    total = _log_sum(logs + ll)
+    total = log_sum(logs + ll)
     new = logs + ll - total
     weights = ca.exp(new)
     ms = ca.vertsplit(m_in, [0, *np.cumsum(n).tolist()])
@@ -366,7 +279,7 @@ def _block(
         "y": ny, "R": ny, "dt": 1, "p": np_,
     }  # fmt: skip
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
-    mixer = _root_mixer if roots else _mixer
+    mixer = root_mixer if roots else plain_mixer
     logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
     ms = ca.vertsplit(m, [0, *np.cumsum(n).tolist()])
     Ps = ca.vertsplit(P, [0, *np.cumsum([k * k for k in n]).tolist()])
@@ -410,12 +323,24 @@ def _needs_roots(
     if ((R > 0) & ~(S <= WIDE * R)).any():
         return True
     at = np.cumsum([0, *(k * k for k in n)])
-    for P in (*P_f.T[::5], P1):
-        if not np.isfinite(P).all():
-            return True
-        if any(narrow(P[i:j].reshape(k, k)) for i, j, k in zip(at[:-1], at[1:], n, strict=True)):
-            return True
-    return False
+    some = np.column_stack([P_f[:, ::10], P1])
+    return any(
+        _any_narrow(some[i:j].T.reshape(-1, k, k))
+        for i, j, k in zip(at[:-1], at[1:], n, strict=True)
+    )
+
+
+def _any_narrow(P: np.ndarray) -> bool:
+    """:func:`~estimators.filtering.narrow` for any of several covariances, (K, n, n)."""
+    d = np.diagonal(P, axis1=1, axis2=2)
+    if not (d > 0).all():
+        return any(narrow(one) for one in P)
+    s = 1 / np.sqrt(d)
+    try:
+        L = np.linalg.cholesky(P * s[:, :, None] * s[:, None, :])
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((np.diagonal(L, axis1=1, axis2=2) ** 2 >= NARROW).all())
 
 
 def _log_transitions(

@@ -194,3 +194,38 @@ def test_variances_of_missing_samples_do_not_count():
     y[0, 1], v[0, 1] = np.nan, np.nan
     y[1, 1], v[1, 1] = np.nan, 0
     assert Recording(**GOOD | dict(y=y, variance=v)).size == 3
+
+
+def test_what_numpy_would_turn_into_numbers_is_told():
+    """Ticks of dates are no seconds, masked values no readings, text no numbers."""
+    t = np.array(["2024-01-01T00:00:00", "2024-01-01T00:00:02", "2024-01-01T00:00:04"], "M8[ns]")
+    with pytest.raises(DataError, match=r"place: .*give \(t - t\[0\]\) / np.timedelta64\(1, 's'\)"):
+        made(place=(t, (5, 6, 7)))
+    with pytest.raises(DataError, match=r"give t / np.timedelta64\(1, 's'\)"):
+        made(place=(t - t[0], (5, 6, 7)))
+    r = made(place=((t - t[0]) / np.timedelta64(1, "s"), (5, 6, 7)))
+    assert_allclose(r.t, [0, 0.5, 2, 4])
+    masked = np.ma.array([5.0, -999.0, 7.0], mask=[False, True, False])
+    assert_allclose(made(place=((0, 1, 2), masked)).y[0], [5, np.nan, np.nan, 7])
+    with pytest.raises(DataError, match="1 of 3 values are masked"):
+        made(place=(np.ma.array([0.0, 1.0, 2.0], mask=[0, 1, 0]), (5, 6, 7)))
+    for wrong in ([True, False, True], ["5", "6", "7"], [5, "6", 7], [1j, 2, 3]):
+        with pytest.raises(DataError, match="numbers expected"):
+            made(place=((0, 1, 2), wrong))
+    with pytest.raises(DataError, match="u: 1 of 2 values are masked"):
+        Recording([0.0, 1.0], np.ma.array([[1.0, 2.0]], mask=[[0, 1]]), np.zeros((1, 2)),
+                  np.ones((1, 2)), [])  # fmt: skip
+    y = np.ma.array([[1.0, -999.0]], mask=[[0, 1]])
+    assert np.isnan(Recording([0.0, 1.0], np.zeros((0, 2)), y, np.ones((1, 2)), []).y[0, 1])
+
+
+def test_gaps_of_pandas():
+    """NA of nullable columns is a gap, as NaN is; Decimals are numbers."""
+    from decimal import Decimal
+
+    import pandas as pd
+
+    r = made(place=((0, 1, 2), pd.Series([5, None, 7], dtype="Int64")))
+    assert_allclose(r.y[0], [5, np.nan, np.nan, 7])
+    r = made(place=((0, 1, 2), [Decimal(5), None, Decimal(7)]))
+    assert_allclose(r.y[0], [5, np.nan, np.nan, 7])

@@ -5,6 +5,7 @@ more; the filters go on with roots, which hold twice as much.  What is left at 1
 a root are rounded to 1e-16 of 1e12, 1e-4 of the narrow direction, which adds up in squares to 1e-8.
 """
 
+import pickle
 from fractions import Fraction
 from functools import lru_cache
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from estimation_models import linear
 
-from apu_casadi.errors import EstimationError
+from apu_casadi.errors import EstimationError, SignalError
 from estimators.algebra import graded_lower
 from estimators.belief import Belief
 from estimators.ekf import extended_kalman_filter
@@ -179,6 +180,27 @@ def test_what_is_well_known_keeps_the_covariance_filter():
     np.testing.assert_allclose(
         short.final.root @ short.final.root.T, short.final.cov, rtol=1e-12, atol=1e-30
     )
+
+
+def test_a_result_is_pickled_without_its_filter():
+    """Smoothed as before where nothing is lost, refused where the roots are needed."""
+    model, data = case("level")
+    for ratio in (1.0, 1e9):
+        result = extended_kalman_filter(model, prior_of(model, ratio, 0.0), data, full=True,
+                                        backend="vm")  # fmt: skip
+        copy = pickle.loads(pickle.dumps(result))
+        if ratio == 1.0:
+            np.testing.assert_array_equal(rts_smoother(copy).mean, rts_smoother(result).mean)
+        else:
+            with pytest.raises(EstimationError, match="of which no digit is left: take a prior"):
+                rts_smoother(copy)
+
+
+def test_a_root_must_be_of_its_covariance():
+    """As a belief with another covariance would keep it."""
+    model, _ = case("sum")
+    with pytest.raises(SignalError, match="the root is none of the covariance"):
+        Belief(model.x, np.zeros(2), np.eye(2), 2 * np.eye(2))
 
 
 def test_graded_columns_keep_their_digits():

@@ -14,6 +14,7 @@ from scipy import linalg, optimize, special
 
 from apu_casadi.errors import EstimationError, ParameterError, SignalError
 from estimators.detection.alarms import Alarms, allowed_per_sample
+from estimators.recording import plain_numbers
 
 __all__ = [
     "cusum",
@@ -247,7 +248,7 @@ def cusum_test(
     ------
     SignalError : not one sequence, or infinite. ParameterError : see :func:`cusum_threshold`.
     """
-    z = np.asarray(z, float)
+    z = plain_numbers(z, "z", gaps=True)
     if z.ndim != 1 or np.isinf(z).any():
         raise SignalError(f"z: one finite sequence expected, got shape {z.shape}")
     if threshold is None:

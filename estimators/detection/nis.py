@@ -13,6 +13,7 @@ from scipy import optimize, stats
 
 from apu_casadi.errors import ParameterError, SignalError
 from estimators.detection.alarms import HOUR, Alarms, allowed_per_sample, rising
+from estimators.recording import plain_numbers
 
 __all__ = ["nis_test", "nis_threshold", "upcrossing_rate", "windowed_nis"]
 
@@ -35,7 +36,7 @@ def windowed_nis(
     ------
     SignalError : shapes that differ, values not finite. ParameterError : window < 1.
     """
-    nis, measured = np.asarray(nis, float), np.asarray(measured, float)
+    nis, measured = plain_numbers(nis, "nis"), plain_numbers(measured, "measured")
     if nis.ndim != 1 or nis.shape != measured.shape:
         raise SignalError(f"nis and measured of one length expected, got {nis.shape} and "
                           f"{measured.shape}")  # fmt: skip

@@ -18,7 +18,7 @@ from apu_casadi.errors import EstimationError, ParameterError, SignalError, near
 from apu_casadi.sharing import keep
 from estimators.filtering import FilterResult
 from estimators.model import FilterModel
-from estimators.recording import Recording
+from estimators.recording import Recording, plain_numbers
 
 __all__ = ["Jump", "LinearFilter", "columns_of", "linear_filter", "linearised", "project"]
 
@@ -140,7 +140,7 @@ def linear_filter(
     ------
     SignalError : shapes that do not fit.
     """
-    y = np.asarray(y, float)
+    y = plain_numbers(y, "y", gaps=True)
     nx, q = A.shape[0], len(names)
     ny = H.shape[0]
     if y.ndim != 2 or y.shape[1] != ny or H.shape != (ny, nx) or R.shape != (ny, ny):
@@ -298,7 +298,7 @@ def project(innovation: np.ndarray, S: np.ndarray, direction: np.ndarray) -> np.
     ------
     SignalError : a direction that is zero though all was measured.
     """
-    nu = np.asarray(innovation, float)
+    nu = plain_numbers(innovation, "innovation", gaps=True)
     there = ~np.isnan(nu)
     d = np.where(there, np.broadcast_to(direction, nu.shape), 0.0)
     nu = np.where(there, nu, 0.0)

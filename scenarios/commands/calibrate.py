@@ -17,6 +17,7 @@ war), health (f_eta_c, ...), fixed (two for each point) or measured:
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from scenarios import jsontext
@@ -108,6 +109,8 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.gasgenerator import GasGenerator
 
     points = read_points(args.file) if args.file else published_points()
+    if args.file:
+        _plausible(args.file, points)
     if args.write_points:
         write_points(points, args.write_points)
     free = [n.strip() for n in args.free.split(",") if n.strip()] if args.free else list(FREE)
@@ -117,6 +120,29 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(text(result))
     return 0
+
+
+def _plausible(path: str, points: Sequence[CalibrationPoint]) -> None:
+    """Refuse numbers that their quantity cannot have: a slip, or another unit than SI.
+
+    Raises
+    ------
+    DataError : with file, point, name and value.
+    """
+    from apu_casadi.errors import DataError
+    from apu_casadi.gasgenerator import GasGenerator
+    from scenarios.estimation.plausible import PLAUSIBLE
+
+    units = {s.name: s.unit for s in (*GasGenerator.Y, *GasGenerator.U)}
+    for p in points:
+        values = {**p.fixed, **p.ambient, **{n: v for n, (v, _) in p.measured.items()}}
+        for name, value in values.items():
+            low, high = PLAUSIBLE.get(name, (value, value))
+            if not low <= value <= high:
+                raise DataError(
+                    f"{path}: point {p.name!r}: {name} = {value:.6g} {units.get(name, '')} is not "
+                    f"plausible ({low:g} to {high:g}); SI units are expected"
+                )
 
 
 def report(result: CalibrationResult) -> dict[str, Any]:

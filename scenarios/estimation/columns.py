@@ -83,6 +83,7 @@ _GROUPS = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d*|[+-]?\d{1,3}(,\d{3}){2,}", re.
 _GROUPS_COMMA = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d*|[+-]?\d{1,3}(\.\d{3}){2,}", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?", re.ASCII)
 _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
+_PLAIN = frozenset("0123456789+-.eE")
 DECIMALS = ("point", "comma")
 
 
@@ -155,7 +156,8 @@ def text_columns(
                 f"{path}, line {line}: {len(row)} cells, but {width} columns are named; is "
                 "the file cut off?"
             )
-    cells = [[r[i].strip() for _, r in body] for i in range(width)]
+    cells = [[c.strip() for c in column] for column in zip(*(r for _, r in body), strict=True)]
+    cells = cells or [[] for _ in range(width)]
     number = _numbers_as(path, cells, names, delimiter, decimal, tell)
     out = []
     at = [k for k, _ in body]
@@ -312,6 +314,12 @@ def _numbers_as(
     """Decide by the whole file what commas and points in numbers are."""
     comma = open_ = groups = groups_comma = point = None
     for i, column in enumerate(cells):
+        if _PLAIN.issuperset("".join(column)):  # nothing but points
+            if point is None and not any(c.count(".") > 1 for c in column):
+                point = next(((i, c) for c in column if "." in c), None)
+                continue
+            if not any(c.count(".") > 1 for c in column):
+                continue
         for c in column:
             if "," in c or c.count(".") > 1:
                 if _GROUPS.fullmatch(c):
@@ -381,6 +389,9 @@ def parsed(
     A column in which numbers prevail must hold nothing else; one without is text, and is refused
     only by who needs it.
     """
+    fast = _fast(cells) if number is _point else None
+    if fast is not None:
+        return Column(name, unit, fast, fast)
     values = np.full(len(cells), np.nan)
     wrong: list[int] = []
     words: list[int] = []
@@ -411,6 +422,18 @@ def parsed(
     tell(f"{place(words[0])}: {cut(cells[words[0]])} is taken as a gap, as are {len(words)} cells "
          "of this column in all")  # fmt: skip
     return Column(name, unit, values, values)
+
+
+def _fast(cells: Sequence[Any]) -> np.ndarray | None:
+    """Plain numbers and empty cells, all at once; None where any cell is anything else."""
+    try:
+        if not _PLAIN.issuperset("".join(cells)):
+            return None
+        values = np.array([c or "nan" for c in cells], dtype=float)
+    except (TypeError, ValueError):
+        return None
+    top = np.abs(values).max(initial=0.0, where=~np.isnan(values))
+    return values if top < 2**53 else None
 
 
 def _whole(cells: Sequence[Any], values: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from apu_casadi.trimming import trim_gas_generator
 from estimators.fit import FitProblem, FitResult, quantile
 from estimators.lifting import Lifted, lift
 from estimators.model import FilterModel, biases, gains, measure, measured_inputs
-from estimators.recording import Recording, record
+from estimators.recording import Recording, plain_numbers, record
 from scenarios.estimation.intervals import share_interval
 from scenarios.estimation.sensors import GAS_PATH, SensorSet
 
@@ -121,6 +121,19 @@ class EngineData:
     t: np.ndarray
     readings: Mapping[str, np.ndarray]
     ambient: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Take masked values as gaps; refuse dates, text and truth values.
+
+        Raises
+        ------
+        DataError : what is no number, with the name.
+        """
+        object.__setattr__(self, "t", plain_numbers(self.t, f"{self.name}: t"))
+        clean = {
+            n: plain_numbers(v, f"{self.name}: {n}", gaps=True) for n, v in self.readings.items()
+        }
+        object.__setattr__(self, "readings", clean)
 
 
 def _level(t: np.ndarray, v: np.ndarray, steady: bool) -> np.ndarray:
