@@ -37,7 +37,7 @@ SPEED_LINE = {
     "PR": 0.12,
     "eta": 0.07,
 }  # of a speed line's mean; found there: 0.05 inside
-BETA_LINE = {"W": 0.05, "PR": 0.05, "eta": 0.06}  # of a beta line's mean
+BETA_LINE = {"W": 0.03, "PR": 0.03, "eta": 0.03}  # of a beta line's mean
 SURGE = 0.1  # of the surge line's ln PR
 EDGE = 1.6  # a cell's tolerance is so many times larger at an edge, where predictions extrapolate
 EDGE_LINE = 2.5  # likewise a line's
@@ -101,13 +101,23 @@ def _predict(x: np.ndarray, v: np.ndarray, i: int, near: list[int]) -> np.ndarra
     return np.asarray(np.tensordot(weights, v[near], axes=1))
 
 
-def deviations(N: np.ndarray, beta: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smaller deviations of both axes, 0 where they disagree, and EDGE factors."""
+class Deviations(NamedTuple):
+    """Of each cell: the smaller of those along both axes, 0 where they disagree; that along the
+    speed line; and the factor of its tolerance.
+    """
+
+    d: np.ndarray
+    on_line: np.ndarray
+    edge: np.ndarray
+
+
+def deviations(N: np.ndarray, beta: np.ndarray, v: np.ndarray) -> Deviations:
+    """Compare each cell with its neighbours along both axes."""
     (dN, edge_N), (db, edge_b) = along(N, v), along(beta, v.T)
     db = db.T
     d = np.where(np.abs(dN) < np.abs(db), dN, db)
     d[np.sign(dN) != np.sign(db)] = 0.0
-    return d, np.where(edge_N, EDGE, 1.0)[:, None] * np.where(edge_b, EDGE, 1.0)
+    return Deviations(d, db, np.where(edge_N[:, None] | edge_b, EDGE, 1.0))
 
 
 def scatter(d: np.ndarray) -> float:
@@ -117,10 +127,10 @@ def scatter(d: np.ndarray) -> float:
 
 def cells(name: str, N: np.ndarray, beta: np.ndarray, v: np.ndarray) -> list[Finding]:
     """Return the implausible cells of one quantity; v as it is compared, ln W, ln PR or eta."""
-    d, edge = deviations(N, beta, v)
+    d, on_line, edge = deviations(N, beta, v)
     excess = np.abs(d) / (max(CELL[name], scatter(d)) * edge)
     return [
-        Finding(name, int(i), int(j), v[i, j], v[i, j] - d[i, j], float(excess[i, j]))
+        Finding(name, int(i), int(j), v[i, j], v[i, j] - on_line[i, j], float(excess[i, j]))
         for i, j in zip(*np.nonzero(excess > 1), strict=True)
     ]
 
@@ -132,7 +142,7 @@ def lines(
 
     A table's noise is excused as in :func:`cells`, less by the root of the cells in a line.
     """
-    noise, found = scatter(deviations(N, beta, v)[0]), []
+    noise, found = scatter(deviations(N, beta, v).d), []
     for axis, x, least in ((1, N, SPEED_LINE[name]), (0, beta, BETA_LINE[name])):
         mean = v.mean(axis=axis)
         excuse = noise / v.shape[axis] ** 0.5
@@ -179,7 +189,7 @@ def implausible(
     tables = (("W", np.log(W), up), ("PR", np.log(PR), up), ("eta", eta, False))
     found = [f for name, v, _ in tables for f in cells(name, N, beta, v)]
     if surge is not None:
-        found += surge_points(*surge, scatter(deviations(N, beta, np.log(PR))[0]))
+        found += surge_points(*surge, scatter(deviations(N, beta, np.log(PR)).d))
     if not found:
         found = [f for name, v, rising in tables for f in lines(name, N, beta, v, rising=rising)]
     found.sort(key=lambda f: -f.excess)
@@ -187,4 +197,5 @@ def implausible(
 
 
 def _from_log(f: Finding) -> Finding:
-    return f._replace(value=float(np.exp(f.value)), expected=float(np.exp(f.expected)))
+    with np.errstate(over="ignore"):  # beside a cell of 1e300 anything may be expected
+        return f._replace(value=float(np.exp(f.value)), expected=float(np.exp(f.expected)))
