@@ -70,7 +70,7 @@ def test_both_points_are_steady_and_differ(gg, states):
     assert_allclose(sorted(ends), [973.34, 980.94], atol=0.01)
 
 
-@pytest.mark.parametrize("share", [0.04, -0.06, 0.08])
+@pytest.mark.parametrize("share", [0.02, 0.04, -0.06])
 def test_a_run_through_the_region_follows_its_branch(gg, states, share):
     """A wave and steps of fuel: every step moves as far as a quarter of it four times.
 
@@ -100,7 +100,7 @@ def test_the_shipped_map_has_one_point_there(gg):
     T4, found = made.Y.index("T4"), 0
     for _ in range(60):
         s = solver.kernel.sought(w) + rng.normal(0, 0.3, len(solver.kernel.free))
-        w1, y, r, _, _ = solver.one("warm", s, p)
+        _, y, r, _, _ = solver.one("warm", s, p)
         if np.abs(r).max() < 1e-9:
             assert y[T4] == pytest.approx(point["T4"], rel=1e-7)
             found += 1

@@ -37,7 +37,7 @@ def sample(t: MapTable, count: int) -> list[tuple[int, int]]:
 @pytest.mark.parametrize("column", COLUMNS)
 @pytest.mark.parametrize("factor", [1e300, 10.0, 2.0, 0.5])
 def test_every_wrong_cell_is_found_and_named(name, column, factor):
-    """What is expected is within 10 % of the true value, at corners too, where it is extrapolated."""
+    """What is expected is within 10 % of the true value, at corners too."""
     t = MAPS[name]
     for i, j in sample(t, 8):
         a = np.array(getattr(t, column))
