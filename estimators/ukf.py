@@ -35,6 +35,7 @@ from typing import Any
 
 import casadi as ca
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError, nearest
 from estimators.algebra import append_column, forward, qr_lower, root_update
 from estimators.belief import Belief
@@ -78,6 +79,10 @@ class PointSet:
             raise ParameterError(f"points {points!r} {nearest(points, POINTS)}")
         if points == "cubature":
             return cls(n, float(n), False, -1 / n)
+        alpha, beta, kappa = (
+            number(label, v, error=ParameterError)
+            for label, v in (("alpha", alpha), ("beta", beta), ("kappa", kappa))
+        )
         if not all(math.isfinite(v) for v in (alpha, beta, kappa)) or alpha <= 0:
             raise ParameterError(
                 f"alpha = {alpha!r}, beta = {beta!r}, kappa = {kappa!r}: finite numbers with "
