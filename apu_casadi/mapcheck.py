@@ -37,7 +37,7 @@ SPEED_LINE = {
     "PR": 0.12,
     "eta": 0.07,
 }  # of a speed line's mean; found there: 0.05 inside
-BETA_LINE = {"W": 0.05, "PR": 0.05, "eta": 0.06}  # of a beta line's mean
+BETA_LINE = {"W": 0.03, "PR": 0.03, "eta": 0.03}  # of a beta line's mean
 SURGE = 0.1  # of the surge line's ln PR
 EDGE = 1.6  # a cell's tolerance is so many times larger at an edge, where predictions extrapolate
 EDGE_LINE = 2.5  # likewise a line's
@@ -95,19 +95,44 @@ def along(x: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return out, edge
 
 
+def either(x: np.ndarray, v: np.ndarray, *, logs: bool) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`along`; of logarithms the smaller of two deviations, of v itself and of exp(v).
+
+    A quantity that is straight in x, as pressure ratio over beta in many turbine maps, has a
+    strongly bent logarithm near 1, and the other way round for what rises exponentially.
+    """
+    d, edge = along(x, v)
+    if not logs:
+        return d, edge
+    plain = np.exp(np.minimum(v, 300.0))
+    expected = plain - along(x, plain)[0]
+    other = v - np.log(np.maximum(expected, 1e-300))
+    return np.where(np.abs(other) < np.abs(d), other, d), edge
+
+
 def _predict(x: np.ndarray, v: np.ndarray, i: int, near: list[int]) -> np.ndarray:
     """Lagrange's polynomial through the rows ``near``, at x[i]."""
     weights = [np.prod([(x[i] - x[m]) / (x[k] - x[m]) for m in near if m != k]) for k in near]
     return np.asarray(np.tensordot(weights, v[near], axes=1))
 
 
-def deviations(N: np.ndarray, beta: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smaller deviations of both axes, 0 where they disagree, and EDGE factors."""
-    (dN, edge_N), (db, edge_b) = along(N, v), along(beta, v.T)
+class Deviations(NamedTuple):
+    """Of each cell: the smaller of those along both axes, 0 where they disagree; that along the
+    speed line; and the factor of its tolerance.
+    """
+
+    d: np.ndarray
+    on_line: np.ndarray
+    edge: np.ndarray
+
+
+def deviations(N: np.ndarray, beta: np.ndarray, v: np.ndarray, *, logs: bool = True) -> Deviations:
+    """Compare each cell with its neighbours along both axes."""
+    (dN, edge_N), (db, edge_b) = either(N, v, logs=logs), either(beta, v.T, logs=logs)
     db = db.T
     d = np.where(np.abs(dN) < np.abs(db), dN, db)
     d[np.sign(dN) != np.sign(db)] = 0.0
-    return d, np.where(edge_N, EDGE, 1.0)[:, None] * np.where(edge_b, EDGE, 1.0)
+    return Deviations(d, db, np.where(edge_N[:, None] | edge_b, EDGE, 1.0))
 
 
 def scatter(d: np.ndarray) -> float:
@@ -117,10 +142,10 @@ def scatter(d: np.ndarray) -> float:
 
 def cells(name: str, N: np.ndarray, beta: np.ndarray, v: np.ndarray) -> list[Finding]:
     """Return the implausible cells of one quantity; v as it is compared, ln W, ln PR or eta."""
-    d, edge = deviations(N, beta, v)
+    d, on_line, edge = deviations(N, beta, v, logs=name != "eta")
     excess = np.abs(d) / (max(CELL[name], scatter(d)) * edge)
     return [
-        Finding(name, int(i), int(j), v[i, j], v[i, j] - d[i, j], float(excess[i, j]))
+        Finding(name, int(i), int(j), v[i, j], v[i, j] - on_line[i, j], float(excess[i, j]))
         for i, j in zip(*np.nonzero(excess > 1), strict=True)
     ]
 
@@ -132,11 +157,12 @@ def lines(
 
     A table's noise is excused as in :func:`cells`, less by the root of the cells in a line.
     """
-    noise, found = scatter(deviations(N, beta, v)[0]), []
+    logs = name != "eta"
+    noise, found = scatter(deviations(N, beta, v, logs=logs).d), []
     for axis, x, least in ((1, N, SPEED_LINE[name]), (0, beta, BETA_LINE[name])):
         mean = v.mean(axis=axis)
         excuse = noise / v.shape[axis] ** 0.5
-        d, edge = _line(x, mean)
+        d, edge = _line(x, mean, logs=logs)
         excess = np.abs(d) / ((least + excuse) * edge)
         if axis == 1 and rising:
             _falls(mean, d, excess, ORDER + excuse)
@@ -146,8 +172,8 @@ def lines(
     return found
 
 
-def _line(x: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    d, edge = along(x, v[:, None])
+def _line(x: np.ndarray, v: np.ndarray, *, logs: bool) -> tuple[np.ndarray, np.ndarray]:
+    d, edge = either(x, v[:, None], logs=logs)
     return d[:, 0], np.where(edge, EDGE_LINE, 1.0)
 
 
@@ -161,7 +187,7 @@ def _falls(v: np.ndarray, d: np.ndarray, excess: np.ndarray, least: float) -> No
 def surge_points(W: np.ndarray, PR: np.ndarray, noise: float) -> list[Finding]:
     """Return the implausible points of a surge line beside a table with this scatter of ln PR."""
     v = np.log(PR)
-    d, edge = _line(np.log(W), v)
+    d, edge = _line(np.log(W), v, logs=True)
     excess = np.abs(d) / ((SURGE + noise) * edge)
     _falls(v, d, excess, ORDER + noise)
     return [
@@ -179,7 +205,7 @@ def implausible(
     tables = (("W", np.log(W), up), ("PR", np.log(PR), up), ("eta", eta, False))
     found = [f for name, v, _ in tables for f in cells(name, N, beta, v)]
     if surge is not None:
-        found += surge_points(*surge, scatter(deviations(N, beta, np.log(PR))[0]))
+        found += surge_points(*surge, scatter(deviations(N, beta, np.log(PR)).d))
     if not found:
         found = [f for name, v, rising in tables for f in lines(name, N, beta, v, rising=rising)]
     found.sort(key=lambda f: -f.excess)
@@ -187,4 +213,5 @@ def implausible(
 
 
 def _from_log(f: Finding) -> Finding:
-    return f._replace(value=float(np.exp(f.value)), expected=float(np.exp(f.expected)))
+    with np.errstate(over="ignore"):  # beside a cell of 1e300 anything may be expected
+        return f._replace(value=float(np.exp(f.value)), expected=float(np.exp(f.expected)))

@@ -39,7 +39,7 @@ import csv
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from itertools import pairwise
@@ -101,6 +101,8 @@ def _lines(path: str | Path) -> list[str]:
 
 def _number(text: str, where: str) -> float:
     try:
+        if "_" in text or not text.isascii():  # float() takes 1_0 and digits of other scripts
+            raise ValueError
         value = float(text)
     except ValueError:
         hint = " (write decimal points, not commas)" if re.fullmatch(r"-?\d+,\d+", text) else ""
@@ -152,7 +154,7 @@ def read_map_csv(path: str | Path, *, check: bool = True) -> MapTable:
     surge: list[tuple[int, list[float]]] = []
     columns: list[str] = []  # of the block being read; empty before the first header
     rows = grid
-    for k, cells in enumerate(csv.reader(_lines(path)), 1):
+    for k, cells in _csv_rows(path):
         row = [c.strip() for c in cells]
         while row and not row[-1]:
             row.pop()
@@ -227,6 +229,25 @@ def read_map_csv(path: str | Path, *, check: bool = True) -> MapTable:
         name=meta.get("name", (Path(path).stem, 0))[0],
         source=meta.get("source", ("", 0))[0],
     )
+
+
+def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
+    """Return the cells of each line with its number.
+
+    Raises
+    ------
+    DataError : a cell that is longer than any number, such as one behind an open quotation mark.
+    """
+    reader, k = csv.reader(_lines(path)), 0
+    while True:
+        k += 1
+        try:
+            row = next(reader, None)
+        except csv.Error as e:
+            raise DataError(f"{path}, line {k}: no row of numbers; {e}") from None
+        if row is None:
+            return
+        yield k, row
 
 
 def _csv_header(path: str | Path, k: int, row: list[str], wanted: Sequence[str]) -> list[str]:

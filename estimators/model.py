@@ -27,6 +27,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from apu_casadi.checked import number
 from apu_casadi.discretisation import linearly_implicit_midpoint
 from apu_casadi.errors import ParameterError, SignalError, nearest
 from apu_casadi.sharing import Parametric, remade
@@ -72,6 +73,8 @@ class Unknown:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        for name in ("walk", "lower", "upper"):
+            number(f"Unknown.{name}", getattr(self, name), error=ParameterError)
         if not (math.isfinite(self.walk) and self.walk >= 0):
             raise ParameterError(f"Unknown.walk must be finite and >= 0, got {self.walk!r}")
         if not self.lower < self.upper:
@@ -309,7 +312,11 @@ def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
     """
     cols = model.u.indices(list(sigma))
     for name, value in sigma.items():
-        if not (math.isfinite(value) and value >= 0):
+        if (
+            not 0
+            <= number(f"noisy_inputs: sigma of {name}", value, error=ParameterError)
+            < math.inf
+        ):
             raise ParameterError(
                 f"noisy_inputs: sigma of {name} must be finite and >= 0, got {value!r}"
             )

@@ -36,6 +36,7 @@ from typing import Any
 
 import casadi as ca
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError, nearest
 from apu_casadi.sharing import kept
 from estimators.algebra import append_column, forward, graded_lower, qr_lower, root_update
@@ -80,6 +81,10 @@ class PointSet:
             raise ParameterError(f"points {points!r} {nearest(points, POINTS)}")
         if points == "cubature":
             return cls(n, float(n), False, -1 / n)
+        alpha, beta, kappa = (
+            number(label, v, error=ParameterError)
+            for label, v in (("alpha", alpha), ("beta", beta), ("kappa", kappa))
+        )
         if not all(math.isfinite(v) for v in (alpha, beta, kappa)) or alpha <= 0:
             raise ParameterError(
                 f"alpha = {alpha!r}, beta = {beta!r}, kappa = {kappa!r}: finite numbers with "

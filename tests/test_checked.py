@@ -27,6 +27,9 @@ from apu_casadi.simulation import simulate
 from apu_casadi.steadypoint import Limits, LoadLaw
 from apu_casadi.trimbatch import performance_deck, trim_batch
 from apu_casadi.trimming import maximum_power, trim_gas_generator
+from estimators.detection.cusum import cusum_test
+from estimators.model import Unknown
+from estimators.ukf import PointSet
 
 NUMBERS = [
     2, 2.0, np.float32(2), np.int16(2), np.array(2.0), np.array([2]), [2.0], (2,), Fraction(4, 2),
@@ -98,6 +101,10 @@ ENTRIES = {
     "generator speed": lambda v: Generator().steady_state(LOAD, w_r=v),
     "calibration": lambda v: CalibrationPoint({"N": 3775.0, "PW": v}, {"T4": (1200.0, 1.0)}),
     "calibration value": lambda v: CalibrationPoint(FIXED, {"T4": (v, 1.0)}),
+    "walk": lambda v: Unknown(walk=v),
+    "sigma points": lambda v: PointSet.of(3, "scaled", v, 2.0, 0.0),
+    "cusum": lambda v: cusum_test(np.zeros(3), drift=v, false_alarms_per_hour=1.0, rate=10.0),
+    "alarms": lambda v: cusum_test(np.zeros(3), drift=0.5, false_alarms_per_hour=v, rate=10.0),
     "simulate": lambda v: simulate(GG.state_space, t_grid=[0.0, v], x0=[3775.0], u=None),
 }
 

@@ -312,3 +312,20 @@ def test_messages_of_files(tmp_path):
         write_map_csv(made(), tmp_path / "no" / "folder.csv")
     with pytest.raises(DataError, match=r"no map 'axi6'.*did you mean 'axi5'"):
         shipped("axi6")
+
+
+@pytest.mark.parametrize("cell", ["1_0", "\u0661", "0x10"])
+def test_numbers_are_written_plainly(write, cell):
+    """float() would take an underscore and digits of other scripts."""
+    lines = csv_lines()
+    lines[3] = lines[3].replace(f"{W[0, 0]:.6f}", cell)
+    with pytest.raises(DataError, match="line 4, column W: a number expected"):
+        read_map(write(lines))
+
+
+def test_an_overlong_cell_is_no_traceback(write):
+    """The csv module refuses cells beyond 128 KiB with an error of its own."""
+    lines = csv_lines()
+    lines[5] = "1" * 200_000
+    with pytest.raises(DataError, match="line 6: no row of numbers"):
+        read_map(write(lines))

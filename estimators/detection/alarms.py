@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError
 
 __all__ = ["HOUR", "Alarms", "allowed_per_sample", "rising"]
@@ -87,7 +88,7 @@ def allowed_per_sample(false_alarms_per_hour: float, rate: float) -> float:
     ParameterError : not finite and positive, or 0.1 for each sample and more.
     """
     for name, value in (("false_alarms_per_hour", false_alarms_per_hour), ("rate", rate)):
-        if not (math.isfinite(value) and value > 0):
+        if not 0 < number(name, value, error=ParameterError) < math.inf:
             raise ParameterError(f"{name} must be finite and > 0, got {value!r}")
     per_sample = false_alarms_per_hour / (HOUR * rate)
     if per_sample >= 0.1:

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from scipy import linalg, optimize, special
 
+from apu_casadi.checked import number
 from apu_casadi.errors import EstimationError, ParameterError, SignalError
 from estimators.detection.alarms import Alarms, allowed_per_sample
 from estimators.recording import plain_numbers
@@ -27,6 +28,8 @@ __all__ = [
 
 
 def _check_cusum(drift: float, threshold: float) -> None:
+    drift = number("drift", drift, error=ParameterError)
+    threshold = number("threshold", threshold, error=ParameterError)
     if not (math.isfinite(drift) and drift >= 0):
         raise ParameterError(f"drift must be finite and >= 0, got {drift!r}")
     if not (math.isfinite(threshold) and threshold > 0):

@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from apu_casadi.checked import number
 from apu_casadi.errors import ParameterError, nearest
 
 __all__ = ["ELECTRICAL", "GAS_PATH", "Sensor", "SensorSet"]
@@ -45,6 +46,7 @@ class Sensor:
         """Refuse numbers that are no standard deviations."""
         for label in ("noise", "gain"):
             value = getattr(self, label)
+            value = number(f"sensor {self.name}: {label}", value, error=ParameterError)
             if not (math.isfinite(value) and value >= 0):
                 raise ParameterError(f"sensor {self.name}: {label} must be >= 0, got {value!r}")
 
