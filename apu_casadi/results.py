@@ -6,7 +6,6 @@ and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for)
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -165,19 +164,8 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     DataError : the file cannot be written there.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as f:
-            f.write(bytes(ds.to_netcdf(engine="scipy", format="NETCDF3_64BIT")))
-            f.flush()
-            os.fsync(f.fileno())
-        os.replace(partial, path)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror or e}") from e
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+    with files.whole(path) as target:
+        target.write_bytes(bytes(ds.to_netcdf(engine="scipy", format="NETCDF3_64BIT")))
     return path
 
 

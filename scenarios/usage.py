@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,6 +34,13 @@ class Parser(argparse.ArgumentParser):
             known = [o for o in self._option_string_actions if o.startswith("--")]
             self.error(f"unrecognized arguments: {' '.join(unknown)} {nearest(option, known)}")
         return found, rest
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print help on stdout so that a full disk is noticed; argparse passes over it."""
+        if message and file is not None and file is sys.stdout:
+            file.write(message)
+        else:
+            super()._print_message(message, file)
 
 
 class ShowVersion(argparse.Action):

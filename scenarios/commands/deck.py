@@ -77,25 +77,26 @@ def _axis(option: str, text: str) -> list[float]:
 
     from apu_casadi.errors import ScenarioError
 
+    wrong = ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
     try:
         if ":" in text:
-            first, last, count = text.split(":")
-            if int(count) < 1:
-                raise ValueError
-            if int(count) > LARGEST:
-                raise ScenarioError(
-                    f"{option}: {int(count)} points asked for, {LARGEST} at most in a deck"
-                )
-            ends = float(first), float(last)
-            if not math.isfinite(ends[1] - ends[0]):
-                raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
-            values = np.linspace(*ends, int(count))
+            start, end, number = text.split(":")
+            first, last, count = float(start), float(end), int(number)
         else:
             values = np.array([float(v) for v in text.split(",")])
+            first, last, count = values[0], values[-1], values.size
+        if count < 1:
+            raise ValueError
     except ValueError:
         raise ScenarioError(
             f"{option}: FROM:TO:COUNT or a list of numbers is expected, got {text!r}"
         ) from None
+    if count > LARGEST:
+        raise ScenarioError(f"{option}: {count} points asked for, {LARGEST} at most in a deck")
+    if not math.isfinite(last - first):
+        raise wrong
+    if ":" in text:
+        values = np.linspace(first, last, count)
     if not np.all(np.isfinite(values)) or np.unique(values).size != values.size:
-        raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
+        raise wrong
     return [float(v) for v in values]
