@@ -14,6 +14,9 @@ from apu_casadi import files
 from apu_casadi.errors import ApuError, EstimationError, OperatingPointError, SimulationError
 from scenarios import guard
 
+LONGEST = 1200
+"""Characters of a message; what a damaged file holds may be of any length."""
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -93,5 +96,6 @@ def _system(e: OSError) -> str:
 
 
 def one_line(text: object) -> str:
-    """Return a text without line breaks."""
-    return " ".join(str(text).split())
+    """Return a text without line breaks; of a very long one, beginning and end."""
+    line = " ".join(str(text).split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 400]} ... {line[-300:]}"

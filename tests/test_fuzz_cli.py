@@ -159,6 +159,17 @@ def test_surroundings(tmp_path, name):
     assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
 
 
+def test_a_message_stays_readable(tmp_path, monkeypatch, capsys):
+    """A damaged file may hold a word of any length; beginning and end tell what is wrong."""
+    monkeypatch.chdir(tmp_path)
+    head = "point,role,name,value,sigma"
+    (tmp_path / "points.csv").write_text(f"{head}\na,fixed,N,{'x' * 100_000},\n")
+    assert cli.main(["calibrate", "points.csv"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("apu: error: points.csv, line 2: N: 'xxx") and len(err) < 1300
+    assert err.endswith("xxx' is not a number\n") and " ... " in err
+
+
 def test_an_unforeseen_error_is_a_sentence_with_its_place(tmp_path):
     """In a process of its own; from Python it is raised, and a variable brings the traceback."""
     code = (
