@@ -22,8 +22,11 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @contextlib.contextmanager
 def tolerant() -> Iterator[None]:
-    """Let stdout and stderr print what their encoding lacks as an escape, not fail on it."""
-    changed = []
+    """Let stdout and stderr print what their encoding lacks as an escape, and nothing if closed."""
+    changed, closed = [], [name for name in ("stdout", "stderr") if getattr(sys, name) is None]
+    for name in closed:
+        with contextlib.suppress(OSError):
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if getattr(stream, "errors", None) == "strict" and hasattr(stream, "reconfigure"):
             with contextlib.suppress(OSError, ValueError):
@@ -35,6 +38,8 @@ def tolerant() -> Iterator[None]:
         for stream in changed:
             with contextlib.suppress(OSError, ValueError):
                 stream.reconfigure(errors="strict")
+        for name in closed:
+            setattr(sys, name, None)
 
 
 def finish(status: int, *, own: bool) -> int:

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scenarios import jsontext
+from scenarios import jsontext, progress
 
 NAME = "deck"
 HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
         )
     files.folder(Path(args.out).parent)
     keep = None if args.outputs is None else [n.strip() for n in args.outputs.split(",")]
+    progress.tell(f"solving {points} points", quiet=args.json)
     t = time.perf_counter()
     deck = performance_deck(
         GasGenerator(), **axes, outputs=keep, n_threads=args.threads

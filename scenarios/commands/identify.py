@@ -16,7 +16,7 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
-from scenarios import jsontext
+from scenarios import jsontext, progress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -95,6 +95,7 @@ def run(args: argparse.Namespace) -> int:
     electrical = study.severity_study()
     trials = {}
     if args.trials:
+        progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
         for label in study.AIMS:
             trials[label] = study.snapshot_trials(
                 first, seeds=range(10_000, 10_000 + args.trials), **options, **study.VARIANTS[label]

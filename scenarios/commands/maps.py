@@ -25,10 +25,11 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi import files, results
     from apu_casadi.gasgenerator import GasGenerator
     from apu_casadi.mapplots import default_lines, plot_compressor_map, plot_turbine_map
-    from scenarios import registry
+    from scenarios import progress, registry
 
     ds = None if args.trajectory is None else results.load(args.trajectory)
     folder = registry.prepare(args.out)
+    progress.tell("drawing both maps")
     gg = GasGenerator()
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):

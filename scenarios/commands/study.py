@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from scenarios import jsontext
+from scenarios import jsontext, progress
 
 NAME = "study"
 HELP = "run a numerical study (trim)"
@@ -32,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
         raise ScenarioError(f"--points must be >= 1, got {args.points}")
     if args.threads is not None and args.threads < 1:
         raise ScenarioError(f"--threads must be >= 1, got {args.threads}")
+    progress.tell(f"trimming {args.points} points", quiet=args.json)
     report = trim_study.run(args.points, args.seed, n_threads=args.threads)
     if args.json:
         jsontext.show(report)
