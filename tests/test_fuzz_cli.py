@@ -128,7 +128,7 @@ def test_messages(odd_files, capsys, argv, message):
 APU = f"{sys.executable} -m scenarios.cli"
 SURROUNDINGS = {
     "stdout closed": (f"{APU} list >&-", {0}),
-    "stderr closed": (f"{APU} list 2>&-", {0}),
+    "stderr closed": (f"{APU} deck --altitude 0 --mach 0 --power 2e5 2>&-", {0}),
     "all closed": (f"{APU} list <&- >&- 2>&-", {0}),
     "error, stderr closed": (f"{APU} run nope 2>&-", {2}),
     "stdout full": (f"{APU} list --json > /dev/full", {2}),

@@ -124,6 +124,15 @@ def test_the_line_says_what_is_kept(monkeypatch, tmp_path):
         files.account(False)
 
 
+def test_processes_started_in_the_block_do_not_hear_ctrl_c():
+    """Also not while they start, when no handler of theirs can stand yet."""
+    code = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+    with interrupts.kept_from_children():
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "True\n"
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
 # ------------------------------------------------------------------ the command, from outside
 
 RECORD = "time,N,P3,T3,T5,Wf,PW\n" + "".join(
