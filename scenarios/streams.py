@@ -39,7 +39,10 @@ def tolerant() -> Iterator[None]:
             with contextlib.suppress(OSError, ValueError):
                 stream.reconfigure(errors="strict")
         for name in closed:
+            stream = getattr(sys, name)
             setattr(sys, name, None)
+            if stream is not None:
+                stream.close()
 
 
 def finish(status: int, *, own: bool) -> int:

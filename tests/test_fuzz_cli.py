@@ -116,6 +116,13 @@ def test_no_option_may_be_abbreviated(words, parser, capsys):
         (["deck", "--mach", "0:1e9:1000000000000"], "1000000000000 points asked for, 5000000"),
         (["deck", "--mach", "0:inf:3"], "values must be finite"),
         (["deck", "--altitude", "0:1:5000", "--mach", "0:1:5000"], "275000000 points asked for"),
+        (["deck", "--threads", "99999"], "--threads must be 1 to 1024, got 99999"),
+        (["study", "trim", "--points", "9" * 15], "--points must be 1 to 10000000, got 99999"),
+        (["campaign", "--runs", "9" * 20], "--runs must be 1 to 1000000, got 99999"),
+        (["identify", "--trials", "9" * 20], "--trials must be 0 to 1000000, got 99999"),
+        (["identify", "--prior", "inf"], "--prior: a finite number is expected, got 'inf'"),
+        (["trim", "--load", "1e5", "--voltage=nan"], "a finite number is expected, got 'nan'"),
+        (["trim", "--load", "1e5", "--voltage=-5"], "--voltage must be > 0, got -5"),
     ],
 )  # fmt: skip
 def test_messages(odd_files, capsys, argv, message):

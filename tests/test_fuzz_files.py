@@ -225,6 +225,26 @@ def test_results_of_other_than_numbers(tmp_path):
         assert words in str(e.value)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda ds: ds.drop_vars("W2"), "the trajectory lacks W2"),
+        (lambda ds: ds.assign(W2=ds["W2"].astype(str)), "other than numbers over time in W2"),
+        (lambda ds: ds.isel(time=0), "lacks a 'time' coordinate"),
+    ],
+)
+def test_a_file_that_is_no_run_is_not_drawn(tmp_path, monkeypatch, capsys, change, words):
+    from scenarios import cli
+
+    monkeypatch.chdir(tmp_path)
+    ds = synthetic_joint(waveforms=False)
+    ds = ds.assign(W2=ds["T4"], T2=ds["T4"], P2=ds["P3"], PR_c=ds["T4"])
+    results.save(change(ds), "x.nc")
+    assert cli.main(["maps", "--trajectory", "x.nc", "--no-lines"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("apu: error: x.nc: ") and words in err
+
+
 def test_a_study_that_lacks_a_part_of_itself(tmp_path):
     path = tmp_path / "correctness.json"
     write_study(path)

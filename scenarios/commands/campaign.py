@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from scenarios import jsontext
+from scenarios import jsontext, usage
 
 NAME = "campaign"
 HELP = "run many joint scenarios with random faults"
@@ -52,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
     from scenarios import campaigns, registry
 
+    usage.count("--runs", args.runs)
+    usage.count("--workers", args.workers, most=1024)
     runs = campaigns.random_faults(args.runs, args.seed, base=registry.get(args.base))
     t = time.perf_counter()
     with _bar(args.runs, show=not args.quiet and sys.stderr.isatty()) as progress:

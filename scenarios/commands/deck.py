@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scenarios import jsontext, progress
+from scenarios import jsontext, progress, usage
 
 NAME = "deck"
 HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
@@ -42,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.steadypoint import MEANING, Status
     from apu_casadi.trimbatch import performance_deck
 
+    usage.count("--threads", args.threads, most=1024)
     axes: dict[str, Any] = {
         "altitude": _axis("--altitude", args.altitude), "Mach": _axis("--mach", args.mach),
         "dT_isa": _axis("--disa", args.disa), "PW": _axis("--power", args.power),

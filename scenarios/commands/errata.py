@@ -27,12 +27,12 @@ def run(args: argparse.Namespace) -> int:
     from scenarios import errata, pages
 
     progress.tell("computing the effects, about a minute", quiet=args.json)
-    if args.write:
+    if args.write is not None:
         files.folder(Path(args.write).parent)  # not after a minute of work
         path = pages.write_text(args.write, errata.page())
     if args.json:
         jsontext.show(errata.report())
-    elif args.write:
+    elif args.write is not None:
         print(f"written: {path}")
     else:
         print(errata.page(), end="")

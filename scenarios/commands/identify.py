@@ -16,7 +16,7 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
-from scenarios import jsontext, progress
+from scenarios import jsontext, progress, usage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
     from estimators.identifiability import compare_sensors, which_to_add
     from scenarios.estimation import identify as study
 
+    usage.count("--trials", args.trials, least=0)
+    usage.count("--samples", args.samples, most=1_000_000_000)
     given = args.prior, args.eta_bias, args.samples, args.trials
     if not (args.prior > 0 and args.eta_bias >= 0 and args.samples >= 1 and args.trials >= 0):
         raise ParameterError(
