@@ -35,6 +35,7 @@ _ADVICE = {
     errno.EROFS: "write elsewhere",
     errno.ENOENT: "check the path",
     errno.ENOTDIR: "a part of the path is a file; check the path",
+    errno.EEXIST: "a file stands where a folder is needed; check the path",
     errno.EISDIR: "name a file in it",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ELOOP: "the links lead in a circle; check them",

@@ -13,6 +13,8 @@ calls :class:`watched` stands around the solvers that swallow exceptions.
 from __future__ import annotations
 
 import _signal  # the functions of signal without conversion to enums; watched() runs once a step
+import contextlib
+from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
@@ -46,6 +48,24 @@ def check() -> None:
     """Raise KeyboardInterrupt if a signal is recorded."""
     if _recorded:
         raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def kept_from_children() -> Iterator[None]:
+    """Start processes inside the block; Ctrl-C of a terminal, which reaches them too, passes by.
+
+    They inherit that SIGINT is blocked, from their first instruction on; a handler that a process
+    installs itself comes too late for one that is still importing.  Here the signal waits for the
+    end of the block, which should be short.
+    """
+    if not hasattr(_signal, "pthread_sigmask"):
+        yield
+        return
+    before = _signal.pthread_sigmask(_signal.SIG_BLOCK, {_signal.SIGINT})
+    try:
+        yield
+    finally:
+        _signal.pthread_sigmask(_signal.SIG_SETMASK, before)
 
 
 class watched:  # noqa: N801 - used like a function

@@ -366,9 +366,13 @@ def _within(ax: Axes, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _trajectory(
     ds: xr.Dataset, needed: Iterable[str], place: Callable[[Any], tuple[Any, Any]]
 ) -> tuple[np.ndarray, np.ndarray]:
+    phases(ds)  # that it is a run over time at all
     missing = [n for n in needed if n not in ds]
     if missing:
         raise DataError(f"the trajectory lacks {', '.join(missing)}")
+    wrong = [n for n in needed if ds[n].dims != ("time",) or ds[n].dtype.kind not in "fiu"]
+    if wrong:
+        raise DataError(f"the trajectory has other than numbers over time in {', '.join(wrong)}")
     x, y = place({n: ds[n].values for n in needed})
     return np.asarray(x), np.asarray(y)
 

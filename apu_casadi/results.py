@@ -218,7 +218,7 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
     ------
     DataError : no ``time`` coordinate, or an attribute that holds something else.
     """
-    if "time" not in ds.coords or ds.sizes["time"] < 2:
+    if "time" not in ds.coords or ds.sizes.get("time", 0) < 2:
         raise DataError(
             f"{_source(ds)}the dataset lacks a 'time' coordinate of at least two samples"
         )

@@ -16,6 +16,8 @@ def _answer(signum: int, frame: object) -> None:
 def _is_command() -> bool:
     """Whether this process is the command ``apu``, and not a program that imports the package."""
     name = os.path.basename(sys.argv[0]) if sys.argv else ""
+    if "--multiprocessing-fork" in sys.orig_argv:  # a worker, which has its parent's sys.argv
+        return False
     return name in ("apu", "apu.exe") or (name == "-m" and "scenarios.cli" in sys.orig_argv)
 
 

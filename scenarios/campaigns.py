@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi import interrupts
 from apu_casadi.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
 from scenarios import campaign_records, registry
 from scenarios.campaign_records import COLUMNS, RUNS, STATUS
@@ -337,8 +338,9 @@ def _pooled(
                 # few under way, so that an interrupt is answered within a run or two
                 while waiting and len(under_way) < 2 * workers and not broken:
                     try:
-                        under_way[executor.submit(_run_one, waiting[-1])] = waiting[-1]
-                        waiting.pop()
+                        with interrupts.kept_from_children():  # submitting starts processes
+                            future = executor.submit(_run_one, waiting[-1])
+                        under_way[future] = waiting.pop()
                     except BrokenProcessPool:
                         broken = True
                 for f in wait(under_way, return_when=FIRST_COMPLETED).done:

@@ -41,18 +41,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     the signal handlers come back afterwards, and an unforeseen error is raised.
     """
     with guard.Guard(own=argv is None) as g:
+        from apu_casadi import files
         from scenarios import streams
 
-        with streams.tolerant():
-            status = _guarded(argv, g)
-            return streams.finish(status, own=g.own)
+        files.account(True)
+        try:
+            with streams.tolerant():
+                return streams.finish(_guarded(argv, g), own=g.own)
+        finally:
+            files.account(False)
 
 
 def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:
-    from apu_casadi import files, interrupts
+    from apu_casadi import interrupts
     from scenarios import streams
 
-    files.account(True)
     try:
         status = _run(argv, g)
         if not interrupts.recorded():
@@ -69,8 +72,6 @@ def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:
                 raise
             guard.say(f"apu: error: {told[0]}")
             return told[1]
-    finally:
-        files.account(False)
     signum = interrupts.recorded() or 2
     g.ignore()
     guard.tell(signum)
@@ -96,6 +97,8 @@ def _run(argv: Sequence[str] | None, g: guard.Guard) -> int:
             status: int = args.run(args)
     except SystemExit as e:  # of code that a scenario brought along
         raise ScenarioError(f"the program was told to end with status {e.code!r}") from None
+    finally:
+        g.raising = not g.own  # what is left to do must not be cut short by an exception
     return status
 
 

@@ -230,7 +230,7 @@ def _wake_a_thread() -> None:
         read, write = os.pipe()
         os.set_blocking(write, False)
         _signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    except (OSError, ValueError):
+    except (AttributeError, OSError, ValueError):  # AttributeError: not on Windows
         return
     if hasattr(os, "register_at_fork"):  # a signal to a child is not one to us
         os.register_at_fork(after_in_child=lambda: _signal.set_wakeup_fd(-1))

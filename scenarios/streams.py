@@ -14,13 +14,19 @@ from apu_casadi import files
 from apu_casadi.errors import ApuError, EstimationError, OperatingPointError, SimulationError
 from scenarios import guard
 
+LONGEST = 1200
+"""Characters of a message; what a damaged file holds may be of any length."""
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
 @contextlib.contextmanager
 def tolerant() -> Iterator[None]:
-    """Let stdout and stderr print what their encoding lacks as an escape, not fail on it."""
-    changed = []
+    """Let stdout and stderr print what their encoding lacks as an escape, and nothing if closed."""
+    changed, closed = [], [name for name in ("stdout", "stderr") if getattr(sys, name) is None]
+    for name in closed:
+        with contextlib.suppress(OSError):
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if getattr(stream, "errors", None) == "strict" and hasattr(stream, "reconfigure"):
             with contextlib.suppress(OSError, ValueError):
@@ -32,6 +38,11 @@ def tolerant() -> Iterator[None]:
         for stream in changed:
             with contextlib.suppress(OSError, ValueError):
                 stream.reconfigure(errors="strict")
+        for name in closed:
+            stream = getattr(sys, name)
+            setattr(sys, name, None)
+            if stream is not None:
+                stream.close()
 
 
 def finish(status: int, *, own: bool) -> int:
@@ -93,5 +104,6 @@ def _system(e: OSError) -> str:
 
 
 def one_line(text: object) -> str:
-    """Return a text without line breaks."""
-    return " ".join(str(text).split())
+    """Return a text without line breaks; of a very long one, beginning and end."""
+    line = " ".join(str(text).split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 400]} ... {line[-300:]}"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
+import sys
 from collections.abc import Sequence
 from typing import Any
 
-from apu_casadi.errors import nearest
+from apu_casadi.errors import ScenarioError, nearest
 
 
 class Parser(argparse.ArgumentParser):
@@ -17,6 +19,7 @@ class Parser(argparse.ArgumentParser):
         """Take the arguments of :class:`argparse.ArgumentParser`."""
         # an abbreviation that works today may be another option's name tomorrow
         super().__init__(*args, **{**options, "allow_abbrev": False})
+        self.register("type", float, finite)
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -33,6 +36,35 @@ class Parser(argparse.ArgumentParser):
             known = [o for o in self._option_string_actions if o.startswith("--")]
             self.error(f"unrecognized arguments: {' '.join(unknown)} {nearest(option, known)}")
         return found, rest
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print help on stdout so that a full disk is noticed; argparse passes over it."""
+        if message and file is not None and file is sys.stdout:
+            file.write(message)
+        else:
+            super()._print_message(message, file)
+
+
+def finite(text: str) -> float:
+    """Return a finite number; every option of type float is read so."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"a finite number is expected, got {text!r}")
+    return value
+
+
+def count(option: str, value: int | None, *, least: int = 1, most: int = 1_000_000) -> None:
+    """Check a number of runs, points, seeds, threads.
+
+    Raises
+    ------
+    ScenarioError : outside the range; None, the default, is inside.
+    """
+    if value is not None and not least <= value <= most:
+        raise ScenarioError(f"{option} must be {least} to {most}, got {value}")
 
 
 class ShowVersion(argparse.Action):

@@ -114,6 +114,21 @@ def test_ctrl_c_in_a_run_waits_for_the_exchange_step(fake, capsys, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_an_interruption_says_what_was_written(fake, capsys, monkeypatch):
+    """Data and summary stand when the figures are drawn."""
+    from apu_casadi import plotting
+
+    def stopped(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(plotting, "save_figures", stopped)
+    assert cli.main(["run", "joint"]) == 130
+    assert capsys.readouterr().err == (
+        "apu: interrupted; written: results/joint/joint.nc, results/joint/summary.json; run the "
+        "same command again\n"
+    )
+
+
 def test_failed_simulation_is_status_1_and_interrupt_130(fake, capsys, monkeypatch):
     def fails(*_):
         raise OperatingPointError("beyond surge at 3.2 s")

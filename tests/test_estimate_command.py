@@ -375,15 +375,25 @@ def test_sensors_are_printed_with_sources(capsys):
     }  # fmt: skip
 
 
-def test_an_interruption_is_one_whatever_it_became():
+def test_an_interruption_is_one_whatever_it_became(monkeypatch, capsys):
     """Ctrl-C inside an integrator comes out as its failure."""
-    with pytest.raises(KeyboardInterrupt), command._interruptible():
+
+    def interrupted(args):
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt:
             raise RuntimeError("integrator failed") from None
-    with pytest.raises(ValueError, match="no interruption"), command._interruptible():
+
+    monkeypatch.setattr(command, "_sensors", interrupted)
+    assert cli.main(["estimate", "sensors"]) == 130
+    assert capsys.readouterr().err.startswith("apu: interrupted")
+
+    def failed(args):
         raise ValueError("no interruption")
+
+    monkeypatch.setattr(command, "_sensors", failed)
+    with pytest.raises(ValueError, match="no interruption"):
+        cli.main(["estimate", "sensors"])
 
 
 def test_interrupted_commands_exit_130(monkeypatch, capsys):

@@ -18,7 +18,7 @@ import os
 import sys
 from pathlib import Path
 
-from scenarios import jsontext
+from scenarios import jsontext, usage
 
 NAME = "bench"
 HELP = "measure times and their accuracy (takes minutes)"
@@ -40,14 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print, write."""
-    from apu_casadi.errors import ScenarioError
     from scenarios import bench, pages, registry
 
     if args.list:
         print("\n".join(bench.known()))
         return 0
-    if args.runs is not None and args.runs < 1:
-        raise ScenarioError(f"--runs must be >= 1, got {args.runs}")
+    usage.count("--runs", args.runs)
     if args.pycycle_python:
         os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
     size = bench.Size()

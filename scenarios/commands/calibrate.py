@@ -20,7 +20,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from scenarios import jsontext
+from scenarios import jsontext, progress
 
 if TYPE_CHECKING:
     from apu_casadi.calibration import CalibrationPoint, CalibrationResult
@@ -114,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
     if args.write_points:
         write_points(points, args.write_points)
     free = [n.strip() for n in args.free.split(",") if n.strip()] if args.free else list(FREE)
+    progress.tell(f"fitting {len(free)} numbers to {len(points)} points", quiet=args.json)
     result = calibrate(GasGenerator() if args.file else uncalibrated(), points, free)
     if args.json:
         jsontext.show(report(result))

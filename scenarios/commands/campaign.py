@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from scenarios import jsontext
+from scenarios import jsontext, usage
 
 NAME = "campaign"
 HELP = "run many joint scenarios with random faults"
@@ -58,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.conditions import day_words
     from scenarios import campaigns, notices, registry
 
+    usage.count("--runs", args.runs)
+    usage.count("--workers", args.workers, most=1024)
     runs = campaigns.random_faults(args.runs, args.seed, base=registry.get(args.base))
     t = time.perf_counter()
     kept = 0

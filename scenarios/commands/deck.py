@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from apu_casadi.conditions import DEFAULT_DAY
-from scenarios import jsontext
+from scenarios import jsontext, progress, usage
 from scenarios.commands.given import program
 
 NAME = "deck"
@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.steadypoint import MEANING, Status
     from apu_casadi.trimbatch import performance_deck
 
+    usage.count("--threads", args.threads, most=1024)
     axes: dict[str, Any] = {
         "altitude": _axis("--altitude", args.altitude), "Mach": _axis("--mach", args.mach),
         "dT_isa": _axis("--disa", args.disa), "PW": _axis("--power", args.power),
@@ -58,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
         )
     files.folder(Path(args.out).parent)
     keep = None if args.outputs is None else [n.strip() for n in args.outputs.split(",")]
+    progress.tell(f"solving {points} points", quiet=args.json)
     t = time.perf_counter()
     deck = performance_deck(
         GasGenerator(), **axes, outputs=keep, n_threads=args.threads
@@ -92,25 +94,26 @@ def _axis(option: str, text: str) -> list[float]:
 
     from apu_casadi.errors import ScenarioError
 
+    wrong = ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
     try:
         if ":" in text:
-            first, last, count = text.split(":")
-            if int(count) < 1:
-                raise ValueError
-            if int(count) > LARGEST:
-                raise ScenarioError(
-                    f"{option}: {int(count)} points asked for, {LARGEST} at most in a deck"
-                )
-            ends = float(first), float(last)
-            if not math.isfinite(ends[1] - ends[0]):
-                raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
-            values = np.linspace(*ends, int(count))
+            start, end, number = text.split(":")
+            first, last, count = float(start), float(end), int(number)
         else:
             values = np.array([float(v) for v in text.split(",")])
+            first, last, count = values[0], values[-1], values.size
+        if count < 1:
+            raise ValueError
     except ValueError:
         raise ScenarioError(
             f"{option}: FROM:TO:COUNT or a list of numbers is expected, got {text!r}"
         ) from None
+    if count > LARGEST:
+        raise ScenarioError(f"{option}: {count} points asked for, {LARGEST} at most in a deck")
+    if not math.isfinite(last - first):
+        raise wrong
+    if ":" in text:
+        values = np.linspace(first, last, count)
     if not np.all(np.isfinite(values)) or np.unique(values).size != values.size:
-        raise ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
+        raise wrong
     return [float(v) for v in values]

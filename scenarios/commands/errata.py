@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from scenarios import jsontext
+from scenarios import jsontext, progress
 
 NAME = "errata"
 HELP = "what the paper leaves open, what was chosen, and what it changes"
@@ -21,14 +21,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compute the effects; print or write the page."""
+    from pathlib import Path
+
+    from apu_casadi import files
     from scenarios import errata, pages
 
+    progress.tell("computing the effects, about a minute", quiet=args.json)
+    if args.write is not None:
+        files.folder(Path(args.write).parent)  # not after a minute of work
+        path = pages.write_text(args.write, errata.page())
     if args.json:
         jsontext.show(errata.report())
-        return 0
-    page = errata.page()
-    if args.write:
-        print(f"written: {pages.write_text(args.write, page)}")
+    elif args.write is not None:
+        print(f"written: {path}")
     else:
-        print(page, end="")
+        print(errata.page(), end="")
     return 0

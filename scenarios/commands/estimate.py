@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from scenarios import jsontext
+from scenarios import jsontext, usage
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
@@ -143,6 +143,7 @@ def _study(args: argparse.Namespace) -> int:
     names = list(studies.STUDIES) if args.study == "all" else [args.study]
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
+    usage.count("--seeds", args.seeds, least=2)
     folder = registry.prepare(args.out)
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}

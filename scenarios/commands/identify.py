@@ -17,7 +17,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.conditions import DEFAULT_DAY, day_words
-from scenarios import jsontext
+from scenarios import jsontext, progress, usage
 from scenarios.commands.given import program
 
 if TYPE_CHECKING:
@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     from estimators.identifiability import compare_sensors, which_to_add
     from scenarios.estimation import identify as study
 
+    usage.count("--trials", args.trials, least=0)
+    usage.count("--samples", args.samples, most=1_000_000_000)
     given = args.prior, args.eta_bias, args.samples, args.trials
     if not (args.prior > 0 and args.eta_bias >= 0 and args.samples >= 1 and args.trials >= 0):
         raise ParameterError(
@@ -97,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
     electrical = study.severity_study()
     trials = {}
     if args.trials:
+        progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
         for label in study.AIMS:
             trials[label] = study.snapshot_trials(
                 first, seeds=range(10_000, 10_000 + args.trials), **options, **study.VARIANTS[label]

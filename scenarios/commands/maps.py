@@ -23,15 +23,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw both maps and print the paths."""
     from apu_casadi import files, results
+    from apu_casadi.errors import DataError
     from apu_casadi.gasgenerator import GasGenerator
     from apu_casadi.mapplots import default_lines, plot_compressor_map, plot_turbine_map
-    from scenarios import registry
+    from scenarios import progress, registry
 
     ds = None if args.trajectory is None else results.load(args.trajectory)
     folder = registry.prepare(args.out)
+    progress.tell("drawing both maps")
     gg = GasGenerator()
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
         path = folder / f"{name}.png"
-        print(files.save_figure(draw(gg, lines=lines, trajectory=ds), path))
+        try:
+            figure = draw(gg, lines=lines, trajectory=ds)
+        except DataError as e:
+            said = str(e)
+            if str(args.trajectory) not in said:
+                said = f"{args.trajectory}: {said}"
+            raise DataError(said) from None
+        print(files.save_figure(figure, path))
     return 0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from scenarios import jsontext
+from scenarios import jsontext, progress
 
 NAME = "study"
 HELP = "run a numerical study (trim)"
@@ -25,13 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and print its table."""
-    from apu_casadi.errors import ScenarioError
-    from scenarios import trim_study
+    from scenarios import trim_study, usage
 
-    if args.points < 1:
-        raise ScenarioError(f"--points must be >= 1, got {args.points}")
-    if args.threads is not None and args.threads < 1:
-        raise ScenarioError(f"--threads must be >= 1, got {args.threads}")
+    usage.count("--points", args.points, most=10_000_000)
+    usage.count("--threads", args.threads, most=1024)
+    usage.count("--seed", args.seed, least=0, most=(1 << 63) - 1)
+    progress.tell(f"trimming {args.points} points", quiet=args.json)
     report = trim_study.run(args.points, args.seed, n_threads=args.threads)
     if args.json:
         jsontext.show(report)

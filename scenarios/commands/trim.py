@@ -89,6 +89,9 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.voltage is not None and args.load is None:
         raise SignalError("--voltage is that of a generator and needs --load")
+    for option, value in (("--voltage", args.voltage), ("--speed", args.speed)):
+        if value is not None and not value > 0:
+            raise SignalError(f"{option} must be > 0, got {value:g}")
     if args.speed is not None and modes[0] == "--fix":
         raise SignalError("with --fix, fix the speed by --fix N_rpm=...")
     return _generator(args) if args.voltage is not None else _gas(args, modes[0])
