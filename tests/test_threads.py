@@ -6,14 +6,17 @@ What serial calls give is the reference: each result is compared bit for bit.
 import concurrent.futures as cf
 import dataclasses
 import hashlib
+import re
 import threading
 import time
 import weakref
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
+import apu_casadi
 from apu_casadi import (
     Apu,
     FaultChange,
@@ -311,3 +314,23 @@ def test_figures_of_four_threads_are_those_of_one(tmp_path):
     got = at_once(work)
     assert dict(mpl.rcParams) == before
     assert got == [work(k) for k in range(THREADS)]
+
+
+#: Modules whose cached values are small, safe to make twice, and belong to no model.
+PLAIN_CACHES = {
+    "apu_casadi/backend.py", "apu_casadi/cachefolder.py", "apu_casadi/signals.py",
+    "estimators/fit.py",
+}  # fmt: skip
+
+
+def test_what_is_kept_is_kept_by_the_one_mechanism():
+    """functools' caches build twice, never let go of a model, and go along with a pickle."""
+    root = Path(apu_casadi.__file__).parents[1]
+    found = {
+        path.relative_to(root).as_posix()
+        for package in ("apu_casadi", "estimators", "scenarios")
+        for path in (root / package).rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.match(r"\s*@(functools\.)?(lru_cache|cache|cached_property)\b", line)
+    }
+    assert found == PLAIN_CACHES, "use derived, kept, last or once of apu_casadi.sharing"
