@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,11 +40,10 @@ def plot_costs(panels: Sequence[tuple[str, str, str, np.ndarray, np.ndarray]], n
     ------
     SignalError : no panels, more than four, or a panel with fewer than two points.
     """
-    import matplotlib as mpl
 
     if not 1 <= len(panels) <= 4:
         raise SignalError(f"one to four panels can be drawn, got {len(panels)}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(3.9)
         axes = fig.subplots(1, len(panels), squeeze=False)[0]
         fig.subplots_adjust(left=0.06, right=0.985, top=0.88, bottom=0.26, wspace=0.24)

@@ -58,7 +58,8 @@ def cache_folder() -> Path | None:
     if _writable(second):
         reason = unsafe(second)
         if reason is None:
-            say(level, f"{why}; libraries go to {second}")
+            todo = "; chmod go-w, or set APU_CACHE_DIR" if level == logging.WARNING else ""
+            say(level, f"{why}; libraries go to {second}{todo}")
             return second
         say(logging.WARNING, f"{why}, and so is {second}, {reason}; using the virtual machine")
         return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,14 +33,13 @@ def plot_eigenvalues(models: Mapping[str, LinearModel]) -> Figure:
     ------
     SignalError : no models, or more than four.
     """
-    import matplotlib as mpl
     from matplotlib.ticker import FixedLocator, FuncFormatter
 
     if not 1 <= len(models) <= len(_MARKS):
         raise SignalError(f"one to {len(_MARKS)} models can be drawn, got {len(models)}")
     modes = {label: m.eigenvalues() for label, m in models.items()}
     values = np.array([e.value for es in modes.values() for e in es])
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(5.6)
         ax = fig.add_axes((0.075, 0.19, 0.91, 0.735))
         ax.set_xscale("symlog", linthresh=_LINEAR, linscale=0.6)

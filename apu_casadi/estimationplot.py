@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +39,6 @@ def plot_gain_of_a_sensor(
     ------
     SignalError : no curves, more than four, unknown labels, or arrays of other shapes.
     """
-    import matplotlib as mpl
 
     prior = np.asarray(prior, float)
     if not 1 <= len(curves) <= len(LINE_INK):
@@ -50,7 +49,7 @@ def plot_gain_of_a_sensor(
             raise SignalError(f"{label}: shapes {shapes}, {prior.shape} expected")
     if set(aims) - set(curves):
         raise SignalError(f"aims of unknown curves: {', '.join(sorted(set(aims) - set(curves)))}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(4.6)
         left, right = fig.subplots(1, 2)
         fig.subplots_adjust(left=0.065, right=0.985, top=0.90, bottom=0.255, wspace=0.2)

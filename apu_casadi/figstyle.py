@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import textwrap
-from typing import TYPE_CHECKING
+import threading
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,12 +46,32 @@ STYLE = {
 """Settings for ``matplotlib.rc_context``."""
 
 
+#: Matplotlib keeps settings and fonts for the whole process: one thread draws at a time.
+_drawing = threading.RLock()
+
+
+@contextlib.contextmanager
+def drawing(style: Mapping[str, Any] = STYLE) -> Iterator[None]:
+    """Draw with these settings; other threads that draw or save wait."""
+    import matplotlib as mpl
+
+    with _drawing, mpl.rc_context(dict(style)):
+        yield
+
+
 def new_figure(height: float, width: float = WIDTH) -> Figure:
     """Return an empty figure of this size (in), drawn off screen by the Agg canvas."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    fig = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    class Shared(Figure):
+        """A figure that is saved while no other thread draws."""
+
+        def savefig(self, *args: Any, **more: Any) -> None:
+            with _drawing:
+                super().savefig(*args, **more)
+
+    fig = Shared(figsize=(width, height), dpi=DPI, facecolor="white")
     FigureCanvasAgg(fig)
     return fig
 

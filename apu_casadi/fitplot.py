@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +42,6 @@ def plot_fit(
     ------
     SignalError : nothing to draw, or arrays of another length.
     """
-    import matplotlib as mpl
 
     wrong = [n for n, s in series.items() if any(np.shape(a) != np.shape(t) for a in s)]
     if not series or wrong:
@@ -50,7 +49,7 @@ def plot_fit(
             f"series of {np.size(t)} values expected; wrong: {', '.join(wrong) or 'none given'}"
         )
     n = len(series)
-    with mpl.rc_context(STYLE):
+    with drawing():
         height = 1.25 * n + 1.3
         fig = new_figure(height)
         grid = fig.add_gridspec(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,11 +50,10 @@ def plot_confusion(panels: Sequence[tuple[str, Mapping[str, Any]]], note: str) -
     ------
     SignalError : no panels or more than three, or a matrix that does not fit its classes.
     """
-    import matplotlib as mpl
 
     if not 1 <= len(panels) <= 3:
         raise SignalError(f"one to three confusion matrices can be drawn, got {len(panels)}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(5.3)
         axes = fig.subplots(1, len(panels), squeeze=False)[0]
         fig.subplots_adjust(left=0.155, right=0.985, top=0.88, bottom=0.30, wspace=0.08)
@@ -84,11 +83,10 @@ def plot_kappa(
     ------
     SignalError : no panels or more than four, fewer than two rows, a value <= 0.
     """
-    import matplotlib as mpl
 
     if not 1 <= len(panels) <= 4:
         raise SignalError(f"one to four panels can be drawn, got {len(panels)}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(3.9)
         axes = fig.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         fig.subplots_adjust(left=0.06, right=0.985, top=0.88, bottom=0.26, wspace=0.08)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +71,6 @@ def plot_joint_estimate(
     ------
     SignalError : a name is missing, or an array has another length.
     """
-    import matplotlib as mpl
 
     t = np.asarray(t, float)
     needed = [f"{n}{end}" for n in NAMES for end in ("", "_sigma", "_true")]
@@ -81,7 +80,7 @@ def plot_joint_estimate(
     wrong = [n for n in needed if np.shape(data[n]) != t.shape]
     if wrong:
         raise SignalError(f"{t.size} values expected of {', '.join(wrong)}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(8.6)
         grid = fig.add_gridspec(
             4, 2, left=0.07, right=0.985, top=0.955, bottom=0.095, hspace=0.36, wspace=0.15

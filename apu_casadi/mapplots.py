@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import DataError, MapError, OperatingPointError, SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 from apu_casadi.maps import map_function
 from apu_casadi.results import phases
 from apu_casadi.steadypoint import OperatingPoint
@@ -216,12 +216,11 @@ def _draw(
     what: str,
     symbol: str,
 ) -> Figure:
-    import matplotlib as mpl
 
     lines = default_lines(gg) if lines is None else lines
     run = None if trajectory is None else _trajectory(trajectory, needed, place)
     drawn = [place(_columns(points)) for points in lines.values()]
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(6.4)
         grid = fig.add_gridspec(
             1, 2, width_ratios=[1.35, 1.0], left=0.062, right=0.985, wspace=0.17, top=0.93,

@@ -504,6 +504,7 @@ class MeanStep(Rebuilt):
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]
         self.limits = np.array([drive] if self.constant else [drive, END_TOL])
         self._iw = ss.u.index("w_r")
+        self._compiled: Caller | None = None
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the tables."""
@@ -522,7 +523,9 @@ class MeanStep(Rebuilt):
         w = float(u[self._iw])
         if not self.valid(w):
             raise SimulationError(f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table")
-        call = _caller(*self.layout, backend_in_use())
+        call = self._compiled
+        if call is None:
+            call = self._compiled = _caller(*self.layout, backend_in_use())
         held = [self.theta] if self.theta.size else []
         x, mean, miss = call(x0, self.parameters, u, *held, self.dt)
         if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):

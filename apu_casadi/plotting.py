@@ -17,6 +17,7 @@ import numpy as np
 
 from apu_casadi import files
 from apu_casadi.errors import DataError
+from apu_casadi.figstyle import drawing, new_figure
 from apu_casadi.results import RPM, phases
 from apu_casadi.runwords import fault_phase, made_with
 
@@ -78,15 +79,6 @@ def _scenario(ds: xr.Dataset) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _figure(height: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=(_WIDTH, height), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(fig)
-    return fig
 
 
 def _severity_note(ds: xr.Dataset) -> str:
@@ -186,13 +178,12 @@ def _trend(
     ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, float, str]]
 ) -> Figure:
     """Draw quantities (name, label, scale, offset, colour) over time, each with an enlargement."""
-    import matplotlib as mpl
 
     _need(ds, [c[0] for c in curves])
     rows = phases(ds)
     t = ds["time"].values
-    with mpl.rc_context(_STYLE):
-        fig = _figure(6.3)
+    with drawing(_STYLE):
+        fig = new_figure(6.3)
         data = [ds[name].values * scale + offset for name, _, scale, offset, _ in curves]
         enlarged = [_quietest(rows, t, y) for y in data]
         two = any(k is not None for k in enlarged)
@@ -333,7 +324,6 @@ def figure_20(ds: xr.Dataset) -> Figure:
     ------
     DataError : a variable is missing.
     """
-    import matplotlib as mpl
 
     factors = {"f_eta_c": "$η_c$", "f_W_c": "$W_c$", "f_eta_t": "$η_t$", "f_W_t": "$W_t$"}
     _need(ds, [*factors, "mu", "k_rf", "kappa", "P_e"])
@@ -369,8 +359,8 @@ def figure_20(ds: xr.Dataset) -> Figure:
             words = f"TTSC {first}\n{second}, {third}"
         cells.append((a, b, words, hurt if m > 0 else healthy))
     lanes.append(("Stator", cells))
-    with mpl.rc_context(_STYLE):
-        fig = _figure(3.7)
+    with drawing(_STYLE):
+        fig = new_figure(3.7)
         ax = fig.add_axes((0.125, 0.0, 0.86, 1.0))
         m = _margins(fig, top=0.45, bottom=0.8)
         ax.set_position((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
@@ -446,7 +436,6 @@ def _waves(
 
 
 def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str, short: str) -> Figure:
-    import matplotlib as mpl
 
     names = [f"{symbol}_{p}" for p in "abc"]
     rms = [f"{symbol.upper()}_{p}_rms" for p in "abc"]
@@ -458,9 +447,9 @@ def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str, short: str) 
     events = rows[1:4]
     n_rows = 1 + (2 if waves else 0) + (1 if events else 0) - (1 if waves and not events else 0)
     heights = [2.5] + [1.75] * (n_rows - 1)
-    with mpl.rc_context(_STYLE):
+    with drawing(_STYLE):
         top, bottom, gap = 0.45, 0.95, 0.72
-        fig = _figure(sum(heights) + gap * (n_rows - 1) + top + bottom)
+        fig = new_figure(sum(heights) + gap * (n_rows - 1) + top + bottom)
         mean = sum(heights) / n_rows
         outer = fig.add_gridspec(
             n_rows, 1, left=0.08, right=0.985, hspace=gap / mean, height_ratios=heights,
@@ -656,7 +645,6 @@ def figure_exchange_error(
     quantities : panels, by name with their title; four at most.
     mark : step [s] that is marked: the paper's.
     """
-    import matplotlib as mpl
     from matplotlib.lines import Line2D
     from matplotlib.ticker import FixedLocator, NullLocator
 
@@ -664,8 +652,8 @@ def figure_exchange_error(
     exchanges = list(dict.fromkeys(ex for _, ex in curves))
     dash = dict(zip(exchanges, ("-", (0, (4, 2)), (0, (1, 1.5))), strict=False))
     steps = np.unique(np.concatenate([dt for dt, _ in curves.values()]))
-    with mpl.rc_context(_STYLE):
-        fig = _figure(7.4)
+    with drawing(_STYLE):
+        fig = new_figure(7.4)
         grid = fig.add_gridspec(
             2, 2, left=0.085, right=0.985, hspace=0.3, wspace=0.2,
             **_margins(fig, top=0.65, bottom=0.85),
@@ -760,7 +748,6 @@ def figure_gas_generator(
     ------
     DataError : a variable is missing.
     """
-    import matplotlib as mpl
     from matplotlib.lines import Line2D
 
     panels = _GAS_PANELS[key]
@@ -773,8 +760,8 @@ def figure_gas_generator(
         {"name": "fuel flow +10 %, load proportional to speed cubed", "start": t_step,
          "end": t_end},
     ]  # fmt: skip
-    with mpl.rc_context(_STYLE):
-        fig = _figure(6.3)
+    with drawing(_STYLE):
+        fig = new_figure(6.3)
         grid = fig.add_gridspec(
             len(panels), 1, left=0.085, right=0.985, hspace=0.14,
             **_margins(fig, top=0.45, bottom=1.0),
@@ -831,7 +818,6 @@ def figure_18(ds: xr.Dataset, check: xr.Dataset, origin: float) -> Figure:
     ------
     DataError : a variable is missing.
     """
-    import matplotlib as mpl
 
     quantities = {"i": "Current [A]", "v": "Voltage [V]"}
     names = [f"{q}_{p}" for q in quantities for p in "abc"]
@@ -843,8 +829,8 @@ def figure_18(ds: xr.Dataset, check: xr.Dataset, origin: float) -> Figure:
         float(np.abs(ds[n].values - np.interp(t, tc, check[n].values))[np.abs(t) > 0.5].max()
               / np.abs(ds[n].values).max()) for n in names
     )  # fmt: skip
-    with mpl.rc_context(_STYLE):
-        fig = _figure(6.6)
+    with drawing(_STYLE):
+        fig = new_figure(6.6)
         grid = fig.add_gridspec(
             2, 2, width_ratios=[1.7, 1.0], left=0.08, right=0.985, hspace=0.26, wspace=0.2,
             **_margins(fig, top=0.5, bottom=0.95),
@@ -888,12 +874,11 @@ def figure_19(runs: Mapping[str, xr.Dataset], origin: float, notes: Mapping[str,
     ------
     DataError : a variable is missing.
     """
-    import matplotlib as mpl
 
     for ds in runs.values():
         _need(ds, ["i_a", "i_b", "i_c", "i_fault"])
-    with mpl.rc_context(_STYLE):
-        fig = _figure(7.8)
+    with drawing(_STYLE):
+        fig = new_figure(7.8)
         grid = fig.add_gridspec(
             3, len(runs), height_ratios=[1.5, 1, 1], left=0.08, right=0.985, hspace=0.32,
             wspace=0.17, **_margins(fig, top=0.5, bottom=0.95),

@@ -675,6 +675,7 @@ class Propagator(Rebuilt):
         self.tol = DRIVE_TOL["fine" if fine else "constant" if constant else "periodic"]
         self.limits = np.array([self.tol])
         self.layout = (gen, ss, plan, self.outputs, self.quad)  # what ``function`` depends on
+        self._compiled: Caller | None = None
         self._call_key = (gen, ss, n_out, plan, self.outputs, self.quad, constant)
         self._t = dt * (np.arange(1, n_out + 1) / n_out)  # rounded as a Stepper does
         self._angle = ss.x.index("theta_e")
@@ -720,7 +721,9 @@ class Propagator(Rebuilt):
                 f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
             )
         even, odd = self.table.at(w)
-        call = _caller(*self._call_key, backend_in_use())  # a run in blocks may never need it
+        call = self._compiled
+        if call is None:  # a run in blocks may never need it
+            call = self._compiled = _caller(*self._call_key, backend_in_use())
         if self.constant:
             x, y, mean, miss = call(x0, even, u, self.theta, self.h)
         else:

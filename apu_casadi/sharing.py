@@ -43,7 +43,7 @@ __all__ = [
     "twin",
 ]
 
-MODELS = 8  # models of each class whose stores outlive them
+MODELS = 4  # models of each class whose stores outlive them
 RESULTS = 64  # results of one function for one model; the longest unused goes first
 
 #: Held while anything is built: CasADi expressions, functions, libraries.
@@ -159,9 +159,10 @@ def keep(
     if table is not None:
         found = table.get(key, table)
         if found is not table:
-            with _TABLES:
-                if key in table:
-                    table.move_to_end(key)
+            if 2 * len(table) > limit:  # something may have to go before long
+                with _TABLES:
+                    if key in table:
+                        table.move_to_end(key)
             return found
     store = _store_of(owner)
     if locked:

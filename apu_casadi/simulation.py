@@ -333,10 +333,9 @@ def stepper(
     else:
         raise SimulationError(f"{ss.name}: at least one output per step is needed, got {n_out}")
     key = (grid.tobytes(), tuple(quad), solver, rtol, atol)
-    model = twin(ss)
     return keep(
         ss, Stepper, key,
-        lambda: Stepper(model, grid, quad=quad, solver=solver, rtol=rtol, atol=atol),
+        lambda: Stepper(twin(ss), grid, quad=quad, solver=solver, rtol=rtol, atol=atol),
     )  # fmt: skip
 
 

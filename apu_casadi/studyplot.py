@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.errors import SignalError
-from apu_casadi.figstyle import INK, LINE_INK, MUTED, STYLE, caption, new_figure, title
+from apu_casadi.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,11 +55,10 @@ def plot_consistency(
     ------
     SignalError : no panels or more than four, or curves of other lengths.
     """
-    import matplotlib as mpl
 
     if not 1 <= len(panels) <= 4:
         raise SignalError(f"one to four panels can be drawn, got {len(panels)}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(5.2)
         grid = fig.subplots(2, len(panels), squeeze=False, sharex="col")
         heads = [textwrap.fill(head, 88 // len(panels)) for head, *_ in panels]
@@ -118,11 +117,10 @@ def plot_null(
     ------
     SignalError : no panels or more than three, or curves of other lengths.
     """
-    import matplotlib as mpl
 
     if not 1 <= len(panels) <= 3:
         raise SignalError(f"one to three panels can be drawn, got {len(panels)}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(3.9)
         axes = fig.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         fig.subplots_adjust(left=0.065, right=0.985, top=0.89, bottom=0.255, wspace=0.08)
@@ -158,12 +156,11 @@ def plot_coverage(
     ------
     SignalError : nothing to draw, or groups of different quantities.
     """
-    import matplotlib as mpl
 
     names = [list(g) for g in groups.values()]
     if not names or not names[0] or any(n != names[0] for n in names):
         raise SignalError(f"groups of the same quantities expected, got {names}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(3.6)
         ax = fig.subplots()
         fig.subplots_adjust(left=0.085, right=0.985, top=0.89, bottom=0.235)
@@ -209,13 +206,12 @@ def plot_rate(
     ------
     SignalError : arrays of other lengths, or no hours.
     """
-    import matplotlib as mpl
 
     z = _same_length("rate", z, {"counts": counts, "expected": expected})
     c, e = np.asarray(counts, float), np.asarray(expected, float)
     if not hours > 0:
         raise SignalError(f"hours must be > 0, got {hours!r}")
-    with mpl.rc_context(STYLE):
+    with drawing():
         fig = new_figure(3.7)
         ax = fig.subplots()
         fig.subplots_adjust(left=0.075, right=0.985, top=0.89, bottom=0.255)

@@ -3,10 +3,13 @@
 Each test has a cache folder of its own.  What needs a compiler is skipped where there is none.
 """
 
+import gc
+import hashlib
 import logging
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -369,3 +372,258 @@ def test_an_input_buffer_filled_in_place_is_taken_as_it_is():
     np.testing.assert_array_equal(call(buffer, P)[0], want)
     with pytest.raises(BackendError, match="p has shape"):
         call(buffer, np.zeros(2))
+
+
+# ------------------------------------------------------------------------------ whose folder
+
+needs_owners = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners of files here")
+
+#: A library whose mere loading leaves a mark.
+PLANTED = """
+#include <stdio.h>
+__attribute__((constructor)) static void ran(void) {
+    FILE *f = fopen("MARK", "w");
+    if (f) fclose(f);
+}
+"""
+
+
+@pytest.fixture
+def planted(fresh, tmp_path, tmp_path_factory, monkeypatch):
+    """A known function's library replaced by one that leaves a mark, with a right sum."""
+    other = str(tmp_path_factory.mktemp("other"))
+    monkeypatch.setattr(cachefolder.tempfile, "gettempdir", lambda: other)
+    backend.compiled(pendulum())
+    forget()
+    mark, source = tmp_path / "ran", tmp_path / "planted.c"
+    source.write_text(PLANTED.replace("MARK", str(mark)))
+    (library,) = [p for p in fresh.glob("apu-*") if p.suffix in (".so", ".dylib")]
+    library.unlink()
+    command = [*backend.find_compiler(), "-shared", "-fPIC", "-o", str(library), str(source)]
+    subprocess.run(command, check=True)
+    library.chmod(0o700)
+    content = library.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    library.with_suffix(".sum").write_text(f"{len(content)} {digest}\n")
+    return mark
+
+
+@needs_compiler
+@needs_owners
+def test_the_planted_library_runs_where_the_folder_is_trusted(planted):
+    """The trap works: what follows is not refused for another reason."""
+    backend.compiled(pendulum())
+    assert planted.exists()
+
+
+def open_folder(folder):
+    folder.chmod(0o777)
+
+
+def open_to_group(folder):
+    folder.chmod(0o775)
+
+
+def sticky(folder):
+    folder.chmod(0o1777)
+
+
+def open_parent(folder):
+    folder.parent.chmod(0o777)
+
+
+def open_link(folder):
+    """The folder is reached by a link that stands in a folder open to all."""
+    real = folder.with_name("real")
+    folder.rename(real)
+    (folder.parent / "open").mkdir()
+    (folder.parent / "open").chmod(0o777)
+    link = folder.parent / "open" / "link"
+    link.symlink_to(real)
+    folder.symlink_to(link)
+
+
+def of_another(folder):
+    os.chown(folder, 65534, 65534)
+
+
+def link_of_another(folder):
+    real = folder.with_name("real")
+    folder.rename(real)
+    folder.symlink_to(real)
+    os.chown(folder, 65534, 65534, follow_symlinks=False)
+
+
+def files_of_another(folder):
+    for path in folder.iterdir():
+        os.chown(path, 65534, 65534)
+
+
+def open_files(folder):
+    for path in folder.iterdir():
+        path.chmod(0o666)
+
+
+NEEDS_ROOT = (of_another, link_of_another, files_of_another)
+
+
+@needs_compiler
+@needs_owners
+@pytest.mark.parametrize(
+    "act",
+    [open_folder, open_to_group, sticky, open_parent, open_link, open_files, *NEEDS_ROOT],
+    ids=lambda f: f.__name__,
+)
+def test_no_library_runs_that_another_user_could_have_put_there(planted, fresh, caplog, act):
+    """Refused with one line, once; a private folder, or compiling again, serves instead."""
+    if act in NEEDS_ROOT and os.getuid() != 0:
+        pytest.skip("only root gives files away")
+    caplog.set_level(logging.INFO, "apu_casadi")
+    act(fresh)
+    for _ in range(2):
+        f = pendulum()
+        made = backend.compiled(f)
+        assert made.class_name() == "External"
+        np.testing.assert_allclose(
+            backend.Caller(made)(X, P)[0], backend.Caller(f)(X, P)[0], rtol=1e-14
+        )
+    assert not planted.exists()
+    assert len(caplog.records) == 1, caplog.text
+    if act in (open_files, files_of_another):
+        assert "compiled again" in caplog.text
+    else:
+        assert "is refused" in caplog.text and caplog.records[0].levelname == "WARNING"
+        assert backend.cache_folder().parent.name.startswith("other")
+
+
+@needs_compiler
+@needs_owners
+def test_a_folder_opened_while_the_process_runs_is_refused_from_then_on(planted, fresh):
+    """Trust is not remembered."""
+    assert backend.cache_folder() == fresh
+    fresh.chmod(0o777)
+    assert backend.cache_folder() != fresh
+    backend.compiled(pendulum())
+    assert not planted.exists()
+
+
+@needs_owners
+@pytest.mark.parametrize("variable", ["APU_CACHE_DIR", "XDG_CACHE_HOME"])
+def test_each_variable_is_examined(monkeypatch, tmp_path, variable):
+    """An open place named by either; new folders are made private, their parents too."""
+    monkeypatch.delenv("APU_CACHE_DIR")
+    place = tmp_path / "a" / "b"
+    monkeypatch.setenv(variable, str(place))
+    folder = backend.cache_folder()
+    assert folder.is_relative_to(place)
+    for p in (folder, place, place.parent):
+        assert p.stat().st_mode & 0o077 == 0
+    place.chmod(0o777)
+    reason = "others can"
+    assert reason in cachefolder.unsafe(folder)
+    assert not backend.cache_folder().is_relative_to(place)
+
+
+@needs_owners
+def test_loops_and_strange_folders_have_a_reason(tmp_path):
+    """No exception, whatever stands there."""
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    assert "loop of links" in cachefolder.unsafe(loop / "x")
+    assert "cannot be examined" in cachefolder.unsafe(tmp_path / "absent" / "x")
+    inside = tmp_path / "inside"
+    inside.mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to("inside")
+    assert cachefolder.unsafe(tmp_path / "link" / ".." / "inside") is None
+
+
+# ------------------------------------------------------------------------------ compilers
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("folder", "given"),
+    [("my tools", "{}"), ("my tools", "'{}' -O0"), ("it's", "{}"), ("plain", "{} -O0 -DX=1")],
+)
+def test_a_compiler_with_blanks_or_quotes_in_its_path(monkeypatch, tmp_path, folder, given):
+    """The whole of $CC may be one path; else it is words, quoted as in a shell."""
+    place = tmp_path / folder
+    place.mkdir()
+    tool = place / "cc"
+    tool.symlink_to(backend.find_compiler()[0])
+    monkeypatch.setenv("CC", given.format(tool))
+    found = backend.find_compiler()
+    assert found[0] == str(tool)
+    assert list(found[1:]) == given.split()[1:]
+    assert backend.compiled(pendulum()).class_name() == "External"
+
+
+@pytest.mark.parametrize("text", ["'gcc", '"', "gcc 'x", "  ", "\\\\"])
+def test_quotes_that_are_not_closed_are_no_traceback(monkeypatch, text):
+    """Nothing is found, or the words are taken as they are."""
+    monkeypatch.setenv("CC", text)
+    assert backend.compiled(pendulum()) is not None
+
+
+def test_a_compilers_message_that_is_no_text(monkeypatch, tmp_path, caplog):
+    """Bytes that are not UTF-8 stand in the warning as replacements."""
+    bad = tmp_path / "bad-cc"
+    bad.write_bytes(b'#!/bin/sh\nprintf "\\377\\376 broken" >&2\nexit 1\n')
+    bad.chmod(0o755)
+    monkeypatch.setenv("CC", str(bad))
+    f = pendulum()
+    assert backend.compiled(f) is f
+    assert "broken" in caplog.text
+
+
+# ------------------------------------------------------------------------------ what is kept
+
+
+@needs_compiler
+def test_a_library_is_closed_when_nothing_uses_it(fresh):
+    """Function, caller, and what was compiled from it; then it is gone from the process."""
+    f = pendulum()
+    call = backend.Caller(backend.compiled(f))
+    batch = backend.mapped(ca.Function("one", f.mx_in(), [backend.compiled(f)(*f.mx_in())[0]]), 1)
+    assert len(backend._loaded) == 1 and "pendulum" in backend.loaded_functions()
+    call(X, P)
+    del f, call
+    batch(X, np.array([P]))
+    if sys.platform == "linux":
+        assert str(fresh) in Path("/proc/self/maps").read_text()
+    del batch
+    assert not backend._loaded and not backend._compiled
+    if sys.platform == "linux":
+        assert str(fresh) not in Path("/proc/self/maps").read_text()
+
+
+def test_units_that_are_gone_keep_nothing_but_the_last_few():
+    """However many are made; those in use keep what they have."""
+    from apu_casadi import Generator, sharing
+    from apu_casadi.machine.parameters import MachineParameters
+
+    held = Generator(MachineParameters(r_s=0.0049))
+    space = held.state_space()
+    gc.collect()
+    before = len(sharing._stores)
+    for k in range(3 * sharing.MODELS):
+        Generator(MachineParameters(r_s=0.005 + 1e-5 * k)).state_space()
+    # without the garbage collector: nothing holds a circle
+    assert len(sharing._stores) <= before + sharing.MODELS + 1
+    assert len(sharing._recent[Generator]) == sharing.MODELS
+    assert held.state_space() is space
+    again = Generator(MachineParameters(r_s=0.0049))
+    assert again.state_space() is space
+
+
+def test_results_of_one_model_are_bounded():
+    """The longest unused goes first."""
+    from apu_casadi import sharing
+
+    class Owner:
+        pass
+
+    owner, made = Owner(), []
+    for k in [0, 1, 2, 0, 3, 0, 1]:
+        sharing.keep(owner, "square", k, lambda k=k: made.append(k) or k * k, limit=3)
+    assert made == [0, 1, 2, 3, 1]

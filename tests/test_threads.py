@@ -6,14 +6,17 @@ What serial calls give is the reference: each result is compared bit for bit.
 import concurrent.futures as cf
 import dataclasses
 import hashlib
+import re
 import threading
 import time
 import weakref
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
+import apu_casadi
 from apu_casadi import (
     Apu,
     FaultChange,
@@ -269,3 +272,65 @@ def test_one_path_saved_by_four_threads_holds_one_whole_result(tmp_path):
     at_once(lambda k: [save(runs[k % 2], path) for _ in range(5)])
     assert digest(load(path)) in [digest(r) for r in runs]
     assert [p.name for p in tmp_path.iterdir()] == ["same.nc"]
+
+
+def test_a_long_call_of_one_thread_keeps_no_other_waiting():
+    """Compiled code runs without any lock: short calls of the same object go on beside it."""
+    source = SeriesLoad.from_power(1e5)
+    point = Apu().generator.steady_state(source)
+    step, ended, count = stepper(point.ss, 1), threading.Event(), 0
+    u = point.u.copy()
+    u[point.ss.u.index("w_r")] *= 1.02
+
+    def long():
+        step(point.x, u, dt=5.0)
+        ended.set()
+
+    t = threading.Thread(target=long)
+    t.start()
+    while not ended.is_set():
+        step(point.x, u, dt=1e-4)
+        count += 1
+    t.join()
+    assert count > 2  # one may begin before, and one end after it
+
+
+def test_figures_of_four_threads_are_those_of_one(tmp_path):
+    """Matplotlib's settings belong to the process: threads take turns, and nothing stays."""
+    import matplotlib as mpl
+
+    from apu_casadi.figstyle import drawing, new_figure
+
+    def work(k):
+        with drawing():
+            fig = new_figure(2.0, 3.0)
+            ax = fig.add_subplot()
+            ax.plot([0, 1, k])
+        path = tmp_path / f"{k}-{threading.get_ident()}.png"
+        fig.savefig(path, metadata={"Software": None})
+        return path.read_bytes()
+
+    before = dict(mpl.rcParams)
+    got = at_once(work)
+    assert dict(mpl.rcParams) == before
+    assert got == [work(k) for k in range(THREADS)]
+
+
+#: Modules whose cached values are small, safe to make twice, and belong to no model.
+PLAIN_CACHES = {
+    "apu_casadi/backend.py", "apu_casadi/cachefolder.py", "apu_casadi/signals.py",
+    "estimators/fit.py",
+}  # fmt: skip
+
+
+def test_what_is_kept_is_kept_by_the_one_mechanism():
+    """functools' caches build twice, never let go of a model, and go along with a pickle."""
+    root = Path(apu_casadi.__file__).parents[1]
+    found = {
+        path.relative_to(root).as_posix()
+        for package in ("apu_casadi", "estimators", "scenarios")
+        for path in (root / package).rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.match(r"\s*@(functools\.)?(lru_cache|cache|cached_property)\b", line)
+    }
+    assert found == PLAIN_CACHES, "use derived, kept, last or once of apu_casadi.sharing"
