@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         from apu_casadi.eigenplot import plot_eigenvalues
         from scenarios import registry
 
-        label = f"{_load(args)}, {day_words(ambient_of(args))}"
+        label = f"{_load(args)} each, {day_words(ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
         plot_eigenvalues({label: model}).savefig(path)
     if args.json:
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _load(args: argparse.Namespace) -> str:
     kind = "constant power" if args.constant_power else f"power factor {args.power_factor:g}"
-    return f"{args.power:g} kW each at 230 V, {kind}"
+    return f"{args.power:g} kW at 230 V, {kind}"
 
 
 def linear_model(args: argparse.Namespace) -> LinearModel:
