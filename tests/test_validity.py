@@ -387,13 +387,13 @@ def test_attributes_tell_what_was_asked(apu):
 
 
 def test_the_truth_of_an_estimation_is_judged_too():
-    """It runs with other steps and its own call; its attributes go on into those of the estimate."""
+    """It runs with other steps and its own call; the estimate takes over its attributes."""
     from scenarios.estimation import jointrun
 
     table = {
         "name": "hot", "duration": 0.06,
         "phase": [{"name": "worn", "start": 0.0, "load": {"kind": "R", "power_kW": 225.0},
-                   "health": {"f_eta_c": 0.88}}],
+                   "health": {"f_eta_c": 0.85}}],
     }  # fmt: skip
     ds, raised = quietly(jointrun.truth, Scenario.from_dict(table))
     assert [r["quantity"] for r in json.loads(ds.attrs["validity"])] == ["T4"]
