@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.conditions import DEFAULT_DAY
+from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY
 from apu_casadi.errors import DataError, ParameterError, nearest
 from scenarios.commands.given import ambient_arguments, ambient_given, program
 
@@ -274,6 +274,8 @@ def _data(
             ambient[name] = table.get(name, U[name].unit, difference=name == "dT_isa")
         elif name in said:
             ambient[name] = said[name]
+        if name in ambient:
+            _in_range(table.source, name, ambient[name])
     rows = np.arange(table.size, dtype=float) if t is None else t - t[0]
     # rows in which nothing was read are no points
     there = np.any([np.isfinite(readings[n]) for n in measured], axis=0)
@@ -282,6 +284,21 @@ def _data(
         ambient = {n: v if np.ndim(v) == 0 else v[there] for n, v in ambient.items()}
         rows = rows[there]
     return EngineData(table.source, rows, readings, ambient)
+
+
+def _in_range(source: str, name: str, value: Any) -> None:
+    """Refuse ambient conditions that the engine is not meant for; gaps are refused later."""
+    import numpy as np
+
+    c, a = CONDITIONS[name], np.atleast_1d(np.asarray(value, float))
+    wrong = np.flatnonzero((a < c.lo) | (a > c.hi))
+    if wrong.size:
+        k = int(wrong[0])
+        where = f", data row {k + 1}" if np.ndim(value) else ""
+        raise DataError(
+            f"{source}{where}: {name} = {a[k]:g} {c.unit} is outside [{c.lo:g}, {c.hi:g}]"
+            + (f" ({wrong.size} such rows)" if wrong.size > 1 else "")
+        )
 
 
 def _assumed(data: Sequence[EngineData]) -> dict[str, float]:
