@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY
+from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY, day_words
 from apu_casadi.errors import DataError, ParameterError, nearest
 from scenarios.commands.given import ambient_arguments, ambient_given, program
 
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
                 print(f"profile of {name} ...", file=sys.stderr, flush=True)
             if name not in fit.result.at_bound:
                 profiles.append(profile(fit.result, name))
-    figures = _draw(fit, args.figure, steady) if args.figure else []
+    figures = _draw(fit, args.figure, steady, [d.ambient for d in data]) if args.figure else []
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["recorded_ambient"] = {
@@ -489,7 +489,16 @@ def text(found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _draw(fit: EngineFit, path: str, steady: bool) -> list[Path]:
+def _day(ambient: Mapping[str, Any]) -> str:
+    """Ambient conditions in words; those that change from row to row by their name alone."""
+    import numpy as np
+
+    fixed = {n: float(v) for n, v in ambient.items() if np.ndim(v) == 0}
+    moving = [n for n in ambient if n not in fixed]
+    return day_words(fixed) + (f", but {' and '.join(moving)} as recorded" if moving else "")
+
+
+def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]]) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
     from apu_casadi.fitplot import plot_fit
     from apu_casadi.gasgenerator import GasGenerator
@@ -507,7 +516,8 @@ def _draw(fit: EngineFit, path: str, steady: bool) -> list[Path]:
         t = fit.recordings[k].t
         fig = plot_fit(
             t + 1 if steady else t, fit.series(k), units, steady=steady,
-            heading=f"{name}: measured and fitted", note=f"95 %: {note}.",
+            heading=f"{name}: measured and fitted",
+            note=f"95 %: {note}. Ambient: {_day(days[k])}; {program()}.",
         )  # fmt: skip
         try:
             fig.savefig(target)

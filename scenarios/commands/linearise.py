@@ -54,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
 
         label = f"{_load(args)} each, {day_words(ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
-        plot_eigenvalues({label: model}).savefig(path)
+        note = f"Load {label}; healthy; {program()}."
+        plot_eigenvalues({label: model}, note).savefig(path)
     if args.json:
         given = {
             "ambient": ambient_of(args),
