@@ -19,7 +19,7 @@ _LINEAR = 0.3  # 1/s; between plus and minus this the axes are linear
 _MARKS = ("o", "s", "^", "D")
 
 
-def plot_eigenvalues(models: Mapping[str, LinearModel]) -> Figure:
+def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figure:
     """Draw the eigenvalues of one or more models, named by the state that takes most part.
 
     Both axes are logarithmic but near zero, since the machine's fastest mode decays 10 000 times
@@ -28,6 +28,7 @@ def plot_eigenvalues(models: Mapping[str, LinearModel]) -> Figure:
     Parameters
     ----------
     models : up to four linear models by label; the first one's modes are named.
+    note : added to the caption: where the models hold.
 
     Raises
     ------
@@ -87,11 +88,11 @@ def plot_eigenvalues(models: Mapping[str, LinearModel]) -> Figure:
             ax.legend(
                 loc="lower left", fontsize=8.2, frameon=True, framealpha=0.92, edgecolor="none"
             )
-        caption(
-            fig,
+        text = (
             "Named by the state that takes most part in the mode. Shaded: unstable. Dashed: "
-            f"constant damping ratio. Both axes are logarithmic beyond ±{_LINEAR:g}.",
+            f"constant damping ratio. Both axes are logarithmic beyond ±{_LINEAR:g}."
         )
+        caption(fig, f"{text} {note}".strip())
         return fig
 
 

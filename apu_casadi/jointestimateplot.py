@@ -81,9 +81,9 @@ def plot_joint_estimate(
     if wrong:
         raise SignalError(f"{t.size} values expected of {', '.join(wrong)}")
     with drawing():
-        fig = new_figure(8.6)
+        fig = new_figure(8.9)
         grid = fig.add_gridspec(
-            4, 2, left=0.07, right=0.985, top=0.955, bottom=0.095, hspace=0.36, wspace=0.15
+            4, 2, left=0.07, right=0.985, top=0.955, bottom=0.12, hspace=0.36, wspace=0.15
         )
         axes: list[Axes] = []
         for k, (name, words, unit, scale) in enumerate(_PANELS):

@@ -285,6 +285,25 @@ def test_what_a_run_accepts_the_engine_accepts(apu, name, end):
             refused()
 
 
+@pytest.mark.parametrize("name", AMBIENT)
+def test_a_fit_takes_no_day_that_the_engine_refuses(healthy, name, tmp_path, capsys):
+    """An option and a column beyond the range are refused with file, row, value and range."""
+    c = CONDITIONS[name]
+    beyond = c.hi * 1.5
+    assert cli.main(["fit", str(healthy[1]), "--steady", OPTIONS[name], f"{beyond}"]) == 2
+    assert f"bench.csv: {name} = {beyond:g} {c.unit} is outside" in capsys.readouterr().err
+    rows = healthy[1].read_text(encoding="utf-8").splitlines()
+    path = tmp_path / "column.csv"
+    cells = [c.default, *[beyond] * (len(rows) - 2)]
+    text = [f"{rows[0]},{name}"]
+    text += [f"{r},{v}" for r, v in zip(rows[1:], cells, strict=True)]
+    path.write_text("\n".join(text), encoding="utf-8")
+    assert cli.main(["fit", str(path), "--steady"]) == 2
+    err = capsys.readouterr().err
+    assert f"column.csv, data row 2: {name} = {beyond:g} {c.unit} is outside" in err
+    assert f"({len(rows) - 2} such rows)" in err
+
+
 def test_words():
     assert day_words({"dT_isa": -12.5, "war": 0.01}) == (
         "0 m, Mach 0, ISA - 12.5 K, 0.01 kg/kg of water"

@@ -26,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.conditions import DEFAULT_DAY
+from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY, day_words
 from apu_casadi.errors import DataError, ParameterError, nearest
 from scenarios import jsontext
 from scenarios.commands.given import ambient_arguments, ambient_given, program
@@ -171,7 +171,7 @@ def run(args: argparse.Namespace) -> int:
                 print(f"profile of {name} ...", file=sys.stderr, flush=True)
             if name not in fit.result.at_bound:
                 profiles.append(profile(fit.result, name))
-    figures = _draw(fit, args.figure, steady) if args.figure else []
+    figures = _draw(fit, args.figure, steady, [d.ambient for d in data]) if args.figure else []
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["read_as"] = [*notes, *_unheeded(tables, times, args)]
@@ -317,6 +317,8 @@ def _data(
             ambient[name] = table.get(name, U[name].unit, difference=name == "dT_isa")
         elif name in said:
             ambient[name] = said[name]
+        if name in ambient:
+            _in_range(table.source, name, ambient[name])
     rows = np.arange(table.size, dtype=float) if t is None else t - t[0]
     # rows in which nothing was read are no points
     there = np.any([np.isfinite(readings[n]) for n in measured], axis=0)
@@ -325,6 +327,21 @@ def _data(
         ambient = {n: v if np.ndim(v) == 0 else v[there] for n, v in ambient.items()}
         rows = rows[there]
     return EngineData(table.source, rows, readings, ambient)
+
+
+def _in_range(source: str, name: str, value: Any) -> None:
+    """Refuse ambient conditions that the engine is not meant for; gaps are refused later."""
+    import numpy as np
+
+    c, a = CONDITIONS[name], np.atleast_1d(np.asarray(value, float))
+    wrong = np.flatnonzero((a < c.lo) | (a > c.hi))
+    if wrong.size:
+        k = int(wrong[0])
+        where = f", data row {k + 1}" if np.ndim(value) else ""
+        raise DataError(
+            f"{source}{where}: {name} = {a[k]:g} {c.unit} is outside [{c.lo:g}, {c.hi:g}]"
+            + (f" ({wrong.size} such rows)" if wrong.size > 1 else "")
+        )
 
 
 def _assumed(data: Sequence[EngineData]) -> dict[str, float]:
@@ -530,7 +547,16 @@ def text(found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _draw(fit: EngineFit, path: str, steady: bool) -> list[Path]:
+def _day(ambient: Mapping[str, Any]) -> str:
+    """Ambient conditions in words; those that change from row to row by their name alone."""
+    import numpy as np
+
+    fixed = {n: float(v) for n, v in ambient.items() if np.ndim(v) == 0}
+    moving = [n for n in ambient if n not in fixed]
+    return day_words(fixed) + (f", but {' and '.join(moving)} as recorded" if moving else "")
+
+
+def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]]) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
     from apu_casadi import files
     from apu_casadi.fitplot import plot_fit
@@ -548,7 +574,8 @@ def _draw(fit: EngineFit, path: str, steady: bool) -> list[Path]:
         t = fit.recordings[k].t
         fig = plot_fit(
             t + 1 if steady else t, fit.series(k), units, steady=steady,
-            heading=f"{name}: measured and fitted", note=f"95 %: {note}.",
+            heading=f"{name}: measured and fitted",
+            note=f"95 %: {note}. Ambient: {_day(days[k])}; {program()}.",
         )  # fmt: skip
         made.append(files.save_figure(fig, target))
     return made

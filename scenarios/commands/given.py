@@ -28,7 +28,7 @@ def ambient_arguments(parser: argparse.ArgumentParser, *, otherwise: str = "") -
         unit = "" if c.unit == "1" else f", {c.unit}"
         parser.add_argument(
             *flags, metavar=_METAVAR[name], type=float, dest=name,
-            help=f"{c.doc}{unit} (default {otherwise}{c.default:g})",
+            help=f"{c.doc}{unit} (default: {otherwise}{c.default:g})",
         )  # fmt: skip
 
 

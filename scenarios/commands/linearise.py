@@ -53,9 +53,10 @@ def run(args: argparse.Namespace) -> int:
         from apu_casadi.eigenplot import plot_eigenvalues
         from scenarios import registry
 
-        label = f"{_load(args)}, {day_words(ambient_of(args))}"
+        label = f"{_load(args)} each, {day_words(ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
-        files.save_figure(plot_eigenvalues({label: model}), path)
+        note = f"Load {label}; healthy; {program()}."
+        files.save_figure(plot_eigenvalues({label: model}, note), path)
     if args.json:
         given = {
             "ambient": ambient_of(args),
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _load(args: argparse.Namespace) -> str:
     kind = "constant power" if args.constant_power else f"power factor {args.power_factor:g}"
-    return f"{args.power:g} kW each at 230 V, {kind}"
+    return f"{args.power:g} kW at 230 V, {kind}"
 
 
 def linear_model(args: argparse.Namespace) -> LinearModel:
