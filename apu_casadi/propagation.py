@@ -507,11 +507,14 @@ def leap(
     if m % 2:
         V1, V1_dot = V_of(end, u, th)
         Vm = (V[0] + V1) / 2 + H / 8 * (V[1] - V1_dot)
-        # Under a light load a new speed moves the voltage within L''/R, far less than H: the slope
-        # at the start then says nothing of what follows, which is the straight line to the end.
-        change = ca.fabs(V1 - V[0]) + H * ca.fabs(V1_dot) + 1e-9 * p.V_rated_rms
-        layer = H * ca.fabs(V[1]) > LAYER * change
-        V0, Vm = (ca.if_else(layer, V1 - H * f * V1_dot, v) for f, v in ((1, V[0]), (0.5, Vm)))
+        V0 = V[0]
+        if constant:
+            # Under a light load a new speed moves the voltage within L''/R, far less than H: the
+            # slope at the start then says nothing of what follows, a straight line to the end.
+            change = ca.fabs(V1 - V[0]) + H * ca.fabs(V1_dot) + 1e-9 * p.V_rated_rms
+            layer = H * ca.fabs(V[1]) > LAYER * change
+            V0 = ca.if_else(layer, V1 - H * V1_dot, V0)
+            Vm = ca.if_else(layer, V1 - H / 2 * V1_dot, Vm)
     else:
         V1, V1_dot = V_of(end, u, th)[0], ca.SX.nan()  # the rate is not needed
         V0, Vm = V[0], V_of(samples[m // 2 - 1], u, th)[0]
