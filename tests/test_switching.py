@@ -123,3 +123,21 @@ def test_tolerances_follow_the_resistance():
     """Nothing below 1 kohm, in proportion above it, 1e-2 at least."""
     loads = (KW225, ConstantPowerLoad(1e5), OpenLoad(1e3), OpenLoad(1e4), OpenLoad(1e6))
     assert [fineness(load) for load in loads] == [1.0, 1.0, 1.0, 0.1, 0.01]
+
+
+@pytest.mark.parametrize("neutral", ["grounded", "isolated"])
+@pytest.mark.parametrize("load", [
+    SeriesLoad(R=(0.7053, 0.7053, 1e-9)), SeriesLoad(R=(0.7053,) * 3, L=(0.0, 0.0, 1e6)),
+], ids=["shorted", "inductance"])  # fmt: skip
+def test_extreme_loads_by_two_solvers(load, neutral):
+    """A shorted phase, and one open by an inductance: CVODES and IDAS to 2e-6 of rated voltage.
+
+    The inductance keeps the current that it was switched on with, a constant one.
+    """
+    gen = Generator(neutral=neutral)
+    a, b = (
+        gen.simulate(KW225, 0.04, switches=[(0.01, load)], solver=s) for s in ("cvodes", "idas")
+    )
+    late = slice(0.03, None)
+    for n in ("v_a", "v_b", "v_c"):
+        assert_allclose(b[n].sel(time=late), a[n].sel(time=late), atol=2e-6 * 325, rtol=0)
