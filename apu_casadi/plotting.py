@@ -483,7 +483,7 @@ def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str, short: str) 
         if events:
             _rms_row(fig, outer[row], ds, rms, events, rows, short)
         more = (
-            "Envelope: extremes of all samples. Enlarged rms: over eight full cycles. "
+            "Envelope: extremes of all samples. Enlarged rms: of each exchange step. "
             if waves
             else ""
         )
@@ -560,7 +560,6 @@ def _rms_row(
     """Draw the rms values around the beginning of every later phase, each on its own scale."""
     grid = spec.subgridspec(1, len(events), wspace=0.23)
     t = ds["time"].values
-    tw = ds["time_w"].values if "time_w" in ds.coords else None
     for k, p in enumerate(events):
         ax = fig.add_subplot(grid[k])
         ink = _colour(k + 1)[1]
@@ -572,11 +571,6 @@ def _rms_row(
         drawn = []
         for name in rms:
             x, y = t[inside], ds[name].values[inside]
-            if tw is not None:
-                a, b = np.searchsorted(tw, (lo - 1e-9, hi + 1e-9))
-                wave = ds[f"{name[0].lower()}_{name[2]}"].values[a:b]
-                cycles = cycle_rms(tw[a:b], wave, 8)
-                x, y = cycles if cycles[0].size > 1 else (x, y)
             ax.plot(x, y, color=_ABC[name[2]], lw=_NESTED[name[2]], zorder=3)
             drawn.append(y)
         ax.set_xlim(lo, hi)

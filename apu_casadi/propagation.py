@@ -47,8 +47,8 @@ HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goe
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; a
 #: quarter acts on average.  Where coefficients are constant a larger one tells of a limit met.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 1e-5, "fine": 2e-5}
-#: Slope of the terminal voltage at the start of a step, over its change in it, from which on the
-#: voltage has moved within far less than the step; 1.3 at rated load.
+#: Slope of the terminal voltage at the start of a step, over its change in it and its slope at the
+#: end, from which on the voltage has moved within far less than the step; 1.3 at rated load.
 LAYER = 4.0
 EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
@@ -506,10 +506,14 @@ def leap(
     if m % 2:
         V1, V1_dot = V_of(end, u, th)
         Vm = (V[0] + V1) / 2 + H / 8 * (V[1] - V1_dot)
-        # Under a light load a new speed moves the voltage within L''/R, far less than H: the slope
-        # at the start then says nothing of what follows, which is the straight line to the end.
-        layer = H * ca.fabs(V[1]) > LAYER * (ca.fabs(V1 - V[0]) + 1e-9 * p.V_rated_rms)
-        V0, Vm = (ca.if_else(layer, V1 - H * f * V1_dot, v) for f, v in ((1, V[0]), (0.5, Vm)))
+        V0 = V[0]
+        if constant:
+            # Under a light load a new speed moves the voltage within L''/R, far less than H: the
+            # slope at the start then says nothing of what follows, a straight line to the end.
+            change = ca.fabs(V1 - V[0]) + H * ca.fabs(V1_dot) + 1e-9 * p.V_rated_rms
+            layer = H * ca.fabs(V[1]) > LAYER * change
+            V0 = ca.if_else(layer, V1 - H * V1_dot, V0)
+            Vm = ca.if_else(layer, V1 - H / 2 * V1_dot, Vm)
     else:
         V1, V1_dot = V_of(end, u, th)[0], ca.SX.nan()  # the rate is not needed
         V0, Vm = V[0], V_of(samples[m // 2 - 1], u, th)[0]
