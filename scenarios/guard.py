@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from types import FrameType
     from typing import Any
 
-GRACE = 0.8
+GRACE = 0.6
 """Seconds between a signal and the end of the process at the latest."""
 
-CHILDREN = 0.4
+CHILDREN = 0.3
 """Seconds after which processes that were started are killed; a pool then ends in order."""
 
 AGAIN = "run the same command again"

@@ -22,7 +22,7 @@ from apu_casadi.interrupts import watched
 from scenarios import guard
 
 ANSWER = 3.0
-"""Seconds allowed for an answer that takes 0.8 s at most on a machine with nothing else to do."""
+"""Seconds allowed for an answer that takes 0.6 s at most on a machine with nothing else to do."""
 
 
 @pytest.fixture

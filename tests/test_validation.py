@@ -40,3 +40,18 @@ def test_unknown_sections_are_refused_with_the_nearest():
     """A typo is answered with the section meant."""
     with pytest.raises(ScenarioError, match="table5"):
         validation.run("tabel5")
+
+
+def test_json_takes_rows_of_numpy_numbers_that_fall_short(monkeypatch, capsys):
+    """Peers return NumPy's numbers, and the verdict on them must be Python's."""
+    import json
+
+    import numpy as np
+
+    from scenarios import cli
+
+    row = validation.Row("T4", "K", 1.0, np.float64(1.1), np.float64(0.1), 1e-3, "why", "check")
+    assert type(row.passed) is bool and not row.passed
+    monkeypatch.setattr(validation, "sections", lambda: {"x": ("title", lambda: [row])})
+    assert cli.main(["validate", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["sections"]["x"][0]["passed"] is False
