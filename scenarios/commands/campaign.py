@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from scenarios import jsontext, usage
+from scenarios import guard, jsontext, usage
 
 NAME = "campaign"
 HELP = "run many joint scenarios with random faults"
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
             )  # fmt: skip
     except KeyboardInterrupt:
         again = "the same command without --fresh" if args.fresh else "the same command"
-        say(f"{kept} of {args.runs} runs are kept in {args.out}; {again} goes on with them")
+        guard.note(f"{kept} of {args.runs} runs are kept in {args.out}; {again} goes on with them")
         raise
     t = time.perf_counter() - t
     n = campaigns.counts(ds)
