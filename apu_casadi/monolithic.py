@@ -117,7 +117,8 @@ def joint_state_space(
 
 def _integral(gen: StateSpace, name: str) -> Signal:
     term = Term.of(name)
-    unit = "1" if term.base == "1" else gen.y[term.base].unit
+    output = f"{term.base}_a" if term.base in ("v", "i") else term.base
+    unit = "1" if output == "1" else gen.y[output].unit
     # over one output interval, some 20 ms, and not over the run: hence the factor
     return Signal(
         f"int_{re.sub(r'[~^*]', '_', name)}",
@@ -173,21 +174,26 @@ def simulate_monolithic(
     grid = exchange_grid(duration, dt, pending)
     point = apu.steady_state(load, ambient=ambient, health=factors)
     V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
-    quad = (*MEANS, *wanted(phasors=False, short=True, symmetric=False))
     amb = dataclasses.astuple(ambient)
     fault: Ttsc | None = None
 
+    def symmetric() -> bool:
+        return fault is None and load.balanced
+
+    def asked() -> tuple[str, ...]:
+        """Return the means that this load and fault need."""
+        return (*MEANS, *wanted(phasors=False, short=True, symmetric=symmetric()))
+
     def variant() -> tuple[StateSpace, StateSpace, np.ndarray, np.ndarray]:
         """Return joint model, generator model, inputs and parameters of load and fault now."""
-        ss = joint_state_space(apu, load.kind, gen.fault_kind(load, fault), quad)
+        ss = joint_state_space(apu, load.kind, gen.fault_kind(load, fault), asked())
         u_sg = gen.inputs(load, w_r=w_r, V_ref=V_ref)
         rest = np.delete(u_sg, gen.variant(load, fault).u.index("w_r"))
         theta = np.concatenate([gg.THETA.pack(factors), gen.fault_vector(load, fault)])
         return ss, gen.variant(load, fault), np.concatenate([amb, rest, [dt]]), theta
 
-    ss, sg, u, theta = variant()
-    zero = np.zeros(1 + len(quad))
-    x = np.concatenate([point.gas.x, [point.gas["Wf"]], point.generator.x, zero])
+    (ss, sg, u, theta), quad = variant(), asked()
+    x = np.concatenate([point.gas.x, [point.gas["Wf"]], point.generator.x, np.zeros(1 + len(quad))])
     K = grid.size - 1
     Y = np.empty((len(gg.Y), K + 1))
     averages = {name: np.empty(K + 1) for name in (*MEANS, *RMS)}
@@ -211,7 +217,7 @@ def simulate_monolithic(
                 fault = event.fault
         if changed:  # all that comes at one instant is one switch
             w_r = apu.w_r(float(x[0]))
-            ss, sg, u, theta = variant()
+            (ss, sg, u, theta), quad = variant(), asked()
             x_sg = gen.transfer(
                 x[2 : 2 + n_sg], old, sg,
                 u=gen.inputs(old_load, w_r=w_r, V_ref=V_ref),
@@ -219,7 +225,7 @@ def simulate_monolithic(
                 u_target=gen.inputs(load, w_r=w_r, V_ref=V_ref),
                 theta_target=gen.fault_vector(load, fault),
             )  # fmt: skip
-            x, n_sg = np.concatenate([x[:2], x_sg, zero]), len(sg.x)
+            x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(1 + len(quad))]), len(sg.x)
         x[2 + n_sg :], u[-1] = 0.0, h
         angle = float(x[ss.x.index("theta_e")])
         fine = fineness(load)
@@ -235,8 +241,7 @@ def simulate_monolithic(
         nsteps += int(r.stats["nsteps"])
         Y[:, k] = r.y[: len(gg.Y), -1]
         means = as_dict(quad, x[3 + n_sg :, None] / h)
-        symmetric = fault is None and load.balanced
-        rms = settled(means, turn=turn, symmetric=symmetric, phasors=False)
+        rms = settled(means, turn=turn, symmetric=symmetric(), phasors=False)
         for name, value in zip(averages, (*(means[n] for n in MEANS), *rms), strict=True):
             averages[name][k] = value.item()
         worst = max(worst, float(Y[gg.Y.index("residual"), k]))

@@ -257,6 +257,7 @@ def simulate_joint(
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
     slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
+    load_now, fault_now = load, fault
 
     free = hook is None and not (noise.N or noise.w1 or noise.w2)
     k = 0
@@ -269,12 +270,12 @@ def simulate_joint(
                 factors.update(event.factors)
                 theta = gg.THETA.pack(factors)
             elif isinstance(event, LoadChange):
-                load = event.load
+                load_now = event.load
             elif isinstance(event, FaultChange):
-                fault = event.fault
+                fault_now = event.fault
         # all that comes at one instant is one switch, whatever its order
-        if load != machine.load or fault != machine.fault:
-            machine.switch(load, fault, t0)
+        if load_now != machine.load or fault_now != machine.fault:
+            machine.switch(load_now, fault_now, t0)
             slope = None
         until = pending[0].t if pending else duration
         if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + GRID_TOL:

@@ -300,6 +300,12 @@ def test_a_fit_takes_no_day_that_the_engine_refuses(healthy, name, tmp_path, cap
     path.write_text("\n".join(text), encoding="utf-8")
     assert cli.main(["fit", str(path), "--steady"]) == 2
     err = capsys.readouterr().err
+    assert f"column.csv, column {name}, data row 2, line 3: " in err
+    assert f"{beyond:g}" in err and f"{c.lo:g} to {c.hi:g}" in err
+    # whoever widens the range of readings does not widen the engine's
+    wide = ["--range", f"{name}=-1e9:1e9"]
+    assert cli.main(["fit", str(path), "--steady", *wide]) == 2
+    err = capsys.readouterr().err
     assert f"column.csv, data row 2: {name} = {beyond:g} {c.unit} is outside" in err
     assert f"({len(rows) - 2} such rows)" in err
 

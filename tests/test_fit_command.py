@@ -121,11 +121,11 @@ def test_what_is_open_is_said(capsys, steady, tmp_path):
     assert status == 0
     assert "not measured, and left open: PW" in text and "ridge: turbine efficiency" in text
     path.write_text("T3,PW\n560,2e5\n562,3e5\n", encoding="utf-8")
-    status, text, _ = out(capsys, path, "--disa", "0")
+    status, text, _ = out(capsys, path)
     assert status == 0
     assert "undetermined: " in text and "cannot be told apart" in text
     assert "fewer readings than unknowns" in text and "open to open" in text
-    status, text, _ = out(capsys, path, "--disa", "0", "--json")
+    status, text, _ = out(capsys, path, "--json")
     assert [r["estimate"] for r in json.loads(text)["parameters"]] == [None] * 4
 
 

@@ -170,11 +170,11 @@ def test_a_message_stays_readable(tmp_path, monkeypatch, capsys):
     """A damaged file may hold a word of any length; beginning and end tell what is wrong."""
     monkeypatch.chdir(tmp_path)
     head = "point,role,name,value,sigma"
-    (tmp_path / "points.csv").write_text(f"{head}\na,fixed,N,{'x' * 100_000},\n")
+    (tmp_path / "points.csv").write_text(f"{head}\na,fixed,{'x' * 100_000},1,\n")
     assert cli.main(["calibrate", "points.csv"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("apu: error: points.csv, line 2: N: 'xxx") and len(err) < 1300
-    assert err.endswith("xxx' is not a number\n") and " ... " in err
+    assert err.startswith("apu: error: points.csv: a: fixed 'xxx") and len(err) < 1300
+    assert "xxx' is unknown (valid: N, PW" in err and " ... " in err
 
 
 def test_an_unforeseen_error_is_a_sentence_with_its_place(tmp_path):

@@ -214,8 +214,8 @@ def test_results_of_other_than_numbers(tmp_path):
     path = tmp_path / "x.nc"
     ds = synthetic_joint(waveforms=False)
     for wrong, words in (
-        (ds.assign(T4=ds["T4"].astype(str)), "T4: one number at each time"),
-        (ds.assign(T4=ds["T4"] * float("nan")), "T4 = nan at 0 s is no finite number"),
+        (ds.assign(T4=ds["T4"].astype(str)), "T4: numbers on time are expected"),
+        (ds.assign(T4=ds["T4"] * float("nan")), "T4 = nan at t = 0 s is no finite number"),
         (ds.assign_coords(time=ds["time"] * 0), "'time' does not increase"),
         (ds.assign_attrs(phases="{"), "attribute 'phases'"),
     ):
@@ -245,18 +245,26 @@ def test_a_file_that_is_no_run_is_not_drawn(tmp_path, monkeypatch, capsys, chang
     assert err.startswith("apu: error: x.nc: ") and words in err
 
 
-def test_a_study_that_lacks_a_part_of_itself(tmp_path):
+def test_a_study_that_lacks_a_part_of_itself(tmp_path, caplog):
+    """What cannot be read at all is refused; a damaged part is left out, told, and made again."""
     path = tmp_path / "correctness.json"
     write_study(path)
     good = json.loads(path.read_text())
     part = next(iter(good["parts"]))
-    for change, words in (
-        ({"parts": []}, "tables 'fixed' and 'parts'"),
-        ({"parts": {part: 5}}, f"part {part!r} has no result"),
-        ({"parts": {part: {**good["parts"][part], "seeds": "x"}}}, "does not say its seeds"),
-        ({"parts": {part: {**good["parts"][part], "result": {}}}}, "its results cannot be read"),
+    path.write_text(json.dumps({**good, "parts": []}))
+    with pytest.raises(DataError, match=r"correctness\.json: no table 'parts'"):
+        read_study(path)
+    for damaged, words in (
+        (5, "no table"),
+        ({**good["parts"][part], "seeds": "x"}, "its seeds are 'x'"),
+        ({k: v for k, v in good["parts"][part].items() if k != "result"}, "it has no result"),
     ):
-        path.write_text(json.dumps({**good, **change}))
-        with pytest.raises(DataError, match=r"correctness\.json: damaged") as e:
-            read_study(path)
-        assert words in str(e.value)
+        path.write_text(json.dumps({**good, "parts": {**good["parts"], part: damaged}}))
+        caplog.clear()
+        record = studies.read(studies.get("correctness"), tmp_path)
+        assert set(record["parts"]) == set(good["parts"]) - {part}
+        assert f"part {part!r} is left out: {words}" in caplog.text
+    empty = {**good["parts"][part], "result": {}}
+    path.write_text(json.dumps({**good, "parts": {**good["parts"], part: empty}}))
+    with pytest.raises(DataError, match="correctness"):
+        page.pictures(page.load(tmp_path))

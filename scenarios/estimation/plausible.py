@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from apu_casadi.conditions import RANGES
 from apu_casadi.errors import DataError, nearest
 from scenarios.estimation.units import UNITS
 
@@ -40,7 +41,7 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
     "PW": (-2e4, 9e5),
     "PR_c": (1.0, 20.0), "PR_t": (1.0, 20.0), "eta_c": (0.2, 1.0), "eta_t": (0.2, 1.0),
     "SM": (-0.5, 2.0), "Mach8": (0.0, 1.0), "V8": (0.0, 700.0),
-    "altitude": (-500.0, 20e3), "Mach": (0.0, 1.0), "dT_isa": (-100.0, 100.0), "war": (0.0, 0.06),
+    **RANGES,  # of the ambient conditions: what the engine takes
 }  # fmt: skip
 #: Quantities whose range holds zero: without a unit, a largest reading below this is not in SI.
 _SMALL = {"PW": 2e3}
@@ -102,7 +103,7 @@ class Limits:
         if unit not in (None, si):
             shown += f" = {values[k]:.6g} {si}"
         count = f"{int(out.sum())} of {int(there.sum())} readings"
-        limits = f"{low:g} to {high:g} {si}"
+        limits = f"{low:g} to {high:g}" + ("" if si == "1" else f" {si}")
         others = _fits(si, raw[there], low, high)
         if others and out.sum() * 2 >= there.sum() and self._many(values[there], low, high):
             meant = " or ".join(others)
