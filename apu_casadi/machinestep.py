@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
@@ -97,6 +98,24 @@ def ramped(ss: StateSpace) -> StateSpace:
     )
 
 
+class RawMeans(NamedTuple):
+    """Means of one or more steps as they were averaged; :meth:`MachineStep.settle` goes on.
+
+    Parameters
+    ----------
+    quad, symmetric : names of the means, and whether the phases differ by rotation only.
+    values : shape (means, steps); ``MEANS`` come first.
+    turn, w_r, t : electrical periods in each step, electrical speed (rad/s), end (s); (steps,).
+    """
+
+    quad: tuple[str, ...]
+    symmetric: bool
+    values: np.ndarray
+    turn: np.ndarray
+    w_r: np.ndarray
+    t: np.ndarray
+
+
 class MachineStep:
     """One of the two equal generators.
 
@@ -138,7 +157,12 @@ class MachineStep:
         self._short = (1 - SPEED_RANGE) * self.gen.machine.w_rated * dt < 2 * math.pi
         self.nsteps = self.propagated = 0
         self.spikes: list[str] = []
-        self.excess = (0.0, 0.0, 0.0, 0.0)  # largest of torque power over (8), both, instant
+        self.excess: tuple[float, ...] = (
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        )  # largest of torque power over (8), both, instant
         self._fast: dict[str, Propagator | MeanStep | None] = {}
         self._kept = slice(None)
         self._block: JointBlock | None = None
@@ -189,20 +213,33 @@ class MachineStep:
         """What is averaged over a whole step."""
         return self._quad(short=self._short)
 
-    def _settled(self, quad: tuple[str, ...], means: np.ndarray, turn: Any, t: Any) -> np.ndarray:
-        """Return what is kept of the means of steps that end at t, s, as ``kept``.
+    def _raw(self, quad: tuple[str, ...], means: np.ndarray, h: float, t: Any) -> RawMeans:
+        """Return a copy of the means of steps of length h that end at t, s."""
+        values = means.reshape(len(quad), -1).copy()
+        n = values.shape[1]
+        turn = np.full(n, h * self.w_r / (2 * math.pi))
+        return RawMeans(
+            quad, self.symmetric, values, turn, np.full(n, self.w_r), np.broadcast_to(t, n)
+        )
 
-        ``turn`` are the electrical periods in a step.
+    def settle(self, raw: Sequence[RawMeans]) -> np.ndarray:
+        """Return what is kept of the means of steps, as ``kept``, shape (kept, steps).
+
+        Many steps at once, since one costs as much as a hundred.  All have the same ``quad`` and
+        ``symmetric``.  Notes where the torque takes more than eq. (8) says.
         """
-        n, by_name = len(MEANS), as_dict(quad, means)
-        values = settled(by_name, turn=turn, symmetric=self.symmetric, phasors=self.phasors)
-        torque = 2.0 * by_name["T_e"] * self.w_r / self.gen.machine.n_pp
-        excess = np.atleast_1d(torque - by_name["P_total"])
+        values, turn, w_r, t = (
+            np.concatenate([r[i] for r in raw], axis=-1) for i in range(2, len(RawMeans._fields))
+        )
+        by_name = as_dict(raw[0].quad, values)
+        more = settled(by_name, turn=turn, symmetric=raw[0].symmetric, phasors=self.phasors)
+        torque = 2.0 * by_name["T_e"] * w_r / self.gen.machine.n_pp
+        excess = torque - by_name["P_total"]
         k = int(np.argmax(excess))
         if excess[k] > self.excess[0]:
-            both = (np.atleast_1d(v)[k] for v in (torque, by_name["P_total"], t))
-            self.excess = (float(excess[k]), *(float(v) for v in both))  # type: ignore[assignment]
-        return np.concatenate([means[:n], values])
+            at = (excess[k], torque[k], by_name["P_total"][k], t[k])
+            self.excess = tuple(map(float, at))
+        return np.concatenate([values[: len(MEANS)], more])
 
     @property
     def warnings(self) -> list[str]:
@@ -249,13 +286,13 @@ class MachineStep:
 
     def step(
         self, N: float, slope: float, h: float, t0: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Advance over [t0, t0 + h]: end state, means as ``kept``, sample times and waveforms.
+    ) -> tuple[np.ndarray, RawMeans, np.ndarray, np.ndarray]:
+        """Advance over [t0, t0 + h]: end state, means, sample times and waveforms.
 
         The own state is left as it was: the caller may repeat the step.
         """
         x, quad, means, t, w = self._step(N, slope, h, t0)
-        return x, self._settled(quad, means, h * self.w_r / (2 * math.pi), t0 + h), t, w
+        return x, self._raw(quad, means, h, t0 + h), t, w
 
     def _step(
         self, N: float, slope: float, h: float, t0: float
@@ -330,7 +367,7 @@ class MachineStep:
         u: np.ndarray,
         theta: np.ndarray,
         grid: np.ndarray,
-    ) -> BlockResult | None:
+    ) -> tuple[BlockResult, RawMeans] | None:
         """Advance the whole unit over several exchange steps at once; None where that is not on."""
         if not self._ready or grid.size != BLOCK + 1:
             return None
@@ -343,19 +380,17 @@ class MachineStep:
             self._block = JointBlock(self.apu, fast)
         N = x[0]
         done = self._block(x, z, Wf_I, self.x, u, theta, self.u)
-        if done is not None:
-            self.x = done.x_sg
-            self.propagated += BLOCK
-            self.w_r = self.apu.w_r(float(N))
-            turn = self.dt * self.w_r / (2 * math.pi)
-            kept = self._settled(self.quad, done.means, turn, grid[1:])
-            done = done._replace(means=kept)
-            if self.waveform_dt is not None:
-                n = fast.n_out
-                kept = np.arange(n)[self._kept]
-                columns = (n * np.arange(BLOCK)[:, None] + kept).ravel()
-                done = done._replace(waves=done.waves[:, columns] if kept.size < n else done.waves)
-        return done
+        if done is None:
+            return None
+        self.x = done.x_sg
+        self.propagated += BLOCK
+        self.w_r = self.apu.w_r(float(N))
+        if self.waveform_dt is not None:
+            n = fast.n_out
+            kept = np.arange(n)[self._kept]
+            columns = (n * np.arange(BLOCK)[:, None] + kept).ravel()
+            done = done._replace(waves=done.waves[:, columns] if kept.size < n else done.waves)
+        return done, self._raw(self.quad, done.means, self.dt, grid[1:])
 
     def block_times(self, grid: np.ndarray) -> np.ndarray:
         """Instants of the samples of a block."""

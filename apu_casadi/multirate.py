@@ -52,7 +52,7 @@ from apu_casadi.events import (
 )
 from apu_casadi.gasgenerator import GasGenerator
 from apu_casadi.generator import MeasurementNoise
-from apu_casadi.jointstep import BLOCK, BlockResult
+from apu_casadi.jointstep import BLOCK
 from apu_casadi.machine.load import SeriesLoad
 from apu_casadi.machinestep import (
     EXCHANGES,
@@ -60,6 +60,7 @@ from apu_casadi.machinestep import (
     MEANS,
     WAVEFORMS,
     MachineStep,
+    RawMeans,
     ramped,
 )
 from apu_casadi.means import PARTS, PHASORS, RMS
@@ -86,6 +87,7 @@ __all__ = [
 ]
 
 SOLVERS = ("cvodes", "idas", "propagator")
+_TOGETHER = 512  # entries of means whose rms values are made at once
 _HEALTHY = (0.0, math.nan, math.nan)
 _WAVE_ROWS = ("time_w", *(f"{n} waveform" for n in WAVEFORMS))  # P_total is a mean as well
 
@@ -252,7 +254,7 @@ def simulate_joint(
     y, z = gg.output(x, u, theta, z0=point.gas.z)
     Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
     hot = gg.stepper if solver == "propagator" else None
-    book = _Book(gg, grid, machine.samples(grid), len(machine.kept), storage)
+    book = _Book(gg, grid, machine.samples(grid), len(machine.kept), storage, machine.settle)
     book.put(0, y, machine.means_at_rest(point.generator), factors, None)
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
@@ -279,10 +281,11 @@ def simulate_joint(
             slope = None
         until = pending[0].t if pending else duration
         if free and grid[min(k - 1 + BLOCK, grid.size - 1)] <= until + GRID_TOL:
-            done = machine.block(x, z, Wf_I, u, theta, grid[k - 1 : k + BLOCK])
-            if done is not None:
+            made = machine.block(x, z, Wf_I, u, theta, grid[k - 1 : k + BLOCK])
+            if made is not None:
+                done, raw = made
                 x, z, Wf_I = done.N, done.z, done.Wf_I
-                book.put_block(k, done, factors, machine.fault)
+                book.put_block(k, done.y, raw, factors, machine.fault)
                 book.wave(machine.block_times(grid[k - 1 : k + BLOCK]), done.waves)
                 k += BLOCK - 1
                 slope = None if way != EXCHANGES["paper"] else 0.0
@@ -303,7 +306,7 @@ def simulate_joint(
                 if way.mid_fuel:
                     N_mid, Wf_I_mid = N + h / 2 * slope, Wf_I + h / 2 * fuel.Wf_I_dot
                     fuel = governor(N=N_mid, N_ref=N_ref, Wf_I=Wf_I_mid, par=apu.governor)
-                u[0], u[1] = fuel.Wf, apu.PW(means[0])
+                u[0], u[1] = fuel.Wf, apu.PW(means.values[0, 0])
                 x_new, y, z_new = gg.advance(x, u, theta, z, h, step=hot)
                 slope = (float(x_new[0]) - N) / h
             machine.x = x_sg
@@ -311,8 +314,7 @@ def simulate_joint(
             if noise.N or hook is not None:
                 x = x + noise.N * rng.standard_normal(1)
                 if hook is not None:
-                    # a hook may simulate the same unit, and views of buffers would change
-                    means, w = means.copy(), w.copy()
+                    w = w.copy()  # a hook may simulate the same unit: views of buffers would change
                     x = np.asarray(hook(k, x), float).reshape(1)
                 y, z = gg.output(x, u, theta, z0=z)
         except SimulationError as error:
@@ -363,7 +365,9 @@ class _Book:
         samples: int,
         means: int,
         storage: str | os.PathLike[str] = "memory",
+        settle: Callable[[Sequence[RawMeans]], np.ndarray] | None = None,
     ) -> None:
+        self._settle, self._raw, self._raw_at = settle, list[RawMeans](), 0
         self.gg, self.grid = gg, grid
         n_slow = len(gg.Y) + means + len(gg.THETA) + 3
         size = 8 * (n_slow * grid.size + (1 + len(WAVEFORMS)) * samples)
@@ -395,26 +399,49 @@ class _Book:
         self,
         k: int,
         y: np.ndarray,
-        means: np.ndarray,
+        means: np.ndarray | RawMeans,
         factors: Mapping[str, float],
         fault: Ttsc | None,
     ) -> None:
         """Enter exchange instant k."""
         at = self._columns(k, 1).start
         self.Y[:, at] = y
-        self.means[:, at] = means
+        if isinstance(means, RawMeans):
+            self._later(at, means)
+        else:
+            self.means[:, at] = means
         self.factors[:, at] = tuple(factors.values())
         self.severity[:, at] = _severity(fault)
 
     def put_block(
-        self, k: int, done: BlockResult, factors: Mapping[str, float], fault: Ttsc | None
+        self,
+        k: int,
+        y: np.ndarray,
+        means: RawMeans,
+        factors: Mapping[str, float],
+        fault: Ttsc | None,
     ) -> None:
         """Enter a block of exchange instants, the first of which is k."""
         at = self._columns(k, BLOCK)
-        self.Y[:, at] = done.y
-        self.means[:, at] = done.means
+        self.Y[:, at] = y
+        self._later(at.start, means)
         self.factors[:, at] = np.array(tuple(factors.values()))[:, None]
         self.severity[:, at] = np.array(_severity(fault))[:, None]
+
+    def _later(self, at: int, means: RawMeans) -> None:
+        """Take means whose rms values are made together with those of their neighbours."""
+        if self._raw and (len(self._raw) >= _TOGETHER or self._raw[0][:2] != means[:2]):
+            self._settle_means()
+        if not self._raw:
+            self._raw_at = at
+        self._raw.append(means)
+
+    def _settle_means(self) -> None:
+        if self._raw:
+            assert self._settle is not None
+            made = self._settle(self._raw)
+            self.means[:, self._raw_at : self._raw_at + made.shape[1]] = made
+            self._raw = []
 
     def _columns(self, k: int, n: int) -> slice:
         """Return where instants k to k + n - 1 go, after making room for them."""
@@ -439,6 +466,7 @@ class _Book:
     def _flush(self) -> None:
         """Write the instants in the arrays to the file."""
         assert self.file is not None
+        self._settle_means()
         n = self._end - self._first
         part = copy.copy(self)
         part.Y, part.means = self.Y[:, :n], self.means[:, :n]
@@ -468,6 +496,7 @@ class _Book:
 
     def instants(self) -> dict[str, Any]:
         """All that is kept of the exchange instants, by name; the run is complete."""
+        self._settle_means()
         if self.file is None:
             return {**dict(zip(self.gg.Y.names, self.Y, strict=True)), **self.slow()}
         self._flush()
