@@ -105,15 +105,16 @@ class RawMeans(NamedTuple):
     ----------
     quad, symmetric : names of the means, and whether the phases differ by rotation only.
     values : shape (means, steps); ``MEANS`` come first.
-    turn, w_r, t : electrical periods in each step, electrical speed (rad/s), end (s); (steps,).
+    turn, w_r : electrical periods in each step, and electrical speed, rad/s.
+    t : end of each step, s; one instant or (steps,).
     """
 
     quad: tuple[str, ...]
     symmetric: bool
     values: np.ndarray
-    turn: np.ndarray
-    w_r: np.ndarray
-    t: np.ndarray
+    turn: float
+    w_r: float
+    t: Any
 
 
 class MachineStep:
@@ -216,11 +217,7 @@ class MachineStep:
     def _raw(self, quad: tuple[str, ...], means: np.ndarray, h: float, t: Any) -> RawMeans:
         """Return a copy of the means of steps of length h that end at t, s."""
         values = means.reshape(len(quad), -1).copy()
-        n = values.shape[1]
-        turn = np.full(n, h * self.w_r / (2 * math.pi))
-        return RawMeans(
-            quad, self.symmetric, values, turn, np.full(n, self.w_r), np.broadcast_to(t, n)
-        )
+        return RawMeans(quad, self.symmetric, values, h * self.w_r / (2 * math.pi), self.w_r, t)
 
     def settle(self, raw: Sequence[RawMeans]) -> np.ndarray:
         """Return what is kept of the means of steps, as ``kept``, shape (kept, steps).
@@ -228,9 +225,10 @@ class MachineStep:
         Many steps at once, since one costs as much as a hundred.  All have the same ``quad`` and
         ``symmetric``.  Notes where the torque takes more than eq. (8) says.
         """
-        values, turn, w_r, t = (
-            np.concatenate([r[i] for r in raw], axis=-1) for i in range(2, len(RawMeans._fields))
-        )
+        values = np.concatenate([r.values for r in raw], axis=1)
+        steps = [r.values.shape[1] for r in raw]
+        turn, w_r = (np.repeat(x, steps) for x in ([r.turn for r in raw], [r.w_r for r in raw]))
+        t = np.concatenate([np.atleast_1d(r.t) for r in raw])
         by_name = as_dict(raw[0].quad, values)
         more = settled(by_name, turn=turn, symmetric=raw[0].symmetric, phasors=self.phasors)
         torque = 2.0 * by_name["T_e"] * w_r / self.gen.machine.n_pp

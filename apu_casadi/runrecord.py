@@ -16,12 +16,14 @@ from typing import Any
 from apu_casadi.events import Ambient, Event, FaultChange, LoadChange
 from apu_casadi.machine.load import ConstantPowerLoad, Load, OpenLoad
 from apu_casadi.machine.ttsc import Ttsc
+from apu_casadi.sharing import once
 
 __all__ = ["asked", "installed", "load_words"]
 
 _V, _W = 230.0, 2 * math.pi * 400.0  # V rms and rad/s at which the power of a load is told
 
 
+@once
 def installed() -> str:
     """Return the installed version; "unknown" in a checkout that is not installed."""
     try:
