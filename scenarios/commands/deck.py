@@ -110,7 +110,7 @@ def _axis(option: str, text: str) -> list[float]:
         ) from None
     if count > LARGEST:
         raise ScenarioError(f"{option}: {count} points asked for, {LARGEST} at most in a deck")
-    if not math.isfinite(last - first):
+    if not (math.isfinite(first) and math.isfinite(last) and math.isfinite(last - first)):
         raise wrong
     if ":" in text:
         values = np.linspace(first, last, count)
