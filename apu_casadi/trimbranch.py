@@ -85,7 +85,16 @@ def settle(
     if both.size:
         swap[both] = ~on_design_side(solver, solved.w[:, both], p[:, both], compile=compile)
     first, other = solved.or_else(found, swap), found.or_else(solved, swap)
-    return first, other.or_else(_none(solver.gg, p.shape[1]), swap & broken)
+    out = swap & broken  # the first point did not count: the one that does may have a second one
+    other = other.or_else(_none(solver.gg, p.shape[1]), out)
+    again = np.flatnonzero(out)
+    if again.size:
+        inside = Roots(*(a[..., again] for a in first))
+        pair = settle(solver, limits, inside, p[:, again], compile=compile)
+        for mine, new in zip((first, other), pair, strict=True):
+            for a, b in zip(mine, new, strict=True):
+                a[..., again] = b
+    return first, other
 
 
 def _none(gg: GasGenerator, M: int) -> Roots:
