@@ -223,7 +223,11 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
             f"{_source(ds)}the dataset lacks a 'time' coordinate of at least two samples"
         )
     t = ds["time"].values
-    if t.ndim != 1 or t.dtype.kind not in "fiu" or not np.all(np.diff(t) > 0):
+    if (
+        t.ndim != 1
+        or t.dtype.kind not in "fiu"
+        or not (np.isfinite(t).all() and np.all(t[1:] > t[:-1]))
+    ):
         raise DataError(f"{_source(ds)}'time' does not increase from sample to sample")
     text = ds.attrs.get("phases")
     if text is None:
