@@ -27,10 +27,9 @@ def rows():
 def run_of(dt, *, N=1.0, P=1.0, V=1.0):
     """A joint run sampled every ``dt``; factors on speed excursion, power and voltage."""
     t = np.arange(round(study.DURATION / dt) + 1) * dt
-    names = ("V_a_rms", "V_b_rms", "V_c_rms")
     after = t > study.T_EVENT
     values = {"N": 3775 + 100 * N * after, "P_total": 2e5 * np.where(after, P, 1.0)}
-    values |= {n: 230 * np.where(after, V, 1.0) for n in names}
+    values["P_e"] = 1e5 * np.where(after, V, 1.0) ** 2  # into a resistive load
     return results.dataset({"time": t}, {"time": values})
 
 
