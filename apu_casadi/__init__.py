@@ -2,7 +2,7 @@
 
 The names below are the public surface; each is loaded from its module at first use, so that
 ``import apu_casadi`` itself costs next to nothing.  Everything else is reached by its module, as
-in ``from apu_casadi.mapfiles import read_map``.
+in ``from apu_casadi.gaspath.maps.mapfiles import read_map``.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from apu_casadi.apu import Apu, trim
-    from apu_casadi.errors import ApuError
-    from apu_casadi.events import Ambient, FaultChange, HealthChange, LoadChange
-    from apu_casadi.gasgenerator import GasGenerator
-    from apu_casadi.generator import Generator
-    from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
-    from apu_casadi.machine.ttsc import Ttsc
-    from apu_casadi.multirate import Noise, simulate_joint
-    from apu_casadi.signals import Signal, Signals
-    from apu_casadi.statespace import StateSpace
-    from apu_casadi.steadypoint import OperatingPoint
-    from apu_casadi.trimbatch import trim_batch
+    from apu_casadi.core.errors import ApuError
+    from apu_casadi.core.signals import Signal, Signals
+    from apu_casadi.core.statespace import StateSpace
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
+    from apu_casadi.gaspath.steady.trimbatch import trim_batch
+    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.generator import Generator
+    from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+    from apu_casadi.unit.apu import Apu, trim
+    from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
+    from apu_casadi.unit.multirate import Noise, simulate_joint
 
     __version__: str
 
@@ -51,26 +51,26 @@ __all__ = [
 ]
 
 _HOME = {
-    "Ambient": "apu_casadi.events",
-    "Apu": "apu_casadi.apu",
-    "ApuError": "apu_casadi.errors",
-    "ConstantPowerLoad": "apu_casadi.machine.load",
-    "FaultChange": "apu_casadi.events",
-    "GasGenerator": "apu_casadi.gasgenerator",
-    "Generator": "apu_casadi.generator",
-    "HealthChange": "apu_casadi.events",
-    "LoadChange": "apu_casadi.events",
-    "Noise": "apu_casadi.multirate",
-    "OpenLoad": "apu_casadi.machine.load",
-    "OperatingPoint": "apu_casadi.steadypoint",
-    "SeriesLoad": "apu_casadi.machine.load",
-    "Signal": "apu_casadi.signals",
-    "Signals": "apu_casadi.signals",
-    "StateSpace": "apu_casadi.statespace",
-    "Ttsc": "apu_casadi.machine.ttsc",
-    "simulate_joint": "apu_casadi.multirate",
-    "trim": "apu_casadi.apu",
-    "trim_batch": "apu_casadi.trimbatch",
+    "Ambient": "apu_casadi.unit.events",
+    "Apu": "apu_casadi.unit.apu",
+    "ApuError": "apu_casadi.core.errors",
+    "ConstantPowerLoad": "apu_casadi.machine.loads.load",
+    "FaultChange": "apu_casadi.unit.events",
+    "GasGenerator": "apu_casadi.gaspath.gasgenerator",
+    "Generator": "apu_casadi.machine.generator",
+    "HealthChange": "apu_casadi.unit.events",
+    "LoadChange": "apu_casadi.unit.events",
+    "Noise": "apu_casadi.unit.multirate",
+    "OpenLoad": "apu_casadi.machine.loads.load",
+    "OperatingPoint": "apu_casadi.gaspath.steady.steadypoint",
+    "SeriesLoad": "apu_casadi.machine.loads.load",
+    "Signal": "apu_casadi.core.signals",
+    "Signals": "apu_casadi.core.signals",
+    "StateSpace": "apu_casadi.core.statespace",
+    "Ttsc": "apu_casadi.machine.faults.ttsc",
+    "simulate_joint": "apu_casadi.unit.multirate",
+    "trim": "apu_casadi.unit.apu",
+    "trim_batch": "apu_casadi.gaspath.steady.trimbatch",
 }
 
 
@@ -97,5 +97,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names, loaded or not."""
     return sorted({*globals(), *__all__})

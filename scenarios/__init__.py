@@ -7,7 +7,7 @@ import os
 import sys
 
 
-def _answer(signum: int, frame: object) -> None:
+def answer(signum: int, frame: object) -> None:
     """End at an interrupt that comes before the guard of the command stands."""
     os.write(2, b"apu: interrupted; nothing was written; run the same command again\n")
     os._exit(128 + signum)
@@ -23,4 +23,4 @@ def _is_command() -> bool:
 
 # here, since this is the first line of the package that runs; what follows may take long to import
 if _is_command() and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
-    _signal.signal(_signal.SIGINT, _answer)
+    _signal.signal(_signal.SIGINT, answer)

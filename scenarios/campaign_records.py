@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from apu_casadi.errors import DataError
+from apu_casadi.core.errors import DataError
 
 RUNS = "runs.jsonl"
 STATUS = ("done", "refused", "failed", "invalid", "crashed")
@@ -31,7 +31,7 @@ COLUMNS = (
     "P_loss_fault", "N_rpm_min", "N_rpm_max", "T4_max", "SM_percent_min", "f_eta_c", "f_W_c",
     "f_eta_t", "f_W_t", "mu", "k_rf", "kappa", "h",
 )  # fmt: skip
-"""Numbers of :func:`apu_casadi.results.phase_summary` that are kept of each phase."""
+"""Numbers of :func:`apu_casadi.core.results.phase_summary` that are kept of each phase."""
 _MAY_BE_NONE = {"k_rf", "kappa"}  # healthy
 _log = logging.getLogger("apu_casadi")
 
@@ -90,15 +90,13 @@ def _is_nan(x: object) -> bool:
 def read(path: Path, asked: Mapping[str, tuple[str, int]]) -> dict[str, dict[str, Any]]:
     """Return the sound records of a file by key; the file loses its damaged lines.
 
-    Parameters
-    ----------
-    path : of the file, which need not exist.
-    asked : name and number of phases of the runs that are wanted, by key; lines with other keys
-        belong to other campaigns and stay as they are.
+    Args:
+        path: of the file, which need not exist.
+        asked: name and number of phases of the runs that are wanted, by key; lines with other keys
+            belong to other campaigns and stay as they are.
 
-    Raises
-    ------
-    DataError : the file cannot be read.
+    Raises:
+        DataError: the file cannot be read.
     """
     try:
         raw = path.read_bytes()
@@ -160,14 +158,12 @@ def _rewrite(path: Path, data: bytes) -> None:
 def appending(path: Path, *, fresh: bool) -> Iterator[Callable[[Mapping[str, Any]], None]]:
     """Yield a function that appends a record to the file, whole or not at all.
 
-    Parameters
-    ----------
-    path : of the file.
-    fresh : begin with an empty one.
+    Args:
+        path: of the file.
+        fresh: begin with an empty one.
 
-    Raises
-    ------
-    DataError : the file cannot be written (by the function too).
+    Raises:
+        DataError: the file cannot be written (by the function too).
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
     try:

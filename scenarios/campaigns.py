@@ -31,13 +31,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi import interrupts
-from apu_casadi.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
+from apu_casadi.core import interrupts
+from apu_casadi.core.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
 from scenarios import campaign_records, registry
 from scenarios.campaign_records import COLUMNS, RUNS, STATUS
-from scenarios.locking import locked
 from scenarios.schema import FaultSpec, Scenario
-from scenarios.workers import pool, stoppable
+from scenarios.shell.locking import locked
+from scenarios.shell.workers import pool, stoppable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -72,15 +72,13 @@ def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> l
     factors are uniform, mu uniform, k_rf log-uniform; kappa is mu (the paper's full coupling) in
     one half of the runs and uniform in [mu, 1] in the other; each phase is equally likely.
 
-    Parameters
-    ----------
-    n : number of runs.
-    seed : of the random numbers; each run's own seed, for its noise, follows from it.
-    base : scenario with a phase that changes health and one with a fault; these two are changed.
+    Args:
+        n: number of runs.
+        seed: of the random numbers; each run's own seed, for its noise, follows from it.
+        base: scenario with a phase that changes health and one with a fault; these two are changed.
 
-    Raises
-    ------
-    ScenarioError : ``base`` has no such phases, or ``n`` or ``seed`` is negative.
+    Raises:
+        ScenarioError: ``base`` has no such phases, or ``n`` or ``seed`` is negative.
     """
     s = registry.get(base) if isinstance(base, str) else base
     if n < 1 or seed < 0:
@@ -136,9 +134,9 @@ class _Task:
 
 def _run_one(task: _Task) -> dict[str, Any]:
     """Run one scenario; return its record, whatever happens."""
-    from apu_casadi.errors import ApuWarning, OperatingPointError
-    from apu_casadi.results import phase_summary, save
-    from apu_casadi.validity import found_in
+    from apu_casadi.core.errors import ApuWarning, OperatingPointError
+    from apu_casadi.core.results import phase_summary, save
+    from apu_casadi.unit.validity import found_in
 
     t = time.perf_counter()
     record: dict[str, Any] = {"key": task.key, "name": task.table["name"], "reason": ""}
@@ -187,31 +185,29 @@ def run_campaign(
     Ctrl-C and SIGTERM end it with KeyboardInterrupt, and its processes with it; so does its own
     end by any other cause.  Two campaigns in one folder run one after the other.
 
-    Parameters
-    ----------
-    scenarios : the runs; names must differ.
-    workers : processes, by default one for each core that may be used; 1 runs them here.
-    out : folder for ``runs.jsonl`` and ``campaign.nc``; None writes nothing.
-    summary_only : run without waveforms and keep the summaries; False writes the dataset of each
-        run, with the waveforms its scenario asks for, to the folder ``runs`` in ``out``.
-    progress : called with the number of finished runs and of all.
-    resume : take runs from ``runs.jsonl`` that the same scenario gave with the same program
-        before, crashed ones excepted; False begins anew.
-    solver : as for :func:`scenarios.registry.run`.
-    wait : wait while another campaign works in the folder; what it has done is not done again.
-        False refuses instead.
-    say : called with a sentence that names the process waited for; by default the log is.
+    Args:
+        scenarios: the runs; names must differ.
+        workers: processes, by default one for each core that may be used; 1 runs them here.
+        out: folder for ``runs.jsonl`` and ``campaign.nc``; None writes nothing.
+        summary_only: run without waveforms and keep the summaries; False writes the dataset of each
+            run, with the waveforms its scenario asks for, to the folder ``runs`` in ``out``.
+        progress: called with the number of finished runs and of all.
+        resume: take runs from ``runs.jsonl`` that the same scenario gave with the same program
+            before, crashed ones excepted; False begins anew.
+        solver: as for :func:`scenarios.registry.run`.
+        wait: wait while another campaign works in the folder; what it has done is not done again.
+            False refuses instead.
+        say: called with a sentence that names the process waited for; by default the log is.
 
-    Returns
-    -------
-    xarray.Dataset on ``run`` and ``phase``: the quantities of
-    :func:`apu_casadi.results.phase_summary` (NaN where there is none), ``status`` with ``reason``,
-    ``seed``, ``fault_phase``, ``seconds``, ``residual``, ``exchange_error``, ``warnings``.
+    Returns:
+        xarray.Dataset on ``run`` and ``phase``: the quantities of
+        :func:`apu_casadi.core.results.phase_summary` (NaN where there is none), ``status`` with
+        ``reason``, ``seed``, ``fault_phase``, ``seconds``, ``residual``, ``exchange_error``,
+        ``warnings``.
 
-    Raises
-    ------
-    ScenarioError : no runs, two of one name, workers < 1, or an unknown solver.
-    DataError : ``out`` cannot be read or written, or another campaign works there.
+    Raises:
+        ScenarioError: no runs, two of one name, workers < 1, or an unknown solver.
+        DataError: ``out`` cannot be read or written, or another campaign works there.
     """
     scenarios = list(scenarios)
     _check(scenarios, workers, solver)
@@ -239,14 +235,14 @@ def run_campaign(
             done = _run_all(tasks, done, workers, progress, keep_it)
         _sweep(folder / "runs")  # of processes that were killed meanwhile
         ds = _dataset(scenarios, [done[t.key] for t in tasks], solver)
-        from apu_casadi.results import save
+        from apu_casadi.core.results import save
 
         save(ds, folder / DATASET)
     return ds
 
 
 def _check(scenarios: Sequence[Scenario], workers: int | None, solver: str) -> None:
-    from apu_casadi.multirate import SOLVERS
+    from apu_casadi.unit.multirate import SOLVERS
 
     if not scenarios:
         raise ScenarioError("a campaign needs at least one scenario")
@@ -289,7 +285,7 @@ def _sweep(*folders: Path) -> None:
 
 
 def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
-    from apu_casadi.backend import package_digest
+    from apu_casadi.core.backend import package_digest
 
     table = s.to_dict()
     # the same numbers from the same program: a changed model runs its campaign again
@@ -301,7 +297,7 @@ def _records(
     tasks: Sequence[_Task], workers: int | None
 ) -> Generator[dict[str, Any], None, None]:  # fmt: skip
     """Yield the records of all tasks, in the order in which they end."""
-    from apu_casadi.backend import available_threads
+    from apu_casadi.core.backend import available_threads
 
     n = min(available_threads() if workers is None else workers, len(tasks))
     if n <= 1:
@@ -377,7 +373,7 @@ def _finished(folder: Path, tasks: Sequence[_Task], keep: str | None) -> dict[st
 
 def _whole(path: Path) -> bool:
     """Whether a run's own file is there, with all its bytes; one that is damaged is told."""
-    from apu_casadi.results import load
+    from apu_casadi.core.results import load
 
     if not path.exists():
         return False
@@ -412,8 +408,8 @@ def _dataset(
 ) -> xr.Dataset:  # fmt: skip
     import xarray as xr
 
-    from apu_casadi import runrecord
-    from apu_casadi.results import CHANNELS
+    from apu_casadi.core.results import CHANNELS
+    from apu_casadi.unit import runrecord
 
     n, m = len(records), max(len(s.phases) for s in scenarios)
     rows = [r.get("phases", ()) for r in records]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 
-from scenarios import guard
+from scenarios.shell import guard
 
 # anything else is imported when the guard stands
 TYPE_CHECKING = False
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def parser() -> ArgumentParser:
     """Return the parser of the command with all its subcommands."""
     from scenarios import commands
-    from scenarios.usage import Parser, ShowVersion
+    from scenarios.shell.usage import Parser, ShowVersion
 
     p = Parser(
         prog="apu",
@@ -41,8 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     the signal handlers come back afterwards, and an unforeseen error is raised.
     """
     with guard.Guard(own=argv is None) as g:
-        from apu_casadi import files
-        from scenarios import streams
+        from apu_casadi.core import files
+        from scenarios.shell import streams
 
         files.account(True)
         try:
@@ -53,8 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:
-    from apu_casadi import interrupts
-    from scenarios import streams
+    from apu_casadi.core import interrupts
+    from scenarios.shell import streams
 
     try:
         status = _run(argv, g)
@@ -79,8 +79,8 @@ def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:
 
 
 def _run(argv: Sequence[str] | None, g: guard.Guard) -> int:
-    from apu_casadi.errors import ScenarioError
-    from scenarios import notices
+    from apu_casadi.core.errors import ScenarioError
+    from scenarios.shell import notices
 
     try:
         args = parser().parse_args(argv)

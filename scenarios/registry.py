@@ -15,15 +15,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.errors import ScenarioError, nearest
-from apu_casadi.sharing import last, once
-from scenarios import jsontext
+from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.core.sharing import last, once
 from scenarios.schema import Scenario
+from scenarios.shell import jsontext
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.apu import Apu
+    from apu_casadi.unit.apu import Apu
 
 Progress = Callable[[float, float], None]
 """Called with the simulated and the total time [s]."""
@@ -54,9 +54,8 @@ def get(name_or_path: str | os.PathLike[str]) -> Scenario:
     Something is taken as a file if it ends in ``.toml`` or ``.py`` or has a folder in it.  A Python
     file is executed: run only what you trust.
 
-    Raises
-    ------
-    ScenarioError : unknown name (the nearest is named), missing file, wrong key or value.
+    Raises:
+        ScenarioError: unknown name (the nearest is named), missing file, wrong key or value.
     """
     text = os.fspath(name_or_path)
     path = Path(text)
@@ -83,21 +82,19 @@ def run(
 ) -> xr.Dataset:
     """Run a scenario and return the joint dataset.
 
-    Parameters
-    ----------
-    scenario : a description, a name of the library, or a file.
-    out : folder for the netCDF file, the figures and the summary; None writes nothing.
-    progress : called with the simulated and the total time [s].
-    solver : ``"cvodes"``, ``"idas"`` or the fast ``"propagator"``: see
-        :func:`apu_casadi.multirate.simulate_joint`.
-    phasors : keep the fundamental phasors of voltages and currents of each exchange step.
-    overrides : attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
-        ``parameters={"machine.r_s": 0.01}``).
+    Args:
+        scenario: a description, a name of the library, or a file.
+        out: folder for the netCDF file, the figures and the summary; None writes nothing.
+        progress: called with the simulated and the total time [s].
+        solver: ``"cvodes"``, ``"idas"`` or the fast ``"propagator"``: see
+            :func:`apu_casadi.unit.multirate.simulate_joint`.
+        phasors: keep the fundamental phasors of voltages and currents of each exchange step.
+        overrides: attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
+            ``parameters={"machine.r_s": 0.01}``).
 
-    Raises
-    ------
-    ScenarioError, ParameterError : a wrong description; OperatingPointError, SimulationError : the
-        unit cannot run so; DataError : ``out`` cannot be written.
+    Raises:
+        ScenarioError, ParameterError: a wrong description; OperatingPointError, SimulationError :
+            the unit cannot run so; DataError : ``out`` cannot be written.
     """
     s = scenario if isinstance(scenario, Scenario) else get(scenario)
     if overrides:
@@ -113,17 +110,17 @@ def run(
 
 
 @last(4)
-def _unit(parameters: str) -> Apu:
+def unit_of(parameters: str) -> Apu:
     """Return the unit with some parameters changed (JSON); kept, since building takes longer."""
-    from apu_casadi.apu import Apu
+    from apu_casadi.unit.apu import Apu
 
     return Apu().change(json.loads(parameters))
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:
-    from apu_casadi.multirate import simulate_joint
+    from apu_casadi.unit.multirate import simulate_joint
 
-    apu = _unit(json.dumps(dict(s.parameters), sort_keys=True))
+    apu = unit_of(json.dumps(dict(s.parameters), sort_keys=True))
     return simulate_joint(
         apu,
         duration=s.duration,
@@ -143,7 +140,7 @@ def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool
 
 def prepare(out: str | os.PathLike[str]) -> Path:
     """Make the folder for results, before a long run; :class:`DataError` if that is impossible."""
-    from apu_casadi import files
+    from apu_casadi.core import files
 
     return files.folder(out)
 
@@ -158,8 +155,8 @@ def name_of(ds: xr.Dataset) -> str:
 
 def summary(ds: xr.Dataset) -> dict[str, Any]:
     """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
-    from apu_casadi.results import phase_summary
-    from apu_casadi.validity import found_in
+    from apu_casadi.core.results import phase_summary
+    from apu_casadi.unit.validity import found_in
 
     try:
         title = str(json.loads(ds.attrs["scenario"])["title"])
@@ -207,18 +204,17 @@ def write(
 ) -> list[Path]:
     """Write ``NAME.nc``, ``summary.json`` and the figures into a folder; return the paths.
 
-    Raises
-    ------
-    DataError : the folder or a file cannot be written.
+    Raises:
+        DataError: the folder or a file cannot be written.
     """
-    from apu_casadi import files, results
+    from apu_casadi.core import files, results
 
     folder = prepare(out)
     made = [results.save(ds, folder / f"{name or name_of(ds)}.nc")]
     text = jsontext.dumps(summary(ds))
     made.append(files.write_text(folder / "summary.json", text + "\n"))
     if figures:
-        from apu_casadi import plotting
+        from scenarios.figures import plotting
 
         made += plotting.save_figures(ds, folder)
     return made

@@ -42,13 +42,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from apu_casadi import files
-from apu_casadi.errors import DataError, ScenarioError, nearest
-from apu_casadi.events import HEALTH_FACTORS, Ambient, health_factors, number
+from apu_casadi.core import files
+from apu_casadi.core.errors import DataError, ScenarioError, nearest
+from apu_casadi.unit.events import HEALTH_FACTORS, Ambient, health_factors, number
 
 if TYPE_CHECKING:
-    from apu_casadi.events import Event
-    from apu_casadi.machine.ttsc import Ttsc
+    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.unit.events import Event
 
 LOAD_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -129,18 +129,16 @@ def _triple(value: Any, place: str, **limits: Any) -> tuple[float, float, float]
 class LoadSpec:
     """The electrical load of each of the two generators.
 
-    Parameters
-    ----------
-    kind : ``R``, ``RL``, ``series``, ``constant_power`` or ``open``.
-    power_kW : power at rated voltage [kW], for R, RL and constant_power; 0.1 to 500.
-    power_factor : 0.1 to 1, lagging, for RL (default 0.85).
-    unbalance : power of the phases a, b, c relative to the balanced load [1], for R and RL.
-    R_ohm, L_mH : explicit values per phase [ohm, mH], for series.
-    lag_ms : time constant [ms] with which a constant-power load follows the voltage (default 2).
+    Args:
+        kind: ``R``, ``RL``, ``series``, ``constant_power`` or ``open``.
+        power_kW: power at rated voltage [kW], for R, RL and constant_power; 0.1 to 500.
+        power_factor: 0.1 to 1, lagging, for RL (default 0.85).
+        unbalance: power of the phases a, b, c relative to the balanced load [1], for R and RL.
+        R_ohm, L_mH: explicit values per phase [ohm, mH], for series.
+        lag_ms: time constant [ms] with which a constant-power load follows the voltage (default 2).
 
-    Raises
-    ------
-    ScenarioError : an unknown kind, a key that the kind does not take or lacks, a wrong value.
+    Raises:
+        ScenarioError: an unknown kind, a key that the kind does not take or lacks, a wrong value.
     """
 
     kind: str
@@ -203,8 +201,8 @@ class LoadSpec:
         }
 
     def build(self) -> Any:
-        """Return the load of ``apu_casadi.machine.load``, in SI units."""
-        from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+        """Return the load of ``apu_casadi.machine.loads.load``, in SI units."""
+        from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
 
         if self.kind == "open":
             return OpenLoad()
@@ -241,16 +239,14 @@ class LoadSpec:
 class FaultSpec:
     """A stator turn-to-turn short circuit; its severity is mu, k_rf and kappa together.
 
-    Parameters
-    ----------
-    mu : shorted fraction of the turns of the phase, 0 < mu < 1.
-    k_rf : fault resistance over the resistance of the shorted turns, >= 0.
-    kappa : leakage partition, mu (full coupling, the default) to 1 (no mutual leakage).
-    phase : ``a``, ``b`` or ``c``.
+    Args:
+        mu: shorted fraction of the turns of the phase, 0 < mu < 1.
+        k_rf: fault resistance over the resistance of the shorted turns, >= 0.
+        kappa: leakage partition, mu (full coupling, the default) to 1 (no mutual leakage).
+        phase: ``a``, ``b`` or ``c``.
 
-    Raises
-    ------
-    ScenarioError : a value outside its range.
+    Raises:
+        ScenarioError: a value outside its range.
     """
 
     mu: float
@@ -259,7 +255,6 @@ class FaultSpec:
     phase: str = "a"
 
     def __post_init__(self) -> None:
-        """Check every value."""
         number(self.mu, "mu", lo=0.0, hi=0.99, open_lo=True)
         number(self.k_rf, "k_rf", lo=0.0)
         if self.kappa is not None:
@@ -288,8 +283,8 @@ class FaultSpec:
         return {k: v for k, v in dataclasses.asdict(self).items() if v is not None}
 
     def build(self) -> Ttsc:
-        """Return the fault of ``apu_casadi.machine.ttsc``."""
-        from apu_casadi.machine.ttsc import Ttsc
+        """Return the fault of ``apu_casadi.machine.faults.ttsc``."""
+        from apu_casadi.machine.faults.ttsc import Ttsc
 
         return Ttsc(mu=self.mu, k_rf=self.k_rf, kappa=self.kappa, phase=self.phase)
 
@@ -298,16 +293,14 @@ class FaultSpec:
 class NoiseSpec:
     """Uncertainty added to a run, as standard deviations in SI units; zero where not given.
 
-    Parameters
-    ----------
-    N : state noise of the shaft speed per exchange step [rad/s].
-    w1, w2 : voltage noise of stator and rotor equations [V].
-    gas : measurement noise of gas-path outputs by name (``{"T3": 1.0}``).
-    terminal : measurement noise sigma_i [A], sigma_v and sigma_V_fd [V].
+    Args:
+        N: state noise of the shaft speed per exchange step [rad/s].
+        w1, w2: voltage noise of stator and rotor equations [V].
+        gas: measurement noise of gas-path outputs by name (``{"T3": 1.0}``).
+        terminal: measurement noise sigma_i [A], sigma_v and sigma_V_fd [V].
 
-    Raises
-    ------
-    ScenarioError : an unknown name under ``terminal``, or a negative or non-finite value.
+    Raises:
+        ScenarioError: an unknown name under ``terminal``, or a negative or non-finite value.
     """
 
     N: float = 0.0
@@ -340,9 +333,9 @@ class NoiseSpec:
         return {k: v for k, v in dataclasses.asdict(self).items() if v is not None}
 
     def build(self) -> Any:
-        """Return the noise of ``apu_casadi.multirate``."""
-        from apu_casadi.generator import MeasurementNoise
-        from apu_casadi.multirate import Noise
+        """Return the noise of ``apu_casadi.unit.multirate``."""
+        from apu_casadi.machine.generator import MeasurementNoise
+        from apu_casadi.unit.multirate import Noise
 
         terminal = None if self.terminal is None else MeasurementNoise(**self.terminal)
         return Noise(N=self.N, w1=self.w1, w2=self.w2, gas=self.gas, terminal=terminal)
@@ -363,7 +356,6 @@ class _Change:
     fault: Fault | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the three changes."""
         if self.load is not None and not isinstance(self.load, LoadSpec):
             raise _PlacedError("load", f"a LoadSpec is expected, got {self.load!r}")
         if isinstance(self.health, Mapping):
@@ -402,22 +394,19 @@ def _read_changes(table: dict[str, Any]) -> dict[str, Any]:
 class Phase(_Change):
     """A named part of the run, from ``start`` [s] to the start of the next phase.
 
-    Parameters
-    ----------
-    name : a few words, for summaries and figures.
-    start : instant [s] at which it begins and its changes take effect.
-    load, health, fault : what changes then; None keeps what was.
+    Args:
+        name: a few words, for summaries and figures.
+        start: instant [s] at which it begins and its changes take effect.
+        load, health, fault: what changes then; None keeps what was.
 
-    Raises
-    ------
-    ScenarioError : an empty name, a negative start or a wrong change.
+    Raises:
+        ScenarioError: an empty name, a negative start or a wrong change.
     """
 
     name: str
     start: float
 
     def __post_init__(self) -> None:
-        """Check name, start and changes."""
         _text(self.name, "name")
         object.__setattr__(self, "start", number(self.start, "start", lo=0.0, unit="s"))
         super().__post_init__()
@@ -445,15 +434,13 @@ class Phase(_Change):
 class Change(_Change):
     """A change at ``time`` [s] inside a phase (``[[event]]`` in a file).
 
-    Raises
-    ------
-    ScenarioError : a time that is not positive, no change at all, or a wrong change.
+    Raises:
+        ScenarioError: a time that is not positive, no change at all, or a wrong change.
     """
 
     time: float
 
     def __post_init__(self) -> None:
-        """Check time and changes."""
         t = number(self.time, "time", lo=0.0, open_lo=True, unit="s")
         object.__setattr__(self, "time", t)
         super().__post_init__()
@@ -481,25 +468,23 @@ class Change(_Change):
 class Scenario:
     """A complete, checked description of one run.
 
-    Parameters
-    ----------
-    name : short name, also that of the result files (letters, digits, ``_`` and ``-``).
-    duration : end of the run [s], at most 3600.
-    phases : at least one; the first starts at 0 and has a load.
-    title, doc : one line, and more.
-    ambient : ambient and flight conditions.
-    changes : further changes inside the phases (``[[event]]`` in a file).
-    dt : exchange step of the two parts [s]; a step before a change between two is shortened.
-    waveform_dt : sampling step of the waveforms [s]; None for no waveforms (0 in a file).
-    exchange : how speed and fuel pass between the two parts: ``paper``, ``predicted`` or
-        ``corrected``, see :func:`apu_casadi.multirate.simulate_joint`.
-    noise : process and measurement noise; None for none.
-    seed : seed of the noise.
-    parameters : changed parameters of the unit, by dotted name (``machine.r_s``).
+    Args:
+        name: short name, also that of the result files (letters, digits, ``_`` and ``-``).
+        duration: end of the run [s], at most 3600.
+        phases: at least one; the first starts at 0 and has a load.
+        title, doc: one line, and more.
+        ambient: ambient and flight conditions.
+        changes: further changes inside the phases (``[[event]]`` in a file).
+        dt: exchange step of the two parts [s]; a step before a change between two is shortened.
+        waveform_dt: sampling step of the waveforms [s]; None for no waveforms (0 in a file).
+        exchange: how speed and fuel pass between the two parts: ``paper``, ``predicted`` or
+            ``corrected``, see :func:`apu_casadi.unit.multirate.simulate_joint`.
+        noise: process and measurement noise; None for none.
+        seed: seed of the noise.
+        parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
 
-    Raises
-    ------
-    ScenarioError : a wrong value; phases out of order or beyond the end.
+    Raises:
+        ScenarioError: a wrong value; phases out of order or beyond the end.
     """
 
     name: str
@@ -609,13 +594,11 @@ class Scenario:
     def from_dict(cls, data: Any, source: str = "") -> Self:
         """Make a scenario from nested tables, as a TOML file gives them.
 
-        Parameters
-        ----------
-        data : the tables; ``source`` : name of the file, for messages.
+        Args:
+            data: the tables; ``source`` : name of the file, for messages.
 
-        Raises
-        ------
-        ScenarioError : with the file, the place in it, and the nearest valid name.
+        Raises:
+            ScenarioError: with the file, the place in it, and the nearest valid name.
         """
         try:
             return cls._from_dict(data)
@@ -660,9 +643,8 @@ class Scenario:
     def from_toml(cls, path: str | os.PathLike[str]) -> Self:
         """Read a TOML file.
 
-        Raises
-        ------
-        ScenarioError : no such file, no TOML (with line and column), or a wrong key or value.
+        Raises:
+            ScenarioError: no such file, no TOML (with line and column), or a wrong key or value.
         """
         try:
             text = files.read_text(path, "scenario file", LARGEST_FILE)
@@ -691,9 +673,8 @@ class Scenario:
 
         The file is executed with your rights, like any program: run only what you trust.
 
-        Raises
-        ------
-        ScenarioError : no such file, an error inside it (with its line), or no ``scenario``.
+        Raises:
+            ScenarioError: no such file, an error inside it (with its line), or no ``scenario``.
         """
         path = Path(path)
         try:
@@ -751,9 +732,8 @@ class Scenario:
     def change(self, **values: Any) -> Self:
         """Return a copy with some attributes changed; ``parameters`` are added to the present ones.
 
-        Raises
-        ------
-        ScenarioError : unknown name (the nearest is named) or a wrong value.
+        Raises:
+            ScenarioError: unknown name (the nearest is named) or a wrong value.
         """
         names = [f.name for f in dataclasses.fields(self)]
         for n in values:
@@ -784,7 +764,7 @@ class Scenario:
 
         A health event holds all four factors, those of earlier phases included.
         """
-        from apu_casadi.events import FaultChange, HealthChange, LoadChange
+        from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
 
         steps: list[tuple[float, _Change]] = [(p.start, p) for p in self.phases]
         steps += [(c.time, c) for c in self.changes]

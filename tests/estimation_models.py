@@ -7,11 +7,18 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import least_squares
 
-from apu_casadi.signals import Signal, Signals
-from apu_casadi.statespace import StateSpace
-from estimators.belief import Belief
-from estimators.model import FilterModel, Unknown, augment, discretise, measure, noisy_inputs
-from estimators.recording import Recording, record
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.statespace import StateSpace
+from estimators.filters.belief import Belief
+from estimators.models.filtermodel import (
+    FilterModel,
+    Unknown,
+    augment,
+    discretise,
+    measure,
+    noisy_inputs,
+)
+from estimators.models.recording import Recording, record
 
 
 def signals(text, **more):

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import scipy.integrate
 
-from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
+from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 
 P = MachineParameters()
 W = 2 * math.pi * 400.0

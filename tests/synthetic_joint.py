@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from apu_casadi import results
+from apu_casadi.core import results
 
 PHASES = [
     {"name": "design point", "start": 0.0, "end": 2.0},

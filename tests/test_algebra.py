@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from estimators.algebra import (
+from estimators.filters.algebra import (
     append_column,
     backward,
     cholesky,

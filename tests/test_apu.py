@@ -3,8 +3,8 @@
 import pytest
 
 from apu_casadi import Apu, GasGenerator, Generator, SeriesLoad, trim
-from apu_casadi.errors import SignalError
-from apu_casadi.trimming import trim_gas_generator
+from apu_casadi.core.errors import SignalError
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 
 KW100 = SeriesLoad.from_power(100e3)
 

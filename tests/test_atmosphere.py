@@ -2,8 +2,8 @@
 
 import pytest
 
-from apu_casadi.atmosphere import ambient, isa
-from apu_casadi.gas import Gas
+from apu_casadi.gaspath.atmosphere import ambient, isa
+from apu_casadi.gaspath.gas import Gas
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi import backend, cachefolder
-from apu_casadi.errors import BackendError
+from apu_casadi.core import backend, cachefolder
+from apu_casadi.core.errors import BackendError
 
 needs_compiler = pytest.mark.skipif(
     backend.find_compiler() is None, reason="no C compiler ($CC, cc, gcc, clang) found"
@@ -208,7 +208,7 @@ PROCESS = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from test_backend import X, P, pendulum
-from apu_casadi import backend, cachefolder
+from apu_casadi.core import backend, cachefolder
 c = backend.compiled(pendulum())
 assert c.class_name() == "External"
 print(repr(backend.Caller(c)(X, P)[0].tolist()))
@@ -599,8 +599,9 @@ def test_a_library_is_closed_when_nothing_uses_it(fresh):
 
 def test_units_that_are_gone_keep_nothing_but_the_last_few():
     """However many are made; those in use keep what they have."""
-    from apu_casadi import Generator, sharing
-    from apu_casadi.machine.parameters import MachineParameters
+    from apu_casadi import Generator
+    from apu_casadi.core import sharing
+    from apu_casadi.machine.machinedata import MachineParameters
 
     held = Generator(MachineParameters(r_s=0.0049))
     space = held.state_space()
@@ -618,7 +619,7 @@ def test_units_that_are_gone_keep_nothing_but_the_last_few():
 
 def test_results_of_one_model_are_bounded():
     """The longest unused goes first."""
-    from apu_casadi import sharing
+    from apu_casadi.core import sharing
 
     class Owner:
         pass

@@ -5,8 +5,8 @@ import pytest
 from estimation_models import signals
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import SignalError
-from estimators.belief import Belief
+from apu_casadi.core.errors import SignalError
+from estimators.filters.belief import Belief
 
 X = signals("a b c")
 MEAN, SIGMA = {"a": 1, "b": 2, "c": 3}, {"a": 0.1, "b": 0.2, "c": 0}

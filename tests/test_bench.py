@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from apu_casadi.benchplot import fit, plot_costs
-from apu_casadi.errors import ScenarioError, SignalError
-from scenarios import bench
+from apu_casadi.core.errors import ScenarioError, SignalError
+from scenarios.bench import benchmarks
 from scenarios.cli import main
+from scenarios.figures.benchplot import fit, plot_costs
 from scenarios.schema import Scenario
+from scenarios.shell.computer import machine
 
 SHORT = Scenario.from_dict(
     {
@@ -24,33 +25,37 @@ SHORT = Scenario.from_dict(
         ],
     }
 )
-TINY = bench.Size(
+TINY = benchmarks.Size(
     trims=10, batch=20, deck=(2, 2, 1, 3), calls=60, joint=SHORT, repeats=1, runs=1, checked=1,
     hour=0.5, durations=(0.4, 0.8), counts=(1, 2), rates=(0.0, 2e4),
 )  # fmt: skip
-ROW = bench.Row("it", 2.0, "ms", 3.0, 1e-7, 1e-6, "relative")
+ROW = benchmarks.Row("it", 2.0, "ms", 3.0, 1e-7, 1e-6, "relative")
 
 
 @pytest.mark.parametrize("name", ["trim", "deck", "derivatives", "linearisation", "shell"])
 def test_the_parts_run_and_are_accurate(name):
-    rows = bench.PARTS[name](TINY)
+    rows = benchmarks.PARTS[name](TINY)
     assert rows and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
     assert all(math.isfinite(r.value) and r.value > 0 for r in rows)
 
 
 def test_the_joint_parts_run_and_are_accurate(monkeypatch):
     """The process without compiled code is left out: it takes its time to build everything."""
-    monkeypatch.setattr(bench, "_virtual_machine", lambda *_: [])
-    rows = bench.joint(TINY) + bench.campaign(TINY)
+    monkeypatch.setattr(benchmarks, "_virtual_machine", lambda *_: [])
+    rows = benchmarks.joint(TINY) + benchmarks.campaign(TINY)
     assert len(rows) == 3 and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
 
 
 def test_errors_leave_out_the_first_half_millisecond():
     t = np.arange(0, 0.01, 1e-4)
-    ref = {"time_w": t, **{n: np.ones(5) for n in bench.SLOW}, **{n: 0 * t + 2 for n in bench.FAST}}
+    ref = {
+        "time_w": t,
+        **{n: np.ones(5) for n in benchmarks.SLOW},
+        **{n: 0 * t + 2 for n in benchmarks.FAST},
+    }
     off = {**ref, "v_a": ref["v_a"] + 0.5 * (np.abs(t - 0.0052) < 1e-9), "N": ref["N"] * 1.1}
-    assert bench.errors(off, ref, [0.005])["v_a"] == 0.0
-    e = bench.errors(off, ref, [])
+    assert benchmarks.errors(off, ref, [0.005])["v_a"] == 0.0
+    e = benchmarks.errors(off, ref, [])
     assert e["v_a"] == pytest.approx(0.25) and e["N"] == pytest.approx(0.1) and e["v_b"] == 0.0
 
 
@@ -60,26 +65,26 @@ def test_a_fast_wrong_answer_is_not_met():
     assert not dataclasses.replace(ROW, error=math.nan).met
     assert not dataclasses.replace(ROW, value=4.0).met
     assert dataclasses.replace(ROW, value=4.0, more=True).met
-    assert bench.cells(dataclasses.replace(ROW, error=1.0))[5] == "inaccurate"
+    assert benchmarks.cells(dataclasses.replace(ROW, error=1.0))[5] == "inaccurate"
 
 
 def test_memory_is_that_of_this_process():
-    assert 20 < bench.peak_memory() < 1e5
+    assert 20 < benchmarks.peak_memory() < 1e5
 
 
 def test_page_and_table_and_json(tmp_path):
-    where = {**bench.machine(), "load_before": 2.0}
+    where = {**machine(), "load_before": 2.0}
     curves = {"rate": (np.array([0.0, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]))}
     rows = {"trim": [ROW, dataclasses.replace(ROW, target=None, peer="other", ratio=12.0)]}
-    rows["linear"] = bench.linear_rows(curves)
-    r = bench.Report(rows, curves, {"pycycle": "not here"}, where, 3.0)
-    text = bench.page(r, "docs/images/bench_linear.png")
+    rows["linear"] = benchmarks.linear_rows(curves)
+    r = benchmarks.Report(rows, curves, {"pycycle": "not here"}, where, 3.0)
+    text = benchmarks.page(r, "docs/images/bench_linear.png")
     assert "| it | <= 3 ms | 2 ms | 1.0e-07 | 1e-06 | met | - | - | relative |" in text
     assert "Other programs were running" in text and "pycycle: not here" in text
-    assert "12" in bench.table(r) and "load before the start 2.0" in bench.table(r)
+    assert "12" in benchmarks.table(r) and "load before the start 2.0" in benchmarks.table(r)
     assert json.loads(json.dumps(r.to_dict(), allow_nan=False))["rows"]["trim"][0]["met"] is True
     assert rows["linear"][0].value == pytest.approx(0.0, abs=1e-9)
-    path = bench.write_plot(curves, TINY, tmp_path / "a" / "b.png")
+    path = benchmarks.write_plot(curves, TINY, tmp_path / "a" / "b.png")
     assert path.stat().st_size > 5000
 
 
@@ -91,8 +96,10 @@ def test_plot_refuses_what_is_no_curve():
 
 
 def test_the_command(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "PARTS", {"trim": lambda size: [ROW]})
-    monkeypatch.setattr(bench, "linear", lambda size: {"rate": (np.arange(3.0), np.arange(3.0))})
+    monkeypatch.setattr(benchmarks, "PARTS", {"trim": lambda size: [ROW]})
+    monkeypatch.setattr(
+        benchmarks, "linear", lambda size: {"rate": (np.arange(3.0), np.arange(3.0))}
+    )
     assert main(["bench", "--list"]) == 0
     assert "dpsim" in capsys.readouterr().out
     page = tmp_path / "BENCHMARKS.md"
@@ -103,16 +110,16 @@ def test_the_command(capsys, tmp_path, monkeypatch):
     assert main(["bench", "--only", "trim", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"]["trim"][0]["value"] == 2.0
     monkeypatch.setattr(
-        bench, "PARTS", {"trim": lambda size: [dataclasses.replace(ROW, error=1.0)]}
+        benchmarks, "PARTS", {"trim": lambda size: [dataclasses.replace(ROW, error=1.0)]}
     )
     assert main(["bench", "--only", "trim"]) == 1
     assert main(["bench", "--runs", "0"]) == 2
     with pytest.raises(ScenarioError, match="unknown part"):
-        bench.run(["trin"])
+        benchmarks.run(["trin"])
 
 
 @pytest.mark.slow
 def test_the_estimation_part_runs_and_is_accurate():
     """Compiles six filters: some minutes."""
-    rows = bench.estimation(TINY)
+    rows = benchmarks.estimation(TINY)
     assert len(rows) == 3 and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]

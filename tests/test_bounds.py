@@ -13,11 +13,16 @@ import pytest
 from estimation_models import gappy, kalman_by_hand, random_belief, random_linear, signals
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import EstimationError, SignalError
-from estimators.belief import Belief
-from estimators.bounds import expected_bound, linearisations, posterior_bound, snapshot_bound
-from estimators.model import FilterModel
-from estimators.recording import Recording
+from apu_casadi.core.errors import EstimationError, SignalError
+from estimators.filters.belief import Belief
+from estimators.information.bounds import (
+    expected_bound,
+    linearisations,
+    posterior_bound,
+    snapshot_bound,
+)
+from estimators.models.filtermodel import FilterModel
+from estimators.models.recording import Recording
 
 
 def stacked_covariance(parts, model, prior, data):

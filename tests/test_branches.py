@@ -7,11 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
-from apu_casadi.gasgenerator import GasGenerator, GasGeneratorState, default_compressor
-from apu_casadi.mapfiles import MapTable, shipped
-from apu_casadi.steadypoint import Limits
-from apu_casadi.trimming import initialise, trim_gas_generator
-from apu_casadi.trimsolver import solver_of
+from apu_casadi.gaspath.gasgenerator import GasGenerator, GasGeneratorState, default_compressor
+from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.gaspath.steady.steadypoint import Limits
+from apu_casadi.gaspath.steady.trimming import initialise, trim_gas_generator
+from apu_casadi.gaspath.steady.trimsolver import solver_of
 
 AMBIENT = {"altitude": 6046.0, "Mach": 0.187, "dT_isa": -44.56, "war": 0.026}
 FIXED = {"N": 3775.1472, "Wf": 0.0208}

@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from apu_casadi import calibration
-from apu_casadi.calibration import (
+from apu_casadi.core.errors import DataError, OperatingPointError, ParameterError, SignalError
+from apu_casadi.gaspath import calibration
+from apu_casadi.gaspath.calibration import (
     CalibrationPoint,
     calibrate,
     numbers,
@@ -15,8 +16,7 @@ from apu_casadi.calibration import (
     sensitivity,
     write_points,
 )
-from apu_casadi.errors import DataError, OperatingPointError, ParameterError, SignalError
-from apu_casadi.gasgenerator import (
+from apu_casadi.gaspath.gasgenerator import (
     COMPRESSOR_CALIBRATION,
     TURBINE_CALIBRATION,
     GasGenerator,

@@ -12,14 +12,15 @@ import time
 import numpy as np
 import pytest
 
-from apu_casadi import results
-from apu_casadi.errors import DataError, ScenarioError, SimulationError
-from scenarios import campaign_records, campaigns, registry, workers
+from apu_casadi.core import results
+from apu_casadi.core.errors import DataError, ScenarioError, SimulationError
+from scenarios import campaign_records, campaigns, registry
 from scenarios.campaign_records import COLUMNS
 from scenarios.campaigns import RUNS, counts, random_faults, run_campaign
 from scenarios.cli import main
-from scenarios.locking import locked
 from scenarios.schema import FaultSpec, Scenario
+from scenarios.shell import workers
+from scenarios.shell.locking import locked
 
 BASE = {
     "name": "short",

@@ -11,25 +11,25 @@ import pytest
 import xarray as xr
 from numpy.testing import assert_array_equal
 
-from apu_casadi.apu import Apu
-from apu_casadi.calibration import CalibrationPoint
-from apu_casadi.checked import array, number
-from apu_casadi.control import GovernorParameters
-from apu_casadi.cycle import GasGeneratorParameters
-from apu_casadi.errors import ApuError, SignalError
-from apu_casadi.events import Ambient, FaultChange, HealthChange, LoadChange
-from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.generator import Generator, MeasurementNoise
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.multirate import Noise, simulate_joint
-from apu_casadi.simulation import simulate
-from apu_casadi.steadypoint import Limits, LoadLaw
-from apu_casadi.trimbatch import performance_deck, trim_batch
-from apu_casadi.trimming import maximum_power, trim_gas_generator
+from apu_casadi.core.checked import array, number
+from apu_casadi.core.errors import ApuError, SignalError
+from apu_casadi.core.simulation import simulate
+from apu_casadi.gaspath.calibration import CalibrationPoint
+from apu_casadi.gaspath.cycle import GasGeneratorParameters
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.steadypoint import Limits, LoadLaw
+from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
+from apu_casadi.gaspath.steady.trimming import maximum_power, trim_gas_generator
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator, MeasurementNoise
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.multirate import Noise, simulate_joint
 from estimators.detection.cusum import cusum_test
-from estimators.model import Unknown
-from estimators.ukf import PointSet
+from estimators.filters.ukf import PointSet
+from estimators.models.filtermodel import Unknown
 
 NUMBERS = [
     2, 2.0, np.float32(2), np.int16(2), np.array(2.0), np.array([2]), [2.0], (2,), Fraction(4, 2),

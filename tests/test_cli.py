@@ -8,8 +8,8 @@ import sys
 import pytest
 from synthetic_joint import synthetic_joint
 
-from apu_casadi import results
-from apu_casadi.errors import OperatingPointError
+from apu_casadi.core import results
+from apu_casadi.core.errors import OperatingPointError
 from scenarios import cli, registry
 
 
@@ -116,7 +116,7 @@ def test_ctrl_c_in_a_run_waits_for_the_exchange_step(fake, capsys, monkeypatch):
 
 def test_an_interruption_says_what_was_written(fake, capsys, monkeypatch):
     """Data and summary stand when the figures are drawn."""
-    from apu_casadi import plotting
+    from scenarios.figures import plotting
 
     def stopped(*_):
         signal.raise_signal(signal.SIGINT)

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from apu_casadi import Ambient, Apu, GasGenerator, trim, trim_batch
-from apu_casadi.conditions import (
+from apu_casadi.core.errors import ApuError
+from apu_casadi.core.results import save
+from apu_casadi.gaspath.conditions import (
     AMBIENT,
     CONDITIONS,
     DEFAULT_DAY,
@@ -19,15 +21,13 @@ from apu_casadi.conditions import (
     assumed_words,
     day_words,
 )
-from apu_casadi.cycle import GasGeneratorParameters
-from apu_casadi.errors import ApuError
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.multirate import simulate_joint
-from apu_casadi.results import save
-from apu_casadi.steadypoint import Limits, Status
-from apu_casadi.trimbatch import performance_deck
+from apu_casadi.gaspath.cycle import GasGeneratorParameters
+from apu_casadi.gaspath.steady.steadypoint import Limits, Status
+from apu_casadi.gaspath.steady.trimbatch import performance_deck
+from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.recordings.runfiles import recorded_ambient
 from scenarios import cli
-from scenarios.estimation.runfiles import recorded_ambient
 from scenarios.schema import Scenario
 
 ROOT = Path(find_spec("apu_casadi").origin).parents[1]
@@ -104,7 +104,10 @@ def _default_day(given):
 
 
 # what is no default day: the standard atmosphere itself, and the properties of a dry gas
-ELSEWHERE = {"apu_casadi/atmosphere.py: argument dT_isa", "apu_casadi/gas.py: argument war"}
+ELSEWHERE = {
+    "apu_casadi/gaspath/atmosphere.py: argument dT_isa",
+    "apu_casadi/gaspath/gas.py: argument war",
+}
 
 
 def written_elsewhere(text):
@@ -149,7 +152,7 @@ def written_elsewhere(text):
 
 
 def test_no_default_is_written_elsewhere():
-    """Every argument, field, option and table takes its default from apu_casadi/conditions.py."""
+    """Every argument, field, option and table takes its default from ``gaspath/conditions.py``."""
     wrong = [
         f"{path.relative_to(ROOT)}:{line}: {what}"
         for package in ("apu_casadi", "estimators", "scenarios")

@@ -2,8 +2,8 @@
 
 import pytest
 
-from apu_casadi.control import GovernorParameters, governor
-from apu_casadi.errors import ParameterError
+from apu_casadi.core.errors import ParameterError
+from apu_casadi.unit.control import GovernorParameters, governor
 
 P = GovernorParameters()
 
@@ -40,9 +40,9 @@ def test_limits_in_wrong_order_are_refused():
 
 def test_the_fuel_limit_limits_fuel_and_says_what_T4_is_there():
     """T4 "below 1400 K" was promised, 1478 K reached: the words name T4 at one point, no bound."""
-    from apu_casadi.gasgenerator import GasGenerator
-    from apu_casadi.steadypoint import Limits
-    from apu_casadi.trimming import trim_gas_generator
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.steady.steadypoint import Limits
+    from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 
     gg, words = GasGenerator(), next(r for r in P.table() if r[0] == "Wf_max")
     at_limit = {"N": gg.parameters.N, "Wf": P.Wf_max}

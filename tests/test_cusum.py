@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import EstimationError, ParameterError
+from apu_casadi.core.errors import EstimationError, ParameterError
 from estimators.detection.alarms import HOUR
 from estimators.detection.cusum import (
     cusum,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from apu_casadi.discretisation import linearly_implicit_midpoint
+from apu_casadi.core.discretisation import linearly_implicit_midpoint
 
 
 def step_function(rhs, n):

@@ -27,12 +27,13 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
-from apu_casadi.errors import EstimationError, ParameterError
-from apu_casadi.signals import Signals
-from estimators.belief import Belief
-from estimators.ekf import correct, ekf_step, extended_kalman_filter, projected
-from estimators.model import FilterModel, Unknown, augment, gains
-from estimators.recording import Recording
+from apu_casadi.core.errors import EstimationError, ParameterError
+from apu_casadi.core.signals import Signals
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import correct, ekf_step, extended_kalman_filter
+from estimators.filters.stepparts import projected
+from estimators.models.filtermodel import FilterModel, Unknown, augment, gains
+from estimators.models.recording import Recording
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 

@@ -13,30 +13,32 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.backend import use_backend
-from apu_casadi.errors import DataError, EstimationError, ParameterError
-from apu_casadi.events import LoadChange
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.terminalmodel import FLUXES, shunt_parameters
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from scenarios.estimation.electrical.faults import (
+from apu_casadi.core.backend import use_backend
+from apu_casadi.core.errors import DataError, EstimationError, ParameterError
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.terminals import FLUXES, shunt_parameters
+from apu_casadi.unit.events import LoadChange
+from estimators.apu.electrical.electricalfilter import electrical_filter
+from estimators.apu.electrical.faults import (
     describe,
     faulty_phase,
     leaky_fault,
     ridge,
     shunt_of,
 )
-from scenarios.estimation.electrical.filter import electrical_filter
-from scenarios.estimation.electrical.model import _exponential, leaky_pair
-from scenarios.estimation.electrical.signals import GAIN_SENSORS, MEASURED
-from scenarios.estimation.electrical.tracking import track, window_power
-from scenarios.estimation.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
-from scenarios.estimation.electrical_study.detection import detection
-from scenarios.estimation.electrical_study.efficiency import efficiency
-from scenarios.estimation.electrical_study.false_alarms import _chance
-from scenarios.estimation.electrical_study.leaky import shunt_information
-from scenarios.estimation.electrical_study.protocol import (
+from estimators.apu.electrical.machinemodel import _exponential, leaky_pair
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED
+from estimators.apu.electrical.tracking import track, window_power
+from estimators.apu.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
+from estimators.apu.sensors import ELECTRICAL
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from scenarios.studies.electrical.detection import detection
+from scenarios.studies.electrical.efficiency import efficiency
+from scenarios.studies.electrical.false_alarms import _chance
+from scenarios.studies.electrical.leaky import shunt_information
+from scenarios.studies.electrical.parts import run
+from scenarios.studies.electrical.protocol import (
     DETECT,
     DT,
     EFFICIENCY,
@@ -44,16 +46,14 @@ from scenarios.estimation.electrical_study.protocol import (
     FULL_UNBALANCED,
     PART,
 )
-from scenarios.estimation.electrical_study.run import run
-from scenarios.estimation.electrical_study.scores import nees
-from scenarios.estimation.electrical_study.truth import (
+from scenarios.studies.electrical.scores import nees
+from scenarios.studies.electrical.truth import (
     chances,
     drawn_gains,
     generator_truth,
     samples_of,
     unit_truth,
 )
-from scenarios.estimation.sensors import ELECTRICAL
 
 FILT = electrical_filter()
 POWER = electrical_filter(power=True)
@@ -495,7 +495,7 @@ def test_studies_give_json(monkeypatch):
     """Studies at their smallest; numbers are judged elsewhere."""
     monkeypatch.setitem(EFFICIENCY, "duration", 0.02)
     monkeypatch.setitem(DETECT, "matched", (1e-4, 4))
-    monkeypatch.setattr("scenarios.estimation.electrical_study.detection.WAIT", 0.02)
+    monkeypatch.setattr("scenarios.studies.electrical.detection.WAIT", 0.02)
     one = efficiency(2, 0, cases=["matched"])
     two = detection(2, 0, cases=["matched"])
     assert "nees_h" in json.dumps(one)

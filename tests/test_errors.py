@@ -2,8 +2,8 @@
 
 import pytest
 
-from apu_casadi import errors
-from apu_casadi.errors import ApuError, nearest
+from apu_casadi.core import errors
+from apu_casadi.core.errors import ApuError, nearest
 
 FAMILY = [
     e for e in vars(errors).values()

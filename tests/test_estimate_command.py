@@ -15,20 +15,21 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi.errors import DataError, ParameterError, ScenarioError, SignalError
-from apu_casadi.jointestimateplot import NAMES, plot_joint_estimate
-from apu_casadi.results import dataset
-from apu_casadi.signals import Signal
+from apu_casadi.core.errors import DataError, ParameterError, ScenarioError, SignalError
+from apu_casadi.core.results import dataset
+from apu_casadi.core.signals import Signal
+from estimators.apu.electrical.tuning import FAULT_LEVEL
+from estimators.apu.joint import GAIN_SHARE
 from scenarios import cli
 from scenarios.commands import estimate as command
-from scenarios.estimation import fingerprint, jointrun, page, studies
-from scenarios.estimation.correctness import correctness
-from scenarios.estimation.electrical.tuning import FAULT_LEVEL
-from scenarios.estimation.gaspath_study import FRESH
-from scenarios.estimation.joint import GAIN_SHARE
-from scenarios.estimation.reports import REPORTS
-from scenarios.locking import locked
+from scenarios.figures.jointestimateplot import NAMES, plot_joint_estimate
+from scenarios.pages import estimation_page
+from scenarios.pages.reports import REPORTS
 from scenarios.schema import Scenario
+from scenarios.shell.locking import locked
+from scenarios.studies import catalogue, fingerprint, jointrun
+from scenarios.studies.correctness import correctness
+from scenarios.studies.gaspath_study import FRESH
 
 ONSET_HEALTH, ONSET_H = 1.0, 2.0
 PHASES = [{"name": "healthy", "start": 0.0, "end": 1.0},
@@ -113,7 +114,7 @@ def test_the_table_marks_what_lies_outside():
 
 
 def test_a_figure_is_drawn_from_what_is_saved(tmp_path):
-    kept = json.loads(json.dumps(studies._plain(jointrun.saved(made()))))
+    kept = json.loads(json.dumps(catalogue._plain(jointrun.saved(made()))))
     path = jointrun.draw(kept, tmp_path / "a.png")
     assert path.stat().st_size > 20_000
     wrong = {f"{n}{e}": np.zeros(3) for n in NAMES for e in ("", "_sigma", "_true")}
@@ -179,10 +180,10 @@ def toy(monkeypatch):
         return run
 
     toy_fails = []
-    parts = {"a": studies.Part(part("a"), 1, 1), "b": studies.Part(part("b"), 1, 1, share=0.1),
-             "c": studies.Part(part("c"), 1, 0, share=None)}  # fmt: skip
-    study = studies.Study("correctness", "t", "g", parts, ("electrical",))
-    monkeypatch.setitem(studies.STUDIES, "correctness", study)
+    parts = {"a": catalogue.Part(part("a"), 1, 1), "b": catalogue.Part(part("b"), 1, 1, share=0.1),
+             "c": catalogue.Part(part("c"), 1, 0, share=None)}  # fmt: skip
+    study = catalogue.Study("correctness", "t", "g", parts, ("electrical",))
+    monkeypatch.setitem(catalogue.STUDIES, "correctness", study)
     return study, ran, toy_fails
 
 
@@ -192,60 +193,60 @@ def test_what_is_kept_is_not_run_again(toy, tmp_path):
     seen = []
     fails.append(True)
     with pytest.raises(DataError):
-        studies.run("correctness", tmp_path, n_seeds=40)
-    assert ran == ["a"] and list(studies.read(study, tmp_path)["parts"]) == ["a"]
+        catalogue.run("correctness", tmp_path, n_seeds=40)
+    assert ran == ["a"] and list(catalogue.read(study, tmp_path)["parts"]) == ["a"]
     fails.clear()
-    record = studies.run("correctness", tmp_path, n_seeds=40, progress=lambda *a: seen.append(a))
+    record = catalogue.run("correctness", tmp_path, n_seeds=40, progress=lambda *a: seen.append(a))
     assert ran == ["a", "b", "c"]
-    assert record == studies.read(study, tmp_path)
+    assert record == catalogue.read(study, tmp_path)
     assert record["parts"]["b"]["result"] == {"n": 4, "x": [0.333333, None]}
     assert seen[-1] == ("c", 42.0, 42.0)
-    studies.run("correctness", tmp_path, n_seeds=40)
+    catalogue.run("correctness", tmp_path, n_seeds=40)
     assert len(ran) == 3
-    studies.run("correctness", tmp_path, n_seeds=50)
+    catalogue.run("correctness", tmp_path, n_seeds=50)
     assert ran[3:] == ["a", "b"]  # c has no seeds
-    studies.run("correctness", tmp_path, n_seeds=50, again=True)
+    catalogue.run("correctness", tmp_path, n_seeds=50, again=True)
     assert ran[5:] == ["a", "b", "c"]
 
 
 def test_other_constants_make_all_parts_pending(toy, tmp_path, monkeypatch):
     study, *_ = toy
-    studies.run("correctness", tmp_path, n_seeds=40)
-    assert studies.pending(study, tmp_path, 40) == []
-    monkeypatch.setattr(studies, "constants", lambda m: {"Q": 2.0})
-    assert studies.pending(study, tmp_path, 40) == ["a", "b", "c"]
+    catalogue.run("correctness", tmp_path, n_seeds=40)
+    assert catalogue.pending(study, tmp_path, 40) == []
+    monkeypatch.setattr(catalogue, "constants", lambda m: {"Q": 2.0})
+    assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
 
 
 def test_other_seeds_make_a_part_pending_and_are_printed_as_they_were(toy, tmp_path, monkeypatch):
     """A report tells the seeds of the numbers that it reads, never those of today."""
     study, *_ = toy
-    record = studies.run("correctness", tmp_path, n_seeds=40)
+    record = catalogue.run("correctness", tmp_path, n_seeds=40)
     later = dataclasses.replace(study, seed0=7001)
-    assert studies.pending(later, tmp_path, 40) == ["a", "b"]  # c has no seeds
-    r = studies.results(record)
+    assert catalogue.pending(later, tmp_path, 40) == ["a", "b"]  # c has no seeds
+    r = catalogue.results(record)
     assert (r.seeds_to("a"), r.seeds_from("b")) == ("1000 to 1039", "4 from 1000")
     assert list(r) == ["a", "b", "c"] and len(r) == 3 and r["b"]["n"] == 4
-    fresh = studies.get("gaspath")
+    fresh = catalogue.get("gaspath")
     assert (fresh.seed0, fresh.seeds) == (FRESH.start, len(FRESH))
     # the study itself with seeds that are not today's
     kept = {"seeds": 9, "reduction": 0.6, "interval": [0.5, 0.7], "null_rmse": [0.01, 0.02]}
     part = {"seeds": [1, 9], "result": {"seeds": 9, "snapshot": kept, "transient": kept}}
-    said = REPORTS["shaft-power"].claims(studies.Results({"filter": part}))
+    said = REPORTS["shaft-power"].claims(catalogue.Results({"filter": part}))
     assert {c.seeds for c in said} == {"9 from 1"}
 
 
 def test_parts_made_with_other_filters_are_named(toy, tmp_path, capsys, monkeypatch):
     """Seeds and constants do not tell that the code has changed; the filters' equations do."""
     study, *_ = toy
-    record = studies.run("correctness", tmp_path, n_seeds=40)
-    assert studies.other_code(study, record) == ""
+    record = catalogue.run("correctness", tmp_path, n_seeds=40)
+    assert catalogue.other_code(study, record) == ""
     record["parts"]["a"]["code"] = "of before"
     del record["parts"]["b"]["code"]
     record["parts"]["c"]["versions"]["casadi"] = "3.7.0"
-    said = studies.other_code(study, record)
+    said = catalogue.other_code(study, record)
     assert "made with other code: a (--again" in said
     assert said.endswith("not known whether made with this code: b, c")
-    monkeypatch.setattr(studies, "digest", lambda name: "of tomorrow")
+    monkeypatch.setattr(catalogue, "digest", lambda name: "of tomorrow")
     line = ["estimate", "study", "correctness", "--seeds", "40", "--out", str(tmp_path), "--quiet"]
     assert cli.main(line) == 0
     assert "correctness: kept\n  made with other code: all parts (--ag" in capsys.readouterr().out
@@ -253,7 +254,7 @@ def test_parts_made_with_other_filters_are_named(toy, tmp_path, capsys, monkeypa
 
 def test_the_digest_of_the_filters_sees_a_constant_and_no_name():
     """Two models built alike are one; another step, another constant are not."""
-    assert set(fingerprint.FUNCTIONS) == set(studies.STUDIES)
+    assert set(fingerprint.FUNCTIONS) == set(catalogue.STUDIES)
     assert fingerprint.digest("correctness") == fingerprint.digest_of(
         fingerprint.FUNCTIONS["correctness"]()
     )
@@ -264,36 +265,36 @@ def test_the_digest_of_the_filters_sees_a_constant_and_no_name():
 
 
 def test_constants_are_those_in_capitals():
-    found = studies.constants("scenarios.estimation.electrical")
+    found = catalogue.constants("estimators.apu.electrical")
     assert found["FAULT_LEVEL"] == FAULT_LEVEL and "H_WALK" in found
     assert "window_lengths" not in found
-    assert studies.constants("scenarios.estimation.joint")["TEST"]["margin"] > 1
+    assert catalogue.constants("estimators.apu.joint")["TEST"]["margin"] > 1
     # of a package: those of its modules together
-    isolation = studies.constants("scenarios.estimation.isolation")
+    isolation = catalogue.constants("estimators.apu.isolation")
     assert isolation["METHODS"] and isolation["SUBSTEPS"] and isolation["DEFAULT"]["every"]
-    for s in studies.STUDIES.values():
+    for s in catalogue.STUDIES.values():
         json.dumps(s.fixed(), allow_nan=False)
 
 
 def test_wrong_studies_and_files(tmp_path):
     with pytest.raises(ParameterError, match="did you mean 'gaspath'"):
-        studies.get("gas-path")
+        catalogue.get("gas-path")
     with pytest.raises(ParameterError, match="2 at least"):
-        studies.run("speed", tmp_path, n_seeds=1)
+        catalogue.run("speed", tmp_path, n_seeds=1)
     with pytest.raises(DataError, match="JSON cannot hold"):
-        studies._plain({"a": object()})
+        catalogue._plain({"a": object()})
     (tmp_path / "speed.json").write_text("[]")
     with pytest.raises(DataError, match="does not hold the study"):
-        studies.read(studies.get("speed"), tmp_path)
+        catalogue.read(catalogue.get("speed"), tmp_path)
     (tmp_path / "speed.json").write_text("{")
     with pytest.raises(DataError, match="cannot be read"):
-        studies.read(studies.get("speed"), tmp_path)
+        catalogue.read(catalogue.get("speed"), tmp_path)
 
 
 def test_a_damaged_part_is_told_and_run_again(toy, tmp_path, caplog):
     """One number, one type, one name changed in the file: that part alone is made again."""
     study, ran, _ = toy
-    whole = studies.run("correctness", tmp_path, n_seeds=40)
+    whole = catalogue.run("correctness", tmp_path, n_seeds=40)
     path = tmp_path / "correctness.json"
     for part, key, value in (
         ("a", "result", {"n": 41, "x": [0.333333, None]}),
@@ -305,22 +306,22 @@ def test_a_damaged_part_is_told_and_run_again(toy, tmp_path, caplog):
         record = json.loads(path.read_text())
         record["parts"][part][key] = value
         path.write_text(json.dumps(record))
-        assert studies.pending(study, tmp_path, 40) == [part]
-        again = studies.run("correctness", tmp_path, n_seeds=40)
+        assert catalogue.pending(study, tmp_path, 40) == [part]
+        again = catalogue.run("correctness", tmp_path, n_seeds=40)
         assert ran == [part] and f"part {part!r} is left out" in caplog.text
         assert {k: p["result"] for k, p in again["parts"].items()} == {
             k: p["result"] for k, p in whole["parts"].items()
         }
     path.write_text(json.dumps({"study": "correctness", "parts": {}}))
     with pytest.raises(DataError, match="no table 'fixed'"):
-        studies.run("correctness", tmp_path, n_seeds=40)
+        catalogue.run("correctness", tmp_path, n_seeds=40)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["correctness.json"]  # no lock is left
 
 
 def test_what_no_report_can_read_is_an_error_with_a_remedy():
     part = {"seeds": [1, 9], "result": 3}
     with pytest.raises(DataError, match=r"study shaft-power: .* --again makes it anew"):
-        page.claims({"shaft-power": {"parts": {"filter": part}}})
+        estimation_page.claims({"shaft-power": {"parts": {"filter": part}}})
 
 
 def test_two_processes_do_not_run_a_study_twice(toy, tmp_path, caplog):
@@ -328,7 +329,7 @@ def test_two_processes_do_not_run_a_study_twice(toy, tmp_path, caplog):
     _, ran, _ = toy
     with locked(tmp_path, "correctness.lock"):
         began = threading.Thread(
-            target=studies.run, args=("correctness", tmp_path), kwargs={"n_seeds": 40}
+            target=catalogue.run, args=("correctness", tmp_path), kwargs={"n_seeds": 40}
         )
         began.start()
         began.join(0.5)
@@ -338,7 +339,7 @@ def test_two_processes_do_not_run_a_study_twice(toy, tmp_path, caplog):
 
 
 def test_names_on_the_command_line_are_the_studies():
-    assert tuple(studies.STUDIES) == command.NAMES
+    assert tuple(catalogue.STUDIES) == command.NAMES
 
 
 @pytest.mark.parametrize(

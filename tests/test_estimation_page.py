@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apu_casadi.errors import DataError, SignalError
-from apu_casadi.studyplot import plot_consistency, plot_coverage, plot_null, plot_rate
-from scenarios.estimation import page, studies
-from scenarios.estimation.reports import REPORTS
+from apu_casadi.core.errors import DataError, SignalError
+from scenarios.figures.studyplot import plot_consistency, plot_coverage, plot_null, plot_rate
+from scenarios.pages import estimation_page
+from scenarios.pages.reports import REPORTS
+from scenarios.studies import catalogue
 
 HERE = Path(__file__).parents[1]
 KEPT = HERE / "docs" / "estimation"
@@ -16,17 +17,19 @@ KEPT = HERE / "docs" / "estimation"
 
 @pytest.fixture(scope="module")
 def records():
-    return page.load(KEPT)
+    return estimation_page.load(KEPT)
 
 
 def test_the_page_is_what_the_results_say(records):
     """``apu estimate page --write ESTIMATION.md``, from the numbers that are kept."""
     written = (HERE / "ESTIMATION.md").read_text(encoding="utf-8")
-    assert page.page(records) == written
+    assert estimation_page.page(records) == written
 
 
 def test_every_figure_of_the_page_is_there(records):
-    names = [file for group in page.pictures(records).values() for file, _ in group.values()]
+    names = [
+        file for group in estimation_page.pictures(records).values() for file, _ in group.values()
+    ]
     assert len(names) == len(set(names)) >= 6
     for name in names:
         path = HERE / "docs" / "images" / name
@@ -34,16 +37,16 @@ def test_every_figure_of_the_page_is_there(records):
 
 
 def test_every_study_has_a_report():
-    assert set(REPORTS) == set(studies.STUDIES)
+    assert set(REPORTS) == set(catalogue.STUDIES)
 
 
 def test_every_missed_goal_has_a_reason(records):
-    for c in page.claims(records):
+    for c in estimation_page.claims(records):
         assert c.met is None or c.met or c.why, c.what
 
 
 def test_goals_are_sorted(records):
-    goals = [c.goal for c in page.claims(records)]
+    goals = [c.goal for c in estimation_page.claims(records)]
     numbers = [g for g in goals if isinstance(g, int)]
     assert numbers == sorted(numbers) and goals[: len(numbers)] == numbers
 
@@ -51,7 +54,7 @@ def test_goals_are_sorted(records):
 def test_a_part_that_was_not_run_is_named(records):
     """An interrupted study still makes a page."""
     name, record = next(iter(records.items()))
-    text = page.page({name: record | {"parts": {}}})
+    text = estimation_page.page({name: record | {"parts": {}}})
     assert "Not run yet" in text
     for report in REPORTS.values():
         assert report.claims({}) == [] and report.section({}) == []
@@ -59,7 +62,7 @@ def test_a_part_that_was_not_run_is_named(records):
 
 def test_nothing_kept_is_an_error(tmp_path):
     with pytest.raises(DataError, match="apu estimate study all"):
-        page.load(tmp_path)
+        estimation_page.load(tmp_path)
 
 
 def test_figures_refuse_what_does_not_fit():
@@ -78,6 +81,6 @@ def test_figures_refuse_what_does_not_fit():
 def test_the_readme_has_the_short_table(records):
     """``apu estimate page --readme README.md`` puts it there."""
     text = (HERE / "README.md").read_text(encoding="utf-8")
-    assert page.put_summary(text, records) == text
+    assert estimation_page.put_summary(text, records) == text
     with pytest.raises(DataError, match="no place"):
-        page.put_summary("nothing", records)
+        estimation_page.put_summary("nothing", records)

@@ -18,10 +18,10 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from apu_casadi.errors import ParameterError, SignalError
-from apu_casadi.signals import Signals
-from apu_casadi.statespace import StateSpace
-from estimators.model import (
+from apu_casadi.core.errors import ParameterError, SignalError
+from apu_casadi.core.signals import Signals
+from apu_casadi.core.statespace import StateSpace
+from estimators.models.filtermodel import (
     FilterModel,
     Unknown,
     augment,

@@ -6,8 +6,8 @@ import os
 import pytest
 from matplotlib.figure import Figure
 
-from apu_casadi import files
-from apu_casadi.errors import DataError
+from apu_casadi.core import files
+from apu_casadi.core.errors import DataError
 
 
 def test_a_failed_write_leaves_the_former_file_and_nothing_else(tmp_path):

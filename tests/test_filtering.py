@@ -10,12 +10,12 @@ import pytest
 from estimation_models import cv_model, gappy, pendulum, pendulum_data, random_belief
 from numpy.testing import assert_allclose
 
-from apu_casadi.backend import find_compiler, use_backend
-from apu_casadi.errors import DataError, EstimationError, SignalError
-from estimators.belief import Belief
-from estimators.ekf import ekf_step
-from estimators.filtering import BLOCK, STEP_OUT, run
-from estimators.ukf import ukf_step
+from apu_casadi.core.backend import find_compiler, use_backend
+from apu_casadi.core.errors import DataError, EstimationError, SignalError
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import ekf_step
+from estimators.filters.filtering import BLOCK, STEP_OUT, run
+from estimators.filters.ukf import ukf_step
 
 STEPS = {"ekf": ekf_step, "ukf": ukf_step}
 every_step = pytest.mark.parametrize("name", STEPS)
@@ -99,7 +99,7 @@ def test_plain_steps_take_covariances(singular):
 
 def test_the_backend_in_use_is_asked_each_time(monkeypatch):
     """A block made under one backend is not taken for another's."""
-    import estimators.filtering as filtering
+    import estimators.filters.filtering as filtering
 
     asked = []
     real = filtering.compiled

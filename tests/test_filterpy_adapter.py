@@ -20,12 +20,12 @@ from estimation_models import (
 )
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import DataError, EstimationError, ParameterError, SignalError
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from estimators.filterpy_adapter import filterpy_ekf, filterpy_ukf, run_filterpy
-from estimators.model import FilterModel, Unknown, augment, discretise, measure
-from estimators.ukf import unscented_kalman_filter
+from apu_casadi.core.errors import DataError, EstimationError, ParameterError, SignalError
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.filters.filterpy_adapter import filterpy_ekf, filterpy_ukf, run_filterpy
+from estimators.filters.ukf import unscented_kalman_filter
+from estimators.models.filtermodel import FilterModel, Unknown, augment, discretise, measure
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 POINTS = [

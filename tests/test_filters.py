@@ -24,11 +24,11 @@ from estimation_models import (
 )
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import ParameterError
-from estimators.belief import Belief
-from estimators.ekf import ekf_step
-from estimators.filtering import run
-from estimators.ukf import ukf_step
+from apu_casadi.core.errors import ParameterError
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import ekf_step
+from estimators.filters.filtering import run
+from estimators.filters.ukf import ukf_step
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 FILTERS = {

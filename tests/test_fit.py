@@ -11,15 +11,15 @@ from estimation_models import model_of, named
 from numpy.testing import assert_allclose
 from scipy.optimize import brentq, minimize_scalar
 
-from apu_casadi.errors import DataError, EstimationError, ParameterError
-from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.signals import Signal, Signals
-from apu_casadi.statespace import StateSpace
-from apu_casadi.trimming import trim_gas_generator
-from estimators.belief import Belief
-from estimators.fit import FitProblem, fit, profile
-from estimators.lifting import lift, plain
-from estimators.model import (
+from apu_casadi.core.errors import DataError, EstimationError, ParameterError
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.statespace import StateSpace
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from estimators.batch.fit import FitProblem, fit, profile
+from estimators.batch.transcription import Transcription, square_root
+from estimators.filters.belief import Belief
+from estimators.models.filtermodel import (
     Unknown,
     augment,
     biases,
@@ -29,8 +29,8 @@ from estimators.model import (
     measured_inputs,
     noisy_inputs,
 )
-from estimators.recording import Recording, record
-from estimators.transcription import Transcription, square_root
+from estimators.models.lifting import lift, plain
+from estimators.models.recording import Recording, record
 
 
 def static(g, p, ny=1):

@@ -8,13 +8,13 @@ import json
 import numpy as np
 import pytest
 
-from apu_casadi.errors import DataError, ParameterError, SignalError
-from apu_casadi.fitplot import plot_fit
-from apu_casadi.gasgenerator import RPM
+from apu_casadi.core.errors import DataError, ParameterError, SignalError
+from apu_casadi.gaspath.gasgenerator import RPM
+from estimators.apu import fitting
+from estimators.apu.sensors import GAS_PATH
 from scenarios.cli import main
 from scenarios.commands.fit import verdict
-from scenarios.estimation import fitting
-from scenarios.estimation.sensors import GAS_PATH
+from scenarios.figures.fitplot import plot_fit
 
 TRUTH = np.array([0.98, 0.99, 1.0, 0.985])
 HEADER = "N [rpm],P3 [kPa],T3 [K],EGT_in [degC],Wf [kg/h],PW [kW],dT_isa [K],remark"

@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 from synthetic_joint import synthetic_joint
 
-from apu_casadi import results
-from apu_casadi.calibration import read_points, write_points
-from apu_casadi.errors import ApuError, DataError, ScenarioError
+from apu_casadi.core import results
+from apu_casadi.core.errors import ApuError, DataError, ScenarioError
+from apu_casadi.gaspath.calibration import read_points, write_points
 from scenarios import registry
 from scenarios.commands.calibrate import published_points
-from scenarios.estimation import page, studies
+from scenarios.pages import estimation_page
 from scenarios.schema import Scenario
+from scenarios.studies import catalogue
 
 SEED = int(os.environ.get("FUZZ_SEED", "0"))
 CASES = int(os.environ.get("FUZZ_CASES", "150"))
@@ -40,10 +41,10 @@ def read_run(path):
 
 
 def read_study(path):
-    study = studies.get("correctness")
-    record = studies.read(study, path.parent)
-    studies.other_code(study, record)
-    return page.load(path.parent)
+    study = catalogue.get("correctness")
+    record = catalogue.read(study, path.parent)
+    catalogue.other_code(study, record)
+    return estimation_page.load(path.parent)
 
 
 def write_scenario(path):
@@ -261,10 +262,10 @@ def test_a_study_that_lacks_a_part_of_itself(tmp_path, caplog):
     ):
         path.write_text(json.dumps({**good, "parts": {**good["parts"], part: damaged}}))
         caplog.clear()
-        record = studies.read(studies.get("correctness"), tmp_path)
+        record = catalogue.read(catalogue.get("correctness"), tmp_path)
         assert set(record["parts"]) == set(good["parts"]) - {part}
         assert f"part {part!r} is left out: {words}" in caplog.text
     empty = {**good["parts"][part], "result": {}}
     path.write_text(json.dumps({**good, "parts": {**good["parts"], part: empty}}))
     with pytest.raises(DataError, match="correctness"):
-        page.pictures(page.load(tmp_path))
+        estimation_page.pictures(estimation_page.load(tmp_path))

@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi.errors import ParameterError
-from apu_casadi.gas import T_REF, Gas
+from apu_casadi.core.errors import ParameterError
+from apu_casadi.gaspath.gas import T_REF, Gas
 
 TEMPERATURES = np.array([200.0, 250, 298.15, 400, 600, 800, 999, 1001, 1200, 1500, 1800, 2200])
 FAR_WAR = [(0.0, 0.0), (0.0, 0.02), (0.01, 0.0), (0.02, 0.01), (0.04, 0.0)]

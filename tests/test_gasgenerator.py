@@ -6,16 +6,16 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi.errors import (
+from apu_casadi.core.errors import (
     MapError,
     OperatingPointError,
     ParameterError,
     SignalError,
     SimulationError,
 )
-from apu_casadi.gasgenerator import RPM, GasGenerator, GasGeneratorParameters
-from apu_casadi.mapfiles import read_map, shipped, write_map_csv
-from apu_casadi.trimming import initialise, trim_gas_generator
+from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator, GasGeneratorParameters
+from apu_casadi.gaspath.maps.mapfiles import read_map, shipped, write_map_csv
+from apu_casadi.gaspath.steady.trimming import initialise, trim_gas_generator
 
 ISA5 = {"dT_isa": 5.0}
 
@@ -238,7 +238,7 @@ def test_second_derivatives_of_the_root_equal_differences_of_first_ones(gg):
 @pytest.mark.parametrize("backend", ["vm", "auto"])
 def test_what_is_not_a_number_is_never_called_solved(gg, backend):
     """NaN in any input or in the start leaves a residual that fails every check."""
-    from apu_casadi.backend import compiled
+    from apu_casadi.core.backend import compiled
 
     step = compiled(gg.step, backend=backend)
     p = trim_gas_generator(gg, {"N": gg.parameters.N, "PW": 3e5}, **ISA5)

@@ -11,12 +11,11 @@ import pytest
 import xarray as xr
 from scipy.stats import chi2
 
-from apu_casadi.errors import DataError, EstimationError, ParameterError
-from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.trimming import trim_gas_generator
-from estimators.filtering import FilterResult
-from scenarios.estimation import gaspath, gaspath_study
-from scenarios.estimation.gaspath import (
+from apu_casadi.core.errors import DataError, EstimationError, ParameterError
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from estimators.apu import gaspath
+from estimators.apu.gaspath import (
     DT,
     HEALTH,
     OUTPUTS,
@@ -29,6 +28,8 @@ from scenarios.estimation.gaspath import (
     whitened,
     window_means,
 )
+from estimators.filters.filtering import FilterResult
+from scenarios.studies import gaspath_study
 
 GG = GasGenerator()
 FAULTY = {"f_eta_c": 0.99, "f_W_c": 0.985, "f_eta_t": 0.99, "f_W_t": 1.02}

@@ -13,12 +13,12 @@ import scipy.integrate
 from numpy.testing import assert_allclose
 from phase_coordinates import independent_machine
 
-from apu_casadi import simulation
-from apu_casadi.errors import OperatingPointError, ParameterError, SignalError
-from apu_casadi.generator import Generator, MeasurementNoise
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
-from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
-from apu_casadi.machine.ttsc import Ttsc
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import OperatingPointError, ParameterError, SignalError
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator, MeasurementNoise
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 
 P = MachineParameters()
 GEN = Generator()

@@ -13,14 +13,14 @@ from estimation_models import constant_velocity, oscillator
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from apu_casadi.errors import ParameterError, SignalError
-from estimators.belief import Belief
+from apu_casadi.core.errors import ParameterError, SignalError
 from estimators.detection.alarms import HOUR
 from estimators.detection.glr import glr, glr_stationary, glr_statistic, glr_test, glr_threshold
 from estimators.detection.signatures import Jump, linear_filter, linearised, project
-from estimators.ekf import extended_kalman_filter
-from estimators.model import Unknown, augment, discretise, noisy_inputs
-from estimators.recording import Recording
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.models.filtermodel import Unknown, augment, discretise, noisy_inputs
+from estimators.models.recording import Recording
 
 A = np.array([[0.95, 0.1], [0.0, 0.9]])
 H = np.array([[1.0, 0.0], [0.3, 1.0]])

@@ -10,13 +10,14 @@ from estimation_models import batch_by_hand, gappy, linear, random_belief, rando
 from numpy.testing import assert_allclose
 from scipy.stats import chi2, ncx2, norm
 
-from apu_casadi.errors import EstimationError, ParameterError, SignalError
-from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.signals import Signal, Signals
-from apu_casadi.trimming import trim_gas_generator
-from estimators.belief import Belief
-from estimators.bounds import posterior_bound
-from estimators.identifiability import (
+from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from estimators.apu.identify import BASE, CANDIDATES, gas_path
+from estimators.filters.belief import Belief
+from estimators.information.bounds import posterior_bound
+from estimators.information.identifiability import (
     Sensitivities,
     compare_sensors,
     identify,
@@ -26,7 +27,6 @@ from estimators.identifiability import (
     together,
     which_to_add,
 )
-from scenarios.estimation.identify import BASE, CANDIDATES, gas_path
 
 
 def toy(H=None, *, faults="a b", nuisances="n", prior=None, sigma=None, seed=0):

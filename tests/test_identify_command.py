@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import ParameterError, SignalError
-from apu_casadi.estimationplot import plot_gain_of_a_sensor
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from estimators.identifiability import identify
+from apu_casadi.core.errors import ParameterError, SignalError
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import SeriesLoad
+from estimators.apu import identify as study
+from estimators.information.identifiability import identify
 from scenarios.cli import main
-from scenarios.estimation import identify as study
+from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 
 
 def out(capsys, *argv):

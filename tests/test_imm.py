@@ -19,13 +19,13 @@ from scipy.linalg import expm
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from apu_casadi.errors import EstimationError, ParameterError, SignalError
-from apu_casadi.signals import Signal, Signals
-from estimators.belief import Belief
-from estimators.imm import interacting_multiple_models, log_normalised, multiple_models
-from estimators.model import discretise
-from estimators.recording import Recording
-from estimators.ukf import ukf_step
+from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
+from apu_casadi.core.signals import Signal, Signals
+from estimators.filters.belief import Belief
+from estimators.filters.imm import interacting_multiple_models, log_normalised, multiple_models
+from estimators.filters.ukf import ukf_step
+from estimators.models.filtermodel import discretise
+from estimators.models.recording import Recording
 
 A = {"calm": np.array([[1.0, 0.1], [0.0, 1.0]]), "wild": np.array([[1.0, 0.1], [0.0, 0.8]])}
 C = {"calm": np.array([[1.0, 0.0], [0.0, 1.0]]), "wild": np.array([[1.0, 0.2], [0.0, 1.0]])}

@@ -16,10 +16,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi import files, interrupts
-from apu_casadi.errors import SimulationError
-from apu_casadi.interrupts import watched
-from scenarios import guard
+from apu_casadi.core import files, interrupts
+from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.interrupts import watched
+from scenarios.shell import guard
 
 ANSWER = 3.0
 """Seconds allowed for an answer that takes 0.6 s at most on a machine with nothing else to do."""

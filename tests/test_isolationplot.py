@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from apu_casadi.errors import SignalError
-from apu_casadi.isolationplot import plot_confusion, plot_kappa
+from apu_casadi.core.errors import SignalError
+from scenarios.figures.isolationplot import plot_confusion, plot_kappa
 
 SCORES = {
     "classes": ["healthy", "a", "b"],

@@ -8,20 +8,20 @@ import json
 import numpy as np
 import pytest
 
-from apu_casadi.apu import Apu
-from apu_casadi.errors import DataError
-from apu_casadi.events import FaultChange, LoadChange
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.multirate import simulate_joint
-from scenarios.estimation.gaspath import HEALTH
-from scenarios.estimation.joint import (
+from apu_casadi.core.errors import DataError
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import FaultChange, LoadChange
+from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.gaspath import HEALTH
+from estimators.apu.joint import (
     electrical_samples,
     estimate_joint,
     joint_case,
     speed_from_generators,
 )
-from scenarios.estimation.monolithic_filter import compare_monolithic
+from estimators.apu.monolithic_filter import compare_monolithic
 
 APU = Apu()
 FAULT = Ttsc(mu=0.05, k_rf=20.0, phase="a")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios import jsontext
+from scenarios.shell import jsontext
 
 
 @dataclasses.dataclass

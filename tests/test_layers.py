@@ -1,10 +1,12 @@
-"""Who may import whom: the folders and modules form layers, and imports point downwards.
+"""Who may import whom: the folders form layers, and imports point downwards.
 
-The rules are the tables below.  Every import counts, also one inside a function or under
-TYPE_CHECKING: a dependency is a dependency.
+``BELOW`` is the whole rule: a folder, and the folders that it may import besides itself.  Inside a
+folder any import is allowed that makes no circle.  Every import counts, also one inside a function
+or under TYPE_CHECKING: a dependency is a dependency.
 """
 
 import ast
+from graphlib import CycleError, TopologicalSorter
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,74 +16,66 @@ import pytest
 ROOT = Path(find_spec("apu_casadi").origin).parents[1]
 PACKAGES = ("apu_casadi", "estimators", "scenarios")
 
-# Bottom first.  A module may import the layers below its own, and its neighbours only if NEIGHBOURS
-# says so.  "components" and "machine" stand for all modules in these folders.
-LAYERS = (
-    ("interrupts",),
-    ("errors", "checked", "sharing", "conditions"),
-    ("signals", "parameters", "mapcheck", "cachefolder", "calling", "files", "filearrays"),
-    ("netcdf3", "runstorage"),
-    ("statespace", "results", "backend", "runwords"),
-    ("means",),
-    # solvers: they know nothing of turbines or windings, since those come above
-    ("rootfinding", "discretisation", "simulation"),
-    ("gas", "maptable"),
-    ("mapfiles",),
-    ("atmosphere", "maps"),
-    ("components", "machine"),
-    ("cycle",),
-    ("gasgenerator", "generator", "terminalmodel"),
-    ("trimkernel",),
-    ("steadypoint",),
-    ("trimsolver",),
-    ("trimbranch",),
-    ("trimming", "trimbatch", "propagation"),
-    ("calibration", "meanstep"),
-    ("control", "events"),
-    ("apu", "runrecord"),
-    ("jointstep", "validity"),
-    ("machinestep",),
-    ("jointmodel", "multirate"),
-    ("linearisation", "monolithic"),
-)
-NEIGHBOURS = {
-    "checked": {"errors"},
-    "components": {"components"},
-    "machine": {"machine"},
-}
-# What draws, and all that it may see.  Nothing else in apu_casadi imports these, and nothing else
-# uses matplotlib.
-ONLY = {
-    "figstyle": set(),
-    "plotting": {"results", "errors", "figstyle", "files", "runwords"},
-    # these two draw what they are given a model of: eigenvalues, operating lines on a map
-    "eigenplot": {"errors", "figstyle", "linearisation"},
-    "benchplot": {"errors", "figstyle"},
-    "isolationplot": {"errors", "figstyle"},
-    "fitplot": {"errors", "figstyle"},
-    "jointestimateplot": {"errors", "figstyle"},
-    "studyplot": {"errors", "figstyle"},
-    "estimationplot": {"errors", "figstyle"},
-    "mapplots": {
-        "results",
-        "errors",
-        "figstyle",
-        "maps",
-        "steadypoint",
-        "trimming",
-        "gasgenerator",
-    },
-}
-# Upward imports that are known, with the reason; an entry that is no longer needed fails.
-EXCEPTIONS: dict[tuple[str, str], str] = {}
-# apu_casadi/__init__.py is the front door: it names modules, and no module comes in through it.
-# Estimators know f, g and names; of the solvers only how to make a step of f and to compile it.
-ESTIMATORS = {
-    "statespace", "signals", "results", "errors", "checked", "sharing", "backend", "discretisation",
-    "interrupts",
-}  # fmt: skip
+CORE = ("apu_casadi.core",)
+PARTS = (*CORE, "apu_casadi.gaspath", "apu_casadi.machine")
+UNIT = (*PARTS, "apu_casadi.unit")
+MODELS = (*CORE, "estimators.models")
+FILTERS = (*MODELS, "estimators.filters")
+BATCH = (*FILTERS, "estimators.batch")
+GENERIC = (*BATCH, "estimators.information", "estimators.detection")
+ESTIMATORS = (*UNIT, *GENERIC, "estimators.apu")
+SHELL = (*CORE, "scenarios", "scenarios.shell")
+SCENARIO = (*ESTIMATORS, *SHELL, "scenarios.figures", "scenarios.schema", "scenarios.registry",
+            "scenarios.campaign_records", "scenarios.campaigns")  # fmt: skip
+STUDIES = (*SCENARIO, "scenarios.validation", "scenarios.studies")
+PAGES = (*STUDIES, "scenarios.bench", "scenarios.pages")
 
-RANK = {unit: k for k, layer in enumerate(LAYERS) for unit in layer}
+# Bottom first: a folder, or a module that stands in a package itself, and what it may import.
+BELOW: dict[str, tuple[str, ...]] = {
+    "apu_casadi": UNIT,  # the front door names modules; no module of the package comes in by it
+    "apu_casadi.core": (),
+    "apu_casadi.gaspath": CORE,
+    "apu_casadi.machine": CORE,
+    "apu_casadi.unit": PARTS,
+    # generic estimators see f, g and names
+    "estimators": (),
+    "estimators.models": CORE,
+    "estimators.filters": MODELS,
+    "estimators.batch": FILTERS,
+    "estimators.information": BATCH,
+    "estimators.detection": BATCH,
+    "estimators.apu": (*UNIT, *GENERIC),
+    "scenarios": (),
+    "scenarios.shell": SHELL,
+    "scenarios.figures": UNIT,
+    "scenarios.schema": ESTIMATORS,
+    "scenarios.registry": SCENARIO,
+    "scenarios.campaign_records": SCENARIO,
+    "scenarios.campaigns": SCENARIO,
+    "scenarios.validation": SCENARIO,
+    "scenarios.studies": STUDIES,
+    "scenarios.bench": STUDIES,
+    "scenarios.pages": STUDIES,
+    "scenarios.commands": (*PAGES, "apu_casadi"),
+    "scenarios.cli": (*SHELL, "scenarios.commands"),
+}
+# who may import a package of others' code; all others may not
+ONLY = {"matplotlib": "scenarios.figures"}
+
+
+def name_of(path: Path) -> str:
+    """``ROOT/apu_casadi/machine/park.py`` -> ``apu_casadi.machine.park``."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def folder_of(dotted: str) -> str:
+    """``apu_casadi.machine.faults.ttsc`` -> ``apu_casadi.machine``."""
+    return ".".join(dotted.split(".")[:2])
+
+
+def modules() -> dict[str, Path]:
+    """Return all modules of the three packages by dotted name."""
+    return {name_of(p): p for top in PACKAGES for p in sorted((ROOT / top).rglob("*.py"))}
 
 
 def imports(path: Path) -> list[tuple[int, str]]:
@@ -91,10 +85,7 @@ def imports(path: Path) -> list[tuple[int, str]]:
         if isinstance(node, ast.Import):
             found += [(node.lineno, a.name) for a in node.names]
         elif isinstance(node, ast.ImportFrom):
-            if node.level:
-                found.append((node.lineno, "." * node.level + (node.module or "")))
-                continue
-            module = node.module or ""
+            module = "." * node.level + (node.module or "")
             for a in node.names:
                 inner = ROOT.joinpath(*module.split("."), a.name)
                 is_module = inner.with_suffix(".py").exists() or (inner / "__init__.py").exists()
@@ -102,93 +93,84 @@ def imports(path: Path) -> list[tuple[int, str]]:
     return sorted(set(found))
 
 
-def unit_of(dotted: str) -> str:
-    """``apu_casadi.machine.load`` -> ``machine``; ``apu_casadi`` -> ``""``, the front door."""
-    return dotted.split(".")[1] if "." in dotted else ""
-
-
-def own_unit(path: Path) -> str:
-    """Return the unit that a file of apu_casadi belongs to."""
-    name = path.relative_to(ROOT / "apu_casadi").parts[0].removesuffix(".py")
-    return "" if name == "__init__" else name
-
-
 def verdict(path: Path, module: str) -> str | None:
     """Return what is wrong with the import of ``module`` by ``path``; None if it is allowed."""
-    package = path.relative_to(ROOT).parts[0]
+    mine, target = folder_of(name_of(path)), folder_of(module)
     top = module.split(".")[0]
     if module.startswith("."):
         return "relative import; write the absolute one"
     if top in ("tests", "notebooks"):
         return f"nothing imports {top}"
-    if top == "matplotlib" and not (package == "apu_casadi" and own_unit(path) in ONLY):
-        return f"only {', '.join(ONLY)} of apu_casadi use matplotlib; draw there"
-    if top not in PACKAGES or package == "scenarios":
+    if top in ONLY and mine != ONLY[top]:
+        return f"only {ONLY[top]} uses {top}; draw there"
+    if top not in PACKAGES or target == mine or target in BELOW[mine]:
         return None
-    if top == "scenarios":
-        return "nothing imports scenarios; move what is shared down into apu_casadi"
-    target = unit_of(module)
-    if package == "estimators":
-        if top == "estimators" or target in ESTIMATORS:
-            return None
-        return f"estimators import only {', '.join(sorted(ESTIMATORS))} of apu_casadi"
-    if top == "estimators":
-        return "apu_casadi does not know estimators"
-    mine = own_unit(path)
-    if mine in ("", "data"):
-        return None if mine == "" else "data holds no code"
-    if target == "":
-        return "name the module (from apu_casadi.signals import Signals), not the package"
-    if mine in ONLY:
-        if target in ONLY[mine]:
-            return None
-        return f"{mine} sees only {', '.join(sorted(ONLY[mine]))}"
-    if target in ONLY:
-        return f"no model or solver imports {target}"
-    if mine not in RANK or target not in RANK:
-        return None  # test_every_module_has_a_place tells, once
-    if RANK[target] < RANK[mine] or target in NEIGHBOURS.get(mine, ()):
-        return None
-    if (mine, target) in EXCEPTIONS:
-        return None
-    how = "upward" if RANK[target] > RANK[mine] else "sideways"
-    return f"{how} import: {mine} is in layer {RANK[mine]}, {target} in layer {RANK[target]}"
+    if target == "apu_casadi":
+        return "name the module (from apu_casadi.core.signals import Signals), not the package"
+    below = ", ".join(BELOW[mine]) or "nothing else"
+    return f"upward or sideways import: {mine} may import {below}"
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_imports_point_downwards(package):
-    """The tables above; every offence is listed with its line."""
-    wrong = []
-    for path in sorted((ROOT / package).rglob("*.py")):
-        for line, module in imports(path):
-            why = verdict(path, module)
-            if why:
-                wrong.append(f"{path.relative_to(ROOT)}:{line} imports {module}: {why}")
+    """Every offence is listed with its line; a new folder must be put into ``BELOW``."""
+    found = {n: p for n, p in modules().items() if n.split(".")[0] == package}
+    missing = sorted({folder_of(n) for n in found} - set(BELOW))
+    assert not missing, f"no place for {', '.join(missing)}: extend BELOW in {__file__}"
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {module}: {why}"
+        for path in found.values()
+        for line, module in imports(path)
+        if (why := verdict(path, module))
+    ]
     assert not wrong, "\n" + "\n".join(wrong)
 
 
-def test_every_module_has_a_place():
-    """A new module must be put into a layer, or the rules would silently pass it over."""
-    units = {own_unit(p) for p in (ROOT / "apu_casadi").rglob("*.py")} - {"", "data"}
-    missing = units - set(RANK) - set(ONLY)
-    assert not missing, f"no layer for {', '.join(sorted(missing))}: extend LAYERS in {__file__}"
-
-
-def test_no_exception_is_stale():
-    """An exception outlives its reason unless something asks."""
-    used = {
-        (own_unit(path), unit_of(module))
-        for path in (ROOT / "apu_casadi").rglob("*.py")
-        for _, module in imports(path)
+def test_no_circles():
+    """No module imports itself by a detour, whether at once or inside a function."""
+    known = modules()
+    graph = {
+        name: [m for _, m in imports(path) if m in known and m != name]
+        for name, path in known.items()
+        if name not in PACKAGES
     }
-    stale = set(EXCEPTIONS) - used
-    assert not stale, f"remove from EXCEPTIONS of {Path(__file__).name}: {stale}"
+    try:
+        list(TopologicalSorter(graph).static_order())
+    except CycleError as e:
+        pytest.fail(" -> ".join(e.args[1]))
+
+
+def test_no_private_name_leaves_its_module():
+    """Who needs a name of another module needs a public one."""
+    known, wrong = modules(), []
+    for name, path in known.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        inner = {m.split(".")[-1] for _, m in imports(path) if m in known}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
+                private = [a.name for a in node.names if a.name.startswith("_")]
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                there = node.value.id in inner and node.attr.startswith("_")
+                private = [node.attr] if there and not node.attr.endswith("__") else []
+            else:
+                continue
+            wrong += [f"{name}:{node.lineno}: {p}" for p in private if p != "__version__"]
+    assert not wrong, "\n" + "\n".join(wrong)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_file_name_twice(package):
+    """A name tells which file is meant; ``__init__.py`` aside."""
+    names = [p.name for n, p in modules().items() if n.split(".")[0] == package]
+    assert not {n for n in names if names.count(n) > 1} - {"__init__.py"}
 
 
 def test_inner_packages_hold_no_code():
     """Names have one home: only the front door re-exports; a docstring is welcome."""
-    inner = [p for top in ("apu_casadi", "estimators") for p in (ROOT / top).glob("*/__init__.py")]
+    tops = [ROOT / top for top in ("apu_casadi", "estimators")]
+    inner = [p for top in tops for p in top.glob("*/**/__init__.py")]
     assert ROOT / "estimators" / "detection" / "__init__.py" in inner
+    assert ROOT / "apu_casadi" / "machine" / "faults" / "__init__.py" in inner
     for path in inner:
         body = ast.parse(path.read_text(encoding="utf-8")).body
         code = [node for node in body if not isinstance(node, ast.Expr)]
@@ -198,30 +180,29 @@ def test_inner_packages_hold_no_code():
 @pytest.mark.parametrize(
     ("path", "module", "words"),
     [
-        ("apu_casadi/signals.py", "apu_casadi.gas", "upward import: signals is in layer 2"),
-        ("apu_casadi/simulation.py", "apu_casadi.generator", "upward"),
-        ("apu_casadi/machine/wrsg.py", "apu_casadi.components.shaft", "sideways"),
-        ("apu_casadi/components/shaft.py", "apu_casadi.machine.park", "sideways"),
-        ("apu_casadi/generator.py", "apu_casadi.gasgenerator", "sideways"),
+        ("apu_casadi/core/signals.py", "apu_casadi.gaspath.gas", "upward"),
+        ("apu_casadi/core/simulation.py", "apu_casadi.machine.generator", "upward"),
+        ("apu_casadi/machine/wrsg.py", "apu_casadi.gaspath.components.shaft", "sideways"),
+        ("apu_casadi/gaspath/components/shaft.py", "apu_casadi.machine.park", "sideways"),
+        ("apu_casadi/machine/generator.py", "apu_casadi.unit.apu", "upward"),
+        ("apu_casadi/unit/apu.py", "scenarios.figures.runplots", "upward"),
+        ("apu_casadi/unit/apu.py", "apu_casadi", "name the module"),
+        ("apu_casadi/unit/apu.py", "scenarios.schema", "upward"),
+        ("apu_casadi/unit/apu.py", "estimators.filters.ekf", "upward"),
         (
-            "apu_casadi/plotting.py",
-            "apu_casadi.apu",
-            "plotting sees only errors, figstyle, files, results",
+            "estimators/filters/ekf.py",
+            "apu_casadi.machine.generator",
+            "may import apu_casadi.core,",
         ),
-        ("apu_casadi/apu.py", "apu_casadi.plotting", "no model or solver imports plotting"),
-        ("apu_casadi/apu.py", "apu_casadi", "name the module"),
-        ("apu_casadi/apu.py", "scenarios.schema", "nothing imports scenarios"),
-        ("apu_casadi/apu.py", "estimators.ekf", "does not know estimators"),
-        ("estimators/ekf.py", "apu_casadi.generator", "estimators import only"),
-        ("estimators/detection/glr.py", "apu_casadi.gasgenerator", "estimators import only"),
-        (
-            "estimators/detection/glr.py",
-            "scenarios.estimation.gaspath",
-            "nothing imports scenarios",
-        ),
+        ("estimators/models/recording.py", "estimators.filters.belief", "upward"),
+        ("estimators/detection/glr.py", "apu_casadi.gaspath.gasgenerator", "sideways"),
+        ("estimators/detection/glr.py", "estimators.apu.gaspath", "upward"),
+        ("estimators/apu/gaspath.py", "scenarios.registry", "upward"),
         ("scenarios/cli.py", "tests.test_cli", "nothing imports tests"),
-        ("scenarios/cli.py", "matplotlib.pyplot", "only figstyle, plotting"),
+        ("scenarios/cli.py", "matplotlib.pyplot", "only scenarios.figures"),
         ("scenarios/cli.py", ".commands", "relative"),
+        ("scenarios/shell/guard.py", "scenarios.registry", "upward"),
+        ("scenarios/studies/timing.py", "scenarios.bench.benchmarks", "sideways"),
     ],
 )
 def test_the_rules_bite(path, module, words):
@@ -233,12 +214,14 @@ def test_the_rules_bite(path, module, words):
     ("path", "module"),
     [
         ("apu_casadi/machine/wrsg.py", "apu_casadi.machine.park"),
-        ("apu_casadi/multirate.py", "apu_casadi.trimming"),
-        ("estimators/ekf.py", "apu_casadi.statespace"),
-        ("estimators/ekf.py", "estimators.belief"),
+        ("apu_casadi/unit/multirate.py", "apu_casadi.gaspath.steady.trimming"),
+        ("estimators/filters/ekf.py", "apu_casadi.core.statespace"),
+        ("estimators/filters/ekf.py", "estimators.filters.belief"),
         ("estimators/detection/glr.py", "estimators.detection.signatures"),
-        ("scenarios/cli.py", "apu_casadi.apu"),
-        ("apu_casadi/apu.py", "numpy"),
+        ("estimators/apu/joint.py", "apu_casadi.unit.apu"),
+        ("scenarios/commands/run.py", "apu_casadi.unit.apu"),
+        ("scenarios/figures/figstyle.py", "matplotlib.figure"),
+        ("apu_casadi/unit/apu.py", "numpy"),
     ],
 )
 def test_the_rules_let_through(path, module):

@@ -5,27 +5,28 @@ import math
 import numpy as np
 import pytest
 
-from apu_casadi import linearisation, simulation
-from apu_casadi.apu import Apu
-from apu_casadi.errors import ApuError, OperatingPointError, SignalError
-from apu_casadi.events import Ambient
-from apu_casadi.generator import Generator
-from apu_casadi.jointmodel import (
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import ApuError, OperatingPointError, SignalError
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import ConstantPowerLoad, SeriesLoad
+from apu_casadi.machine.park import Abc, abc_to_qd0
+from apu_casadi.unit import linearisation
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.averaged import (
     averaged_generator,
     generator_vectors,
     has_severity,
     joint_averaged,
     joint_vectors,
 )
-from apu_casadi.linearisation import (
+from apu_casadi.unit.events import Ambient
+from apu_casadi.unit.linearisation import (
     linearise,
     linearise_gas_generator,
     linearise_generator,
     linearise_joint,
 )
-from apu_casadi.machine.load import ConstantPowerLoad, SeriesLoad
-from apu_casadi.machine.park import Abc, abc_to_qd0
-from apu_casadi.machine.ttsc import Ttsc
 
 LOADS = {
     "resistive": SeriesLoad.from_power(225e3),

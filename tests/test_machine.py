@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import ParameterError
+from apu_casadi.core.errors import ParameterError
 from apu_casadi.machine import exciter, wrsg
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
-from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from apu_casadi.machine.park import (
     PHASE_ANGLE,
     Abc,
@@ -18,7 +19,6 @@ from apu_casadi.machine.park import (
     phase_selector,
     qd0_to_abc,
 )
-from apu_casadi.machine.ttsc import Ttsc
 
 TABLE_1 = MachineParameters()
 

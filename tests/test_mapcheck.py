@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from apu_casadi import mapcheck
-from apu_casadi.errors import MapError
-from apu_casadi.mapfiles import MapTable, read_map, shipped, write_map_csv
+from apu_casadi.core.errors import MapError
+from apu_casadi.gaspath.maps import mapcheck
+from apu_casadi.gaspath.maps.mapfiles import MapTable, read_map, shipped, write_map_csv
 
 MAPS = {n: shipped(n) for n in ("axi5", "lpt2269")}
 COLUMNS = ("W", "PR", "eta")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from apu_casadi.errors import DataError, MapError
-from apu_casadi.mapfiles import (
+from apu_casadi.core.errors import DataError, MapError
+from apu_casadi.gaspath.maps.mapfiles import (
     SHIPPED,
     MapTable,
     read_map,
@@ -134,7 +134,7 @@ def test_shipped_figures_are_those_of_pycycle():
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_files_name_origin_and_licence(name):
     """Apache-2.0, section 4: attribution and a statement of changes stay with the figures."""
-    text = (resources.files("apu_casadi.data") / f"{name}.csv").read_text()
+    text = (resources.files("apu_casadi.gaspath.data") / f"{name}.csv").read_text()
     for words in ("om-pycycle 4.4.0", f"pycycle/maps/{name}.py", "Apache-2.0", "# changed:"):
         assert words in text
 

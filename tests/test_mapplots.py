@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
-from apu_casadi.apu import Apu
-from apu_casadi.eigenplot import plot_eigenvalues
-from apu_casadi.errors import DataError, MapError, SignalError
-from apu_casadi.linearisation import linearise_gas_generator, linearise_joint
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.mapplots import (
+from apu_casadi.core.errors import DataError, MapError, SignalError
+from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.linearisation import linearise_gas_generator, linearise_joint
+from apu_casadi.unit.multirate import simulate_joint
+from scenarios.cli import main
+from scenarios.figures.eigenplot import plot_eigenvalues
+from scenarios.figures.mapplots import (
     P_STD,
     T_STD,
     default_lines,
@@ -18,8 +20,6 @@ from apu_casadi.mapplots import (
     published_surge_line,
     surge_line,
 )
-from apu_casadi.multirate import simulate_joint
-from scenarios.cli import main
 
 
 @pytest.fixture(scope="module")

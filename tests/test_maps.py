@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
-from apu_casadi.errors import MapError, ParameterError
-from apu_casadi.mapfiles import SHIPPED, MapTable, shipped
-from apu_casadi.maps import (
+from apu_casadi.core.errors import MapError, ParameterError
+from apu_casadi.gaspath.maps.mapfiles import SHIPPED, MapTable, shipped
+from apu_casadi.gaspath.maps.scaledmaps import (
     MapCalibration,
     MapPoint,
     ScaledMap,

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import simulation
-from apu_casadi.apu import Apu
-from apu_casadi.errors import ApuWarning, SignalError
-from apu_casadi.events import FaultChange, HealthChange, LoadChange
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.means import PARTS, RMS, Term, as_dict, settled, wanted, window
-from apu_casadi.meanstep import MeanStep
-from apu_casadi.multirate import simulate_joint
-from apu_casadi.propagation import Propagator
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import ApuWarning, SignalError
+from apu_casadi.core.means import PARTS, RMS, Term, as_dict, settled, wanted, window
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.machine.propagation import Propagator
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.multirate import simulate_joint
 
 APU, GEN = Apu(), Generator()
 W = GEN.machine.w_rated

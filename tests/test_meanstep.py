@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import meanstep, simulation
-from apu_casadi.errors import SimulationError
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import ConstantPowerLoad, SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.machinestep import MEANS
-from apu_casadi.means import PARTS, RMS, Term, as_dict, settled, wanted, window
-from apu_casadi.meanstep import MeanStep
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.means import PARTS, RMS, Term, as_dict, settled, wanted, window
+from apu_casadi.machine import meanstep
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import ConstantPowerLoad, SeriesLoad
+from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.unit.machinestep import MEANS
 
 GEN = Generator()
 W = GEN.machine.w_rated

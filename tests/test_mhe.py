@@ -1,7 +1,8 @@
 """Moving-horizon estimation: Rao, Rawlings and Mayne (2003), IEEE TAC 48, 246.
 
-The oracle on linear models is the extended Kalman filter of :mod:`estimators.ekf`, itself tested
-against a Kalman filter written out by hand; with bounds, a quadratic program solved densely.
+The oracle on linear models is the extended Kalman filter of :mod:`estimators.filters.ekf`, itself
+tested against a Kalman filter written out by hand; with bounds, a quadratic program solved
+densely.
 """
 
 import casadi as ca
@@ -11,16 +12,16 @@ from estimation_models import model_of, named
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from apu_casadi.errors import DataError, EstimationError, ParameterError, SignalError
-from apu_casadi.signals import Signal, Signals
-from apu_casadi.statespace import StateSpace
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from estimators.fit import fit
-from estimators.lifting import lift
-from estimators.mhe import HorizonEstimator, moving_horizon
-from estimators.model import FilterModel, Unknown, augment
-from estimators.recording import Recording, record
+from apu_casadi.core.errors import DataError, EstimationError, ParameterError, SignalError
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.statespace import StateSpace
+from estimators.batch.fit import fit
+from estimators.batch.mhe import HorizonEstimator, moving_horizon
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.models.filtermodel import FilterModel, Unknown, augment
+from estimators.models.lifting import lift
+from estimators.models.recording import Recording, record
 
 A = np.array([[0.9, 0.1, 0.0], [-0.2, 0.8, 0.3], [0.0, 0.0, 1.0]])
 B = np.array([[0.4], [-0.3], [0.0]])

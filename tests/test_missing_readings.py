@@ -9,15 +9,15 @@ import pytest
 from estimation_models import random_belief, random_linear
 from numpy.testing import assert_allclose
 
+from estimators.batch.mhe import moving_horizon
+from estimators.batch.relinearised import relinearised_filter
+from estimators.batch.smoother import rts_smoother
 from estimators.detection.cusum import cusum_test
 from estimators.detection.nis import windowed_nis
-from estimators.ekf import extended_kalman_filter
-from estimators.imm import interacting_multiple_models
-from estimators.mhe import moving_horizon
-from estimators.recording import Recording
-from estimators.relinearised import relinearised_filter
-from estimators.smoother import rts_smoother
-from estimators.ukf import unscented_kalman_filter
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.filters.imm import interacting_multiple_models
+from estimators.filters.ukf import unscented_kalman_filter
+from estimators.models.recording import Recording
 
 MODEL, _ = random_linear(3)
 PRIOR = random_belief(3, MODEL)

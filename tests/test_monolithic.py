@@ -9,14 +9,14 @@ import math
 import numpy as np
 import pytest
 
-from apu_casadi.apu import Apu
-from apu_casadi.errors import ScenarioError
-from apu_casadi.events import FaultChange, HealthChange, LoadChange
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.monolithic import joint_state_space, simulate_monolithic
-from apu_casadi.multirate import EXCHANGES, Noise, ramped, simulate_joint
-from apu_casadi.simulation import stepper
+from apu_casadi.core.errors import ScenarioError
+from apu_casadi.core.simulation import stepper
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.monolithic import joint_state_space, simulate_monolithic
+from apu_casadi.unit.multirate import EXCHANGES, Noise, ramped, simulate_joint
 
 APU = Apu()
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from apu_casadi import results
-from apu_casadi.errors import ScenarioError
-from scenarios import multirate_study as study
+from apu_casadi.core import results
+from apu_casadi.core.errors import ScenarioError
 from scenarios.cli import main
+from scenarios.studies import multirate_study as study
 
 
 def rows():

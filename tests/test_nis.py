@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from apu_casadi.errors import ParameterError, SignalError
+from apu_casadi.core.errors import ParameterError, SignalError
 from estimators.detection.alarms import HOUR
 from estimators.detection.nis import nis_test, nis_threshold, upcrossing_rate, windowed_nis
 

@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from apu_casadi.apu import Apu
-from scenarios import nomenclature
+from apu_casadi.unit.apu import Apu
+from scenarios.pages import nomenclature
 
 PAGE = Path(__file__).parents[1] / "docs" / "NOMENCLATURE.md"
 
 
 def test_the_page_is_what_the_code_generates():
     """One owner of every name, unit and source: the declaration in the code."""
-    again = "write it again: python -m scenarios.nomenclature > docs/NOMENCLATURE.md"
+    again = "write it again: python -m scenarios.pages.nomenclature > docs/NOMENCLATURE.md"
     old, new = PAGE.read_text(encoding="utf-8").splitlines(), nomenclature.page().splitlines()
     differ = [(a, b) for a, b in zip(old, new, strict=False) if a != b]
     assert not differ, f"stale from {differ[0][0]!r}, now {differ[0][1]!r}; {again}"

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apu_casadi import plotting
-from apu_casadi.errors import ScenarioError
-from apu_casadi.results import RPM
-from scenarios import errata, paper_figures, validation, validation_page
-from scenarios.validation import Row
+from apu_casadi.core.errors import ScenarioError
+from apu_casadi.core.results import RPM
+from scenarios.figures import plotting
+from scenarios.pages import errata_page, validation_page
+from scenarios.validation import comparison, paper_figures
+from scenarios.validation.comparison import Row
 
 ROOT = Path(__file__).parents[1]
 
@@ -48,7 +49,7 @@ def test_the_sign_of_the_turbine_flow_shows(runs):
 @pytest.mark.parametrize("name", ["table6", "table9"])
 def test_every_row_is_within_its_tolerance(name):
     """``apu validate`` prints the rows; two routes of our own are checks, never the paper's."""
-    rows = validation.run(name)
+    rows = comparison.run(name)
     short = [f"{r.quantity}: {r.error:+.2e} > {r.tolerance:.0e}" for r in rows if not r.passed]
     assert not short, short
     for r in rows:
@@ -88,7 +89,7 @@ def section_of_page(name):
 @pytest.mark.parametrize("name", ["table4", "table5", "table7", "table8"])
 def test_validation_md_is_what_the_code_yields_now(name):
     """The committed page ages otherwise; errors are compared to a tenth of the tolerance."""
-    rows = [r for r in validation.run(name) if np.isfinite(r.tolerance)]
+    rows = [r for r in comparison.run(name) if np.isfinite(r.tolerance)]
     lines = section_of_page(name)
     assert len(lines) == len(rows), f"{name}: write VALIDATION.md again"
     for line, r in zip(lines, rows, strict=True):
@@ -124,7 +125,7 @@ def numbers(text):
 def test_errata_md_is_what_the_code_yields_now(name):
     """Every number of the page is computed: within 1 % of what stands there, words equal."""
     page = (ROOT / "docs" / "ERRATA.md").read_text(encoding="utf-8")
-    effect = getattr(errata, name)()
+    effect = getattr(errata_page, name)()
     words = effect.split(":")[0][:25]
     line = next((x for x in page.splitlines() if words in x and len(x.split(" | ")) == 4), None)
     assert line, f"not on the page: {words!r}; run apu errata --write docs/ERRATA.md"
@@ -135,13 +136,13 @@ def test_errata_md_is_what_the_code_yields_now(name):
 def test_errata_md_has_every_item():
     """An item added to the list without writing the page again."""
     page = (ROOT / "docs" / "ERRATA.md").read_text(encoding="utf-8")
-    missing = [i.what for items in errata.ITEMS.values() for i in items if i.what not in page]
+    missing = [i.what for items in errata_page.ITEMS.values() for i in items if i.what not in page]
     assert not missing, f"run apu errata --write docs/ERRATA.md: {missing}"
 
 
 @pytest.mark.slow
 def test_errata_md_word_for_word():
     """The whole page, the slow effects included; on the processor that wrote it."""
-    effects = errata.page()
+    effects = errata_page.page()
     page = (ROOT / "docs" / "ERRATA.md").read_text(encoding="utf-8")
     assert numbers(effects) == pytest.approx(numbers(page), rel=1e-2, abs=2e-6)

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import pytest
 
-from apu_casadi.apu import Apu, CouplingParameters
-from apu_casadi.control import GovernorParameters
-from apu_casadi.errors import ParameterError
-from apu_casadi.gasgenerator import GasGeneratorParameters
-from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
-from apu_casadi.maps import MapCalibration
-from apu_casadi.parameters import Parameters, par
+from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.parameters import Parameters, par
+from apu_casadi.gaspath.gasgenerator import GasGeneratorParameters
+from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
+from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
+from apu_casadi.unit.apu import Apu, CouplingParameters
+from apu_casadi.unit.control import GovernorParameters
 
 
 @dataclass(frozen=True)

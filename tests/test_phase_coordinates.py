@@ -9,11 +9,11 @@ import pytest
 from numpy.testing import assert_allclose
 from phase_coordinates import coupled_windings, krause_inductance, split_phase
 
-from apu_casadi import simulation
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.machine.parameters import ExciterParameters, MachineParameters
-from apu_casadi.machine.ttsc import Ttsc
+from apu_casadi.core import simulation
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 
 FROZEN = ExciterParameters(T_E=1e9)
 GENERATORS = {n: Generator(exciter=FROZEN, neutral=n) for n in ("grounded", "isolated")}

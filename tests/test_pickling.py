@@ -23,22 +23,21 @@ from apu_casadi import (
     Generator,
     SeriesLoad,
     Ttsc,
-    backend,
-    sharing,
     simulate_joint,
     trim,
     trim_batch,
 )
-from apu_casadi.errors import BackendError
-from apu_casadi.gasgenerator import MapChoice
-from apu_casadi.mapfiles import MapTable, shipped
-from apu_casadi.meanstep import MeanStep
-from apu_casadi.propagation import Propagator
-from apu_casadi.simulation import stepper
-from estimators.ekf import ekf_step, extended_kalman_filter
-from estimators.fit import FitProblem
-from estimators.mhe import HorizonEstimator
-from estimators.ukf import ukf_step
+from apu_casadi.core import backend, sharing
+from apu_casadi.core.errors import BackendError
+from apu_casadi.core.simulation import stepper
+from apu_casadi.gaspath.gasgenerator import MapChoice
+from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.machine.propagation import Propagator
+from estimators.batch.fit import FitProblem
+from estimators.batch.mhe import HorizonEstimator
+from estimators.filters.ekf import ekf_step, extended_kalman_filter
+from estimators.filters.ukf import ukf_step
 
 SMALL = 100_000  # bytes; what a message between processes does not notice
 SOURCE = SeriesLoad.from_power(1e5)
@@ -70,7 +69,7 @@ def point(gg, k=0):
 @pytest.fixture(scope="module")
 def used():
     """A unit that has been run, trimmed and linearised from."""
-    from apu_casadi.linearisation import linearise_joint
+    from apu_casadi.unit.linearisation import linearise_joint
 
     apu = Apu()
     run(apu)
@@ -143,9 +142,9 @@ def test_own_maps_go_along():
 @pytest.fixture(scope="module")
 def models(used):
     """Public objects that hold functions or buffers, by name."""
-    from scenarios.estimation.electrical.filter import electrical_filter
-    from scenarios.estimation.fitting import engine_model
-    from scenarios.estimation.gaspath import gas_path_filter
+    from estimators.apu.electrical.electricalfilter import electrical_filter
+    from estimators.apu.fitting import engine_model
+    from estimators.apu.gaspath import gas_path_filter
 
     gen, gg = used.generator, used.gas_generator
     at = gen.steady_state(SOURCE)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from synthetic_joint import synthetic_joint
 
-from apu_casadi import plotting
-from apu_casadi.errors import DataError
+from apu_casadi.core.errors import DataError
+from scenarios.figures import plotting
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import propagation, simulation
-from apu_casadi.errors import SimulationError
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
-from apu_casadi.machine.ttsc import Ttsc
-from apu_casadi.propagation import Propagator, gregory, strides
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import SimulationError
+from apu_casadi.machine import propagation
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.propagation import Propagator, gregory, strides
 
 GEN = Generator()
 ISOLATED = Generator(neutral="isolated")

@@ -160,8 +160,8 @@ def test_type_information_is_shipped(package):
 @pytest.mark.parametrize(
     ("package", "path"),
     [
-        ("apu_casadi", "data/axi5.csv"),
-        ("apu_casadi", "data/nasa9.csv"),
+        ("apu_casadi", "gaspath/data/axi5.csv"),
+        ("apu_casadi", "gaspath/data/nasa9.csv"),
         ("scenarios", "library/joint.toml"),
         ("scenarios", "reference/table4.csv"),
     ],

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from apu_casadi.mapfiles import shipped, write_map_csv
-from scenarios import cli, registry, validation
+from apu_casadi.gaspath.maps.mapfiles import shipped, write_map_csv
+from scenarios import cli, registry
+from scenarios.validation import comparison
 
 HERE = Path(__file__).parents[1]
 README = (HERE / "README.md").read_text(encoding="utf-8")
@@ -33,7 +34,7 @@ def test_the_first_example_is_short():
 
 def test_the_scenario_example_is_accepted(tmp_path):
     """Every key of the TOML example is one, and its parameters exist."""
-    from apu_casadi.apu import Apu
+    from apu_casadi.unit.apu import Apu
 
     path = tmp_path / "my_run.toml"
     path.write_text(blocks("toml")[0], encoding="utf-8")
@@ -53,7 +54,7 @@ def test_there_is_one_command_of_each_kind(label):
 @pytest.mark.parametrize("table", ["4", "5", "8"])
 def test_the_accuracy_table_is_what_validate_computes(table):
     """Mean and largest error of the predicted rows, to the two digits printed."""
-    errors = [abs(r.error) for r in validation.run(f"table{table}") if r.kind == "predicted"]
+    errors = [abs(r.error) for r in comparison.run(f"table{table}") if r.kind == "predicted"]
     row = next(x for x in README.splitlines() if x.startswith(f"| {table}, "))
     mean, largest = sum(errors) / len(errors), max(errors)
     assert f"| {len(errors)} predicted | {mean:.1e} | {largest:.1e} |" in row

@@ -7,9 +7,9 @@ import pytest
 import xarray as xr
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import DataError
-from apu_casadi.results import dataset, save
-from scenarios.estimation.recorded import UNITS, convert, parse_mapping, read_table
+from apu_casadi.core.errors import DataError
+from apu_casadi.core.results import dataset, save
+from estimators.apu.recordings.recorded import UNITS, convert, parse_mapping, read_table
 
 
 def written(tmp_path, text, name="run.csv"):
@@ -180,7 +180,7 @@ def test_damaged_netcdf(tmp_path):
 
 def test_parquet_names_what_to_install(tmp_path, monkeypatch):
     """Without an engine nothing is guessed."""
-    import scenarios.estimation.binaryfiles as module
+    import estimators.apu.recordings.binaryfiles as module
 
     path = tmp_path / "run.parquet"
     path.write_bytes(b"PAR1")

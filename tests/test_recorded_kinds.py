@@ -6,9 +6,9 @@ import pytest
 import xarray as xr
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import DataError
+from apu_casadi.core.errors import DataError
+from estimators.apu.recordings.recorded import Reading, parse_mapping, read_table
 from scenarios.cli import main
-from scenarios.estimation.recorded import Reading, parse_mapping, read_table
 
 K = 12
 k = np.arange(K)

@@ -7,9 +7,9 @@ import pytest
 from estimation_models import cv_model, oscillator, pendulum
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import DataError, SignalError
-from estimators.model import discretise
-from estimators.recording import Recording, record
+from apu_casadi.core.errors import DataError, SignalError
+from estimators.models.filtermodel import discretise
+from estimators.models.recording import Recording, record
 
 MODEL = cv_model()
 SIGMA = {"place": 0.1, "speed": 0.2}

@@ -16,11 +16,11 @@ from estimation_models import (
 )
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import ParameterError
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from estimators.relinearised import linearised, relinearised_filter
-from estimators.smoother import rts_smoother
+from apu_casadi.core.errors import ParameterError
+from estimators.batch.relinearised import linearised, relinearised_filter
+from estimators.batch.smoother import rts_smoother
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
 
 
 def swinging(K):

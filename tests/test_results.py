@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from synthetic_joint import synthetic_joint
 
-from apu_casadi import results
-from apu_casadi.errors import DataError, SignalError
-from apu_casadi.signals import Signal
+from apu_casadi.core import results
+from apu_casadi.core.errors import DataError, SignalError
+from apu_casadi.core.signals import Signal
 
 
 @pytest.fixture(scope="module")

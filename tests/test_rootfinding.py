@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi.rootfinding import Newton, solve_bordered
+from apu_casadi.core.rootfinding import Newton, solve_bordered
 
 
 def newton(residual, n=1, n_p=0, **options):

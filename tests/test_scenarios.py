@@ -6,9 +6,9 @@ import types
 
 import pytest
 
-from apu_casadi.errors import ApuError, ScenarioError
-from apu_casadi.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.core.errors import ApuError, ScenarioError
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
 from scenarios import registry
 from scenarios.schema import Change, FaultSpec, LoadSpec, Phase, Scenario
 
@@ -254,7 +254,7 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     """The unit and the simulation are stand-ins that record what they are given."""
     import numpy as np
 
-    from apu_casadi import results
+    from apu_casadi.core import results
 
     seen = {}
 
@@ -268,14 +268,14 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
         given["progress"](0.1, 0.1)
         return results.dataset({"time": np.array([0.0, 0.02])}, {"time": {"N": 3775.0}})
 
-    apu = types.ModuleType("apu_casadi.apu")
+    apu = types.ModuleType("apu_casadi.unit.apu")
     apu.Apu = Unit
-    multirate = types.ModuleType("apu_casadi.multirate")
+    multirate = types.ModuleType("apu_casadi.unit.multirate")
     multirate.simulate_joint = simulate_joint
-    monkeypatch.setitem(sys.modules, "apu_casadi.apu", apu)
-    monkeypatch.setitem(sys.modules, "apu_casadi.multirate", multirate)
+    monkeypatch.setitem(sys.modules, "apu_casadi.unit.apu", apu)
+    monkeypatch.setitem(sys.modules, "apu_casadi.unit.multirate", multirate)
     # units are kept between runs: this stand-in must not stay
-    monkeypatch.setattr(registry, "_unit", registry._unit.__wrapped__)
+    monkeypatch.setattr(registry, "unit_of", registry.unit_of.__wrapped__)
     ds = registry.run(
         "joint",
         waveform_dt=None,

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from apu_casadi.errors import SignalError
-from apu_casadi.signals import Signal, Signals
+from apu_casadi.core.errors import SignalError
+from apu_casadi.core.signals import Signal, Signals
 
 WF = Signal("Wf", "kg/s", "fuel flow", nominal=0.05)
 PW = Signal("PW", "W", "shaft power", nominal=5e5)
@@ -132,7 +132,7 @@ def test_sets_join_and_compare():
 
 
 def test_an_unknown_name_is_told_the_nearest():
-    """The hint of :func:`apu_casadi.errors.nearest`."""
+    """The hint of :func:`apu_casadi.core.errors.nearest`."""
     with pytest.raises(SignalError, match=r"unknown signal 'mach' \(did you mean 'Mach'\?\)"):
         U.index("mach")
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import simulation
-from apu_casadi.errors import SignalError, SimulationError
-from apu_casadi.signals import Signal, Signals
-from apu_casadi.simulation import Switch, simulate, stepper
-from apu_casadi.statespace import StateSpace
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import SignalError, SimulationError
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.simulation import Switch, simulate, stepper
+from apu_casadi.core.statespace import StateSpace
 
 
 def model(ode, *, name="model", mx=False):

@@ -21,12 +21,12 @@ from estimation_models import (
 )
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import EstimationError
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from estimators.model import Unknown, augment, gains
-from estimators.smoother import rts_smoother
-from estimators.ukf import unscented_kalman_filter
+from apu_casadi.core.errors import EstimationError
+from estimators.batch.smoother import rts_smoother
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.filters.ukf import unscented_kalman_filter
+from estimators.models.filtermodel import Unknown, augment, gains
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 FILTERS = {

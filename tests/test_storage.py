@@ -13,22 +13,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from apu_casadi import (
-    Apu,
-    FaultChange,
-    HealthChange,
-    SeriesLoad,
-    Ttsc,
-    multirate,
-    netcdf3,
-    results,
-    runstorage,
-    simulate_joint,
-)
-from apu_casadi.errors import DataError
-from apu_casadi.filearrays import File, RowFile, lazy
-from apu_casadi.generator import MeasurementNoise
-from apu_casadi.multirate import Noise
+from apu_casadi import Apu, FaultChange, HealthChange, SeriesLoad, Ttsc, simulate_joint
+from apu_casadi.core import netcdf3, results, runstorage
+from apu_casadi.core.errors import DataError
+from apu_casadi.core.filearrays import File, RowFile, lazy
+from apu_casadi.machine.generator import MeasurementNoise
+from apu_casadi.unit import multirate
+from apu_casadi.unit.multirate import Noise
 
 LONG = 200_000
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import simulation
-from apu_casadi.errors import ParameterError
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import ConstantPowerLoad, OpenLoad, SeriesLoad, fineness
-from apu_casadi.machine.ttsc import Ttsc
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import ParameterError
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad, fineness
 from scenarios import registry
 from scenarios.schema import Scenario
 

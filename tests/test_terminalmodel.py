@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import terminalmodel as tm
-from apu_casadi.errors import ParameterError
-from apu_casadi.generator import Generator
-from apu_casadi.machine.load import SeriesLoad
+from apu_casadi.core.errors import ParameterError
+from apu_casadi.machine import terminals as tm
+from apu_casadi.machine.faults.ttsc import Ttsc, fault_loss
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import SeriesLoad
 from apu_casadi.machine.park import Abc
-from apu_casadi.machine.ttsc import Ttsc, fault_loss
 
 GEN = Generator()
 P = GEN.machine

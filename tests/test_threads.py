@@ -24,15 +24,14 @@ from apu_casadi import (
     HealthChange,
     SeriesLoad,
     Ttsc,
-    backend,
-    sharing,
     simulate_joint,
     trim,
     trim_batch,
 )
-from apu_casadi.errors import BackendError
-from apu_casadi.results import load, save
-from apu_casadi.simulation import stepper
+from apu_casadi.core import backend, sharing
+from apu_casadi.core.errors import BackendError
+from apu_casadi.core.results import load, save
+from apu_casadi.core.simulation import stepper
 
 THREADS = 4
 
@@ -135,8 +134,8 @@ def test_filters_of_one_model_in_four_threads_give_the_serial_bits():
     """A filter's step is built once and run by each thread on data of its own."""
     from estimation_models import pendulum, pendulum_data, random_belief
 
-    from estimators.ekf import extended_kalman_filter
-    from estimators.ukf import unscented_kalman_filter
+    from estimators.filters.ekf import extended_kalman_filter
+    from estimators.filters.ukf import unscented_kalman_filter
 
     model = pendulum()
     prior, data = random_belief(2, model), pendulum_data(model)
@@ -299,7 +298,7 @@ def test_figures_of_four_threads_are_those_of_one(tmp_path):
     """Matplotlib's settings belong to the process: threads take turns, and nothing stays."""
     import matplotlib as mpl
 
-    from apu_casadi.figstyle import drawing, new_figure
+    from scenarios.figures.figstyle import drawing, new_figure
 
     def work(k):
         with drawing():
@@ -318,8 +317,8 @@ def test_figures_of_four_threads_are_those_of_one(tmp_path):
 
 #: Modules whose cached values are small, safe to make twice, and belong to no model.
 PLAIN_CACHES = {
-    "apu_casadi/backend.py", "apu_casadi/cachefolder.py", "apu_casadi/signals.py",
-    "estimators/fit.py",
+    "apu_casadi/core/backend.py", "apu_casadi/core/cachefolder.py", "apu_casadi/core/signals.py",
+    "estimators/batch/fit.py",
 }  # fmt: skip
 
 
@@ -333,4 +332,4 @@ def test_what_is_kept_is_kept_by_the_one_mechanism():
         for line in path.read_text(encoding="utf-8").splitlines()
         if re.match(r"\s*@(functools\.)?(lru_cache|cache|cached_property)\b", line)
     }
-    assert found == PLAIN_CACHES, "use derived, kept, last or once of apu_casadi.sharing"
+    assert found == PLAIN_CACHES, "use derived, kept, last or once of apu_casadi.core.sharing"

@@ -5,7 +5,7 @@ import json
 import pytest
 import xarray as xr
 
-from apu_casadi import backend
+from apu_casadi.core import backend
 from scenarios.cli import main
 
 

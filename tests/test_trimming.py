@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi import backend
-from apu_casadi.errors import OperatingPointError, SignalError
-from apu_casadi.gasgenerator import RPM, GasGenerator
-from apu_casadi.steadypoint import (
+from apu_casadi.core import backend
+from apu_casadi.core.errors import OperatingPointError, SignalError
+from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator
+from apu_casadi.gaspath.steady.steadypoint import (
     MEANING,
     Limits,
     LoadLaw,
@@ -20,11 +20,11 @@ from apu_casadi.steadypoint import (
     limit_status,
     specify,
 )
-from apu_casadi.trimbatch import performance_deck, trim_batch
-from apu_casadi.trimkernel import LAW, TrimKernel
-from apu_casadi.trimming import maximum_power, trim_gas_generator
-from apu_casadi.trimsolver import norms, solver_of
-from scenarios import trim_study
+from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
+from apu_casadi.gaspath.steady.trimkernel import LAW, TrimKernel
+from apu_casadi.gaspath.steady.trimming import maximum_power, trim_gas_generator
+from apu_casadi.gaspath.steady.trimsolver import norms, solver_of
+from scenarios.studies import trim_study
 
 N_DESIGN = 36050 * RPM
 CRUISE = {"altitude": 8000.0, "Mach": 0.7, "dT_isa": 5.0}
@@ -240,7 +240,7 @@ def test_batch_equals_single(gg, envelope):
 def test_batch_in_chunks_equals_batch_at_once(gg, monkeypatch, envelope):
     """Chunks bound the memory and change nothing."""
     asked, batch = envelope
-    monkeypatch.setattr("apu_casadi.trimbatch.CHUNK", 77)
+    monkeypatch.setattr("apu_casadi.gaspath.steady.trimbatch.CHUNK", 77)
     again = trim_batch(gg, outputs=("T4", "SM"), **asked)
     assert again.names == ("T4", "SM")
     np.testing.assert_array_equal(again.status, batch.status)
@@ -347,7 +347,7 @@ def test_the_map_tables_are_part_of_the_recipe(gg):
     """Another engine must not be given this one's library: the digest tells maps apart."""
     import dataclasses
 
-    from apu_casadi.trimsolver import map_digest
+    from apu_casadi.gaspath.steady.trimsolver import map_digest
 
     table = gg.compressor_map.table
     other = dataclasses.replace(table, eta=table.eta * 0.99)

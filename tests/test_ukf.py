@@ -22,13 +22,13 @@ from estimation_models import (
 )
 from numpy.testing import assert_allclose
 
-from apu_casadi.errors import EstimationError, ParameterError
-from apu_casadi.signals import Signals
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from estimators.filtering import STEP_IN, STEP_OUT
-from estimators.model import FilterModel, Unknown
-from estimators.ukf import PointSet, ukf_step, unscented_kalman_filter
+from apu_casadi.core.errors import EstimationError, ParameterError
+from apu_casadi.core.signals import Signals
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.filters.filtering import STEP_IN, STEP_OUT
+from estimators.filters.ukf import PointSet, ukf_step, unscented_kalman_filter
+from estimators.models.filtermodel import FilterModel, Unknown
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 SETS = {

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from apu_casadi.errors import ScenarioError
-from scenarios import validation
-from scenarios.validation import Row
+from apu_casadi.core.errors import ScenarioError
+from scenarios.validation import comparison
+from scenarios.validation.comparison import Row
 
 
 @pytest.mark.parametrize(
@@ -14,7 +14,7 @@ from scenarios.validation import Row
 )
 def test_every_row_is_within_its_tolerance(name):
     """The goals of the tables and checks; ``apu validate`` prints the rows."""
-    rows = validation.run(name)
+    rows = comparison.run(name)
     short = [f"{r.quantity}: {r.error:+.2e} > {r.tolerance:.0e}" for r in rows if not r.passed]
     assert not short, short
     assert rows
@@ -22,7 +22,7 @@ def test_every_row_is_within_its_tolerance(name):
 
 def test_rows_that_were_fitted_are_not_called_predicted():
     """Table 5: what the six map numbers were fitted to is marked calibrated."""
-    kinds = {r.quantity: r.kind for r in validation.run("table5")}
+    kinds = {r.quantity: r.kind for r in comparison.run("table5")}
     for fitted in ("W2", "W3", "T3", "P3", "T5", "T8", "HPCSM"):
         assert kinds[fitted] == "calibrated"
     assert kinds["Wf" if "Wf" in kinds else "SFC"] == "predicted"
@@ -39,7 +39,7 @@ def test_a_row_with_a_bad_number_does_not_pass():
 def test_unknown_sections_are_refused_with_the_nearest():
     """A typo is answered with the section meant."""
     with pytest.raises(ScenarioError, match="table5"):
-        validation.run("tabel5")
+        comparison.run("tabel5")
 
 
 def test_json_takes_rows_of_numpy_numbers_that_fall_short(monkeypatch, capsys):
@@ -50,8 +50,8 @@ def test_json_takes_rows_of_numpy_numbers_that_fall_short(monkeypatch, capsys):
 
     from scenarios import cli
 
-    row = validation.Row("T4", "K", 1.0, np.float64(1.1), np.float64(0.1), 1e-3, "why", "check")
+    row = comparison.Row("T4", "K", 1.0, np.float64(1.1), np.float64(0.1), 1e-3, "why", "check")
     assert type(row.passed) is bool and not row.passed
-    monkeypatch.setattr(validation, "sections", lambda: {"x": ("title", lambda: [row])})
+    monkeypatch.setattr(comparison, "sections", lambda: {"x": ("title", lambda: [row])})
     assert cli.main(["validate", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["sections"]["x"][0]["passed"] is False

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from apu_casadi import Ambient, Apu, ConstantPowerLoad, HealthChange, LoadChange, SeriesLoad, trim
-from apu_casadi import validity as v
-from apu_casadi.errors import ExchangeWarning, ScenarioError, SimulationError, ValidityWarning
-from apu_casadi.gasgenerator import GasGenerator
-from apu_casadi.monolithic import simulate_monolithic
-from apu_casadi.multirate import Noise, simulate_joint
-from apu_casadi.steadypoint import Limits
-from scenarios import cli, multirate_study, registry
+from apu_casadi.core.errors import ExchangeWarning, ScenarioError, SimulationError, ValidityWarning
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.steadypoint import Limits
+from apu_casadi.unit import validity as v
+from apu_casadi.unit.monolithic import simulate_monolithic
+from apu_casadi.unit.multirate import Noise, simulate_joint
+from scenarios import cli, registry
 from scenarios.campaigns import run_campaign
 from scenarios.schema import Scenario
+from scenarios.studies import multirate_study
 
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)
 # a worn compressor on a very hot day: it gets hot at once, and beyond surge as the speed falls
@@ -371,7 +372,7 @@ def test_a_campaign_keeps_the_warnings_of_each_run():
 
 def test_attributes_tell_what_was_asked(apu):
     """Day, loads, faults with their phase, seed, version; and the captions say them."""
-    from apu_casadi.runwords import fault_phase, made_with
+    from scenarios.figures.runwords import fault_phase, made_with
 
     mild = SURGE.replace("f_eta_c = 0.84", "f_eta_c = 0.98")
     s = Scenario.from_toml_text(mild).change(ambient=Ambient(), waveform_dt=None)
@@ -388,7 +389,7 @@ def test_attributes_tell_what_was_asked(apu):
 
 def test_the_truth_of_an_estimation_is_judged_too():
     """It runs with other steps and its own call; the estimate takes over its attributes."""
-    from scenarios.estimation import jointrun
+    from scenarios.studies import jointrun
 
     table = {
         "name": "hot", "duration": 0.06,

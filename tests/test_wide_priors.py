@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from estimation_models import linear
 
-from apu_casadi.errors import EstimationError, SignalError
-from estimators.algebra import graded_lower
-from estimators.belief import Belief
-from estimators.ekf import extended_kalman_filter
-from estimators.imm import interacting_multiple_models
-from estimators.mhe import moving_horizon
-from estimators.recording import Recording
-from estimators.relinearised import relinearised_filter
-from estimators.smoother import rts_smoother
-from estimators.ukf import ukf_step, unscented_kalman_filter
+from apu_casadi.core.errors import EstimationError, SignalError
+from estimators.batch.mhe import moving_horizon
+from estimators.batch.relinearised import relinearised_filter
+from estimators.batch.smoother import rts_smoother
+from estimators.filters.algebra import graded_lower
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.filters.imm import interacting_multiple_models
+from estimators.filters.ukf import ukf_step, unscented_kalman_filter
+from estimators.models.recording import Recording
 
 RATIOS = (1e-6, 1e4, 1e8, 1e12)
 NOISE = 1e-6

@@ -11,13 +11,13 @@ import time
 
 import pytest
 
-from apu_casadi.errors import DataError
-from scenarios import locking, workers
-from scenarios.locking import locked
+from apu_casadi.core.errors import DataError
+from scenarios.shell import locking, workers
+from scenarios.shell.locking import locked
 
 PARENT = """
 import os, sys, time
-from scenarios.workers import pool
+from scenarios.shell.workers import pool
 with pool(2) as p:
     pids = {p.submit(os.getpid).result() for _ in range(2)}
     jobs = [p.submit(time.sleep, 300) for _ in range(2)]
@@ -33,7 +33,7 @@ with pool(2) as p:
 HOLDER = """
 import sys, time
 from pathlib import Path
-from scenarios.locking import locked
+from scenarios.shell.locking import locked
 with locked(Path(sys.argv[1]), "the.lock"):
     print("held", flush=True)
     time.sleep(300)

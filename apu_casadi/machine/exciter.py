@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from apu_casadi.machine.parameters import ExciterParameters
-from apu_casadi.signals import Signal, Signals
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.machine.machinedata import ExciterParameters
 
 
 class ExciterState(NamedTuple):

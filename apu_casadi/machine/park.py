@@ -57,10 +57,9 @@ def _axes(theta_e: Any) -> list[tuple[Any, Any]]:
 def abc_to_qd0(theta_e: Any, x: Abc) -> Qd0:
     """Return T x.
 
-    Parameters
-    ----------
-    theta_e : electrical angle from the phase-a axis to the q axis, rad.
-    x : phase quantities, any unit.
+    Args:
+        theta_e: electrical angle from the phase-a axis to the q axis, rad.
+        x: phase quantities, any unit.
     """
     axes = _axes(theta_e)
     q = 2.0 / 3.0 * sum(c * v for (c, _), v in zip(axes, x, strict=True))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apu_casadi.machine.parameters import MachineParameters
+from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import Qd0, speed_voltage
 
 
@@ -80,13 +80,12 @@ def flux_rates(
 ) -> Windings:
     """Return d lambda/dt in V, from (5) and (6) solved for the rates.
 
-    Parameters
-    ----------
-    lam, i : flux linkages (Wb) and effective currents (A).
-    v : winding voltages, terminal to machine neutral, V.
-    V_fd : field voltage referred to the stator, V; the dampers are short-circuited.
-    w_r : electrical speed, rad/s.
-    w1, w2 : process noise of (5) and (6), V; w2 in the order fd, kd, kq.
+    Args:
+        lam, i: flux linkages (Wb) and effective currents (A).
+        v: winding voltages, terminal to machine neutral, V.
+        V_fd: field voltage referred to the stator, V; the dampers are short-circuited.
+        w_r: electrical speed, rad/s.
+        w1, w2: process noise of (5) and (6), V; w2 in the order fd, kd, kq.
     """
     e = speed_voltage(w_r, lam.stator)
     return Windings(

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from apu_casadi.checked import number
-from apu_casadi.errors import ParameterError
+from apu_casadi.core.checked import number
+from apu_casadi.core.errors import ParameterError
 
 __all__ = ["HOUR", "Alarms", "allowed_per_sample", "rising"]
 
@@ -20,15 +20,14 @@ HOUR = 3600.0  # s
 class Alarms:
     """What a test said along a sequence of K samples.
 
-    Parameters
-    ----------
-    test : its name.
-    statistic : shape (K,); NaN where it could not be formed.
-    threshold : an alarm is raised where the statistic passes it; a number, or one per sample.
-    index : samples at which an alarm was raised, increasing.
-    rate : samples per second.
-    false_alarms_per_hour : the stated rate, with which the threshold was found.
-    start : time of the first sample, s.
+    Args:
+        test: its name.
+        statistic: shape (K,); NaN where it could not be formed.
+        threshold: an alarm is raised where the statistic passes it; a number, or one per sample.
+        index: samples at which an alarm was raised, increasing.
+        rate: samples per second.
+        false_alarms_per_hour: the stated rate, with which the threshold was found.
+        start: time of the first sample, s.
     """
 
     test: str
@@ -78,14 +77,12 @@ def rising(above: np.ndarray) -> np.ndarray:
 def allowed_per_sample(false_alarms_per_hour: float, rate: float) -> float:
     """Return the false alarms for each sample that are allowed.
 
-    Parameters
-    ----------
-    false_alarms_per_hour : stated rate.
-    rate : samples per second.
+    Args:
+        false_alarms_per_hour: stated rate.
+        rate: samples per second.
 
-    Raises
-    ------
-    ParameterError : not finite and positive, or 0.1 for each sample and more.
+    Raises:
+        ParameterError: not finite and positive, or 0.1 for each sample and more.
     """
     for name, value in (("false_alarms_per_hour", false_alarms_per_hour), ("rate", rate)):
         if not 0 < number(name, value, error=ParameterError) < math.inf:

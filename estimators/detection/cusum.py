@@ -12,10 +12,10 @@ import math
 import numpy as np
 from scipy import linalg, optimize, special
 
-from apu_casadi.checked import number
-from apu_casadi.errors import EstimationError, ParameterError, SignalError
+from apu_casadi.core.checked import number
+from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
 from estimators.detection.alarms import Alarms, allowed_per_sample
-from estimators.recording import plain_numbers
+from estimators.models.recording import plain_numbers
 
 __all__ = [
     "cusum",
@@ -101,13 +101,12 @@ def cusum_arl(
     standard normal distribution about ``shift``; solved at Gauss-Legendre nodes.  Both sides
     together as 1/L = 1/L+ + 1/L-.
 
-    Parameters
-    ----------
-    drift, threshold : k and h, in standard deviations of the sequence.
-    shift : mean of the sequence, standard deviations; 0 gives the mean time between false alarms,
-        a change's size the mean delay of its detection.
-    two_sided : watch both signs.
-    nodes : of the quadrature; by default enough for eight digits or more.
+    Args:
+        drift, threshold: k and h, in standard deviations of the sequence.
+        shift: mean of the sequence, standard deviations; 0 gives the mean time between false
+            alarms, a change's size the mean delay of its detection.
+        two_sided: watch both signs.
+        nodes: of the quadrature; by default enough for eight digits or more.
     """
     _check_cusum(drift, threshold)
     n = nodes or int(40 + 8 * threshold)
@@ -147,22 +146,19 @@ def cusum_threshold(
 ) -> float:
     """Return the threshold of Page's cumulative sum for a stated false-alarm rate.
 
-    Parameters
-    ----------
-    drift : k, standard deviations; half of the shift that is to be found soonest.
-    false_alarms_per_hour : 3600 rate / (average run length without a shift).
-    rate : samples per second.
-    two_sided : watch both signs.
+    Args:
+        drift: k, standard deviations; half of the shift that is to be found soonest.
+        false_alarms_per_hour: 3600 rate / (average run length without a shift).
+        rate: samples per second.
+        two_sided: watch both signs.
 
-    Raises
-    ------
-    ParameterError : rates not positive, or so high that they are no test.
-    EstimationError : run length too long to be computed.
+    Raises:
+        ParameterError: rates not positive, or so high that they are no test.
+        EstimationError: run length too long to be computed.
 
-    Examples
-    --------
-    >>> round(cusum_threshold(0.5, 3600 / 335.37, 1.0, two_sided=False), 3)
-    4.0
+    Examples:
+        >>> round(cusum_threshold(0.5, 3600 / 335.37, 1.0, two_sided=False), 3)
+        4.0
     """
     target = 1 / allowed_per_sample(false_alarms_per_hour, rate)
 
@@ -194,11 +190,10 @@ def cusum_threshold(
 def cusum(z: np.ndarray, drift: float, start: float = 0.0) -> np.ndarray:
     """Return Page's sum S(k) = max(0, S(k-1) + z(k) - drift), without restarts.
 
-    Parameters
-    ----------
-    z : shape (..., K).
-    drift : k.
-    start : S before the first sample.
+    Args:
+        z: shape (..., K).
+        drift: k.
+        start: S before the first sample.
     """
     c = np.cumsum(np.asarray(z, float) - drift, axis=-1)
     return np.asarray(c - np.minimum(np.minimum.accumulate(c, axis=-1), -start))
@@ -235,21 +230,18 @@ def cusum_test(
 ) -> Alarms:
     """Watch a white, unit-variance sequence for a shift of its mean; begins anew after an alarm.
 
-    Parameters
-    ----------
-    z : shape (K,); such as from :func:`~estimators.detection.signatures.project`.  NaN (nothing
-        measured) counts as no evidence.
-    drift, false_alarms_per_hour, rate, two_sided : see :func:`cusum_threshold`.
-    start : time of the first sample, s.
-    threshold : if it is known already.
+    Args:
+        z: shape (K,); such as from :func:`~estimators.detection.signatures.project`.  NaN (nothing
+            measured) counts as no evidence.
+        drift, false_alarms_per_hour, rate, two_sided: see :func:`cusum_threshold`.
+        start: time of the first sample, s.
+        threshold: if it is known already.
 
-    Returns
-    -------
-    Alarms whose statistic is the larger of the two sums.
+    Returns:
+        Alarms whose statistic is the larger of the two sums.
 
-    Raises
-    ------
-    SignalError : not one sequence, or infinite. ParameterError : see :func:`cusum_threshold`.
+    Raises:
+        SignalError: not one sequence, or infinite. ParameterError : see :func:`cusum_threshold`.
     """
     z = plain_numbers(z, "z", gaps=True)
     if z.ndim != 1 or np.isinf(z).any():

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, signal
 
-from apu_casadi.errors import ParameterError, SignalError
+from apu_casadi.core.errors import ParameterError, SignalError
 from estimators.detection.alarms import Alarms, allowed_per_sample, rising
 from estimators.detection.signatures import LinearFilter, columns_of
 
@@ -28,11 +28,10 @@ class Glr:
 
     The log-likelihood gained by jumps of sizes s is b's - s'Cs/2.
 
-    Parameters
-    ----------
-    names : of the q jumps.
-    onsets : samples, (m,).
-    b : (m, q). C : information, (m, q, q).
+    Args:
+        names: of the q jumps.
+        onsets: samples, (m,).
+        b: (m, q). C : information, (m, q, q).
     """
 
     names: tuple[str, ...]
@@ -43,9 +42,8 @@ class Glr:
     def part(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """Return b and C of some jumps.
 
-        Raises
-        ------
-        SignalError : unknown name.
+        Raises:
+            SignalError: unknown name.
         """
         i = columns_of(names, self.names)
         return self.b[:, i], self.C[:, i][:, :, i]
@@ -64,9 +62,8 @@ class Glr:
     def log_marginal(self, names: Sequence[str], mean: Any, cov: Any) -> np.ndarray:
         """Return the logarithm of the ratio of marginal likelihoods, sizes normal, (m,).
 
-        Parameters
-        ----------
-        mean, cov : prior of the sizes, (n,) and (n, n): the penalty that a maximum lacks.
+        Args:
+            mean, cov: prior of the sizes, (n,) and (n, n): the penalty that a maximum lacks.
         """
         b, C = self.part(names)
         mean, cov = np.asarray(mean, float), np.asarray(cov, float)
@@ -85,15 +82,13 @@ class Glr:
 def glr(filter: LinearFilter, onsets: Sequence[int] | np.ndarray, stop: int | None = None) -> Glr:
     """Gather the evidence for jumps at each of several onsets, up to ``stop``.
 
-    Parameters
-    ----------
-    filter : innovations, and where jumps enter.
-    onsets : samples at which a jump may have happened.
-    stop : samples k < stop are used; all by default.
+    Args:
+        filter: innovations, and where jumps enter.
+        onsets: samples at which a jump may have happened.
+        stop: samples k < stop are used; all by default.
 
-    Raises
-    ------
-    ParameterError : no onsets, or one outside the samples.
+    Raises:
+        ParameterError: no onsets, or one outside the samples.
     """
     at = np.asarray(onsets, int)
     end = filter.size if stop is None else stop
@@ -119,20 +114,17 @@ def glr_statistic(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the likelihood ratio's logarithm for one jump, at each sample over recent onsets.
 
-    Parameters
-    ----------
-    filter : innovations, and where jumps enter.
-    name : of the jump.
-    window : samples; onsets further back are forgotten.
-    every : samples between the onsets that are tried.
+    Args:
+        filter: innovations, and where jumps enter.
+        name: of the jump.
+        window: samples; onsets further back are forgotten.
+        every: samples between the onsets that are tried.
 
-    Returns
-    -------
-    (largest b^2/(2 C), its onset) at each sample, shapes (K,).
+    Returns:
+        (largest b^2/(2 C), its onset) at each sample, shapes (K,).
 
-    Raises
-    ------
-    SignalError : unknown jump. ParameterError : window or spacing < 1.
+    Raises:
+        SignalError: unknown jump. ParameterError : window or spacing < 1.
     """
     (c,) = filter.columns([name])
     if window < 1 or every < 1:
@@ -174,22 +166,20 @@ def glr_test(
 ) -> Alarms:
     """Watch a filter's innovations for one jump of unknown size, sign and onset.
 
-    Parameters
-    ----------
-    filter : innovations, and where jumps enter.
-    name : of the jump.
-    window, every : see :func:`glr_statistic`.
-    false_alarms_per_hour : stated rate, kept by a filter that has settled.
-    rate : samples per second.
-    start : time of the first sample, s.
-    threshold : if it is known already; otherwise from :func:`glr_threshold` with the signature at
-        the end of the samples.
-    samples : of that simulation.
+    Args:
+        filter: innovations, and where jumps enter.
+        name: of the jump.
+        window, every: see :func:`glr_statistic`.
+        false_alarms_per_hour: stated rate, kept by a filter that has settled.
+        rate: samples per second.
+        start: time of the first sample, s.
+        threshold: if it is known already; otherwise from :func:`glr_threshold` with the signature
+            at the end of the samples.
+        samples: of that simulation.
 
-    Raises
-    ------
-    SignalError, ParameterError : see :func:`glr_statistic` and :func:`glr_threshold`; fewer samples
-        than the window.
+    Raises:
+        SignalError, ParameterError: see :func:`glr_statistic` and :func:`glr_threshold`; fewer
+            samples than the window.
     """
     (c,) = filter.columns([name])
     if threshold is None:
@@ -224,20 +214,17 @@ def glr_stationary(
     The signature is then the same for every onset, and the evidence for an onset n samples back is
     a matched filter of length n: ten million samples take seconds.
 
-    Parameters
-    ----------
-    white : innovations multiplied by S^(-1/2), (K, ny): white, of unit variance.
-    signature : what a unit jump adds to them, in the same units, (M, ny), from its onset on.
-    lengths : ages of the onset that are tried, samples, at most M.
+    Args:
+        white: innovations multiplied by S^(-1/2), (K, ny): white, of unit variance.
+        signature: what a unit jump adds to them, in the same units, (M, ny), from its onset on.
+        lengths: ages of the onset that are tried, samples, at most M.
 
-    Returns
-    -------
-    (largest b^2/(2 C) over the ages, the age) at each sample, shapes (K,).  An age is not tried
-    before as many samples have come.
+    Returns:
+        (largest b^2/(2 C) over the ages, the age) at each sample, shapes (K,).  An age is not tried
+        before as many samples have come.
 
-    Raises
-    ------
-    ParameterError : a length outside 1 to M. SignalError : shapes that do not fit.
+    Raises:
+        ParameterError: a length outside 1 to M. SignalError : shapes that do not fit.
     """
     white, signature = np.asarray(white, float), np.asarray(signature, float)
     if white.ndim != 2 or signature.ndim != 2 or white.shape[1] != signature.shape[1]:
@@ -276,21 +263,19 @@ def glr_threshold(
     tail of a maximum over correlated chi-squared values; the threshold lies on the fitted tail,
     mostly beyond what was simulated.
 
-    Parameters
-    ----------
-    signature, lengths : see :func:`glr_stationary`.
-    false_alarms_per_hour : up-crossings in an hour without a change.
-    rate : samples per second.
-    samples, seed : of the simulation.
+    Args:
+        signature, lengths: see :func:`glr_stationary`.
+        false_alarms_per_hour: up-crossings in an hour without a change.
+        rate: samples per second.
+        samples, seed: of the simulation.
 
-    Returns
-    -------
-    ``threshold``; ``sigma``, its standard deviation from the simulation's eight parts; ``A`` and
-    ``B`` of the tail (for each sample); ``largest``, the level up to which the tail was seen.
+    Returns:
+        ``threshold``; ``sigma``, its standard deviation from the simulation's eight parts; ``A``
+        and ``B`` of the tail (for each sample); ``largest``, the level up to which the tail was
+        seen.
 
-    Raises
-    ------
-    ParameterError : rates, too few samples (< 1e5), or lengths outside the signature.
+    Raises:
+        ParameterError: rates, too few samples (< 1e5), or lengths outside the signature.
     """
     allowed = allowed_per_sample(false_alarms_per_hour, rate)
     if samples < 100_000:

@@ -11,9 +11,9 @@ import math
 import numpy as np
 from scipy import optimize, stats
 
-from apu_casadi.errors import ParameterError, SignalError
+from apu_casadi.core.errors import ParameterError, SignalError
 from estimators.detection.alarms import HOUR, Alarms, allowed_per_sample, rising
-from estimators.recording import plain_numbers
+from estimators.models.recording import plain_numbers
 
 __all__ = ["nis_test", "nis_threshold", "upcrossing_rate", "windowed_nis"]
 
@@ -23,18 +23,15 @@ def windowed_nis(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return sums over the last ``window`` samples of the NIS and of the numbers measured.
 
-    Parameters
-    ----------
-    nis, measured : shape (K,), as in a :class:`~estimators.filtering.FilterResult`.
-    window : samples; the first ``window - 1`` sums are over fewer, since there are no more.
+    Args:
+        nis, measured: shape (K,), as in a :class:`~estimators.filters.filtering.FilterResult`.
+        window: samples; the first ``window - 1`` sums are over fewer, since there are no more.
 
-    Returns
-    -------
-    (sum, degrees of freedom), each of shape (K,).
+    Returns:
+        (sum, degrees of freedom), each of shape (K,).
 
-    Raises
-    ------
-    SignalError : shapes that differ, values not finite. ParameterError : window < 1.
+    Raises:
+        SignalError: shapes that differ, values not finite. ParameterError : window < 1.
     """
     nis, measured = plain_numbers(nis, "nis"), plain_numbers(measured, "measured")
     if nis.ndim != 1 or nis.shape != measured.shape:
@@ -60,11 +57,10 @@ def upcrossing_rate(threshold: float, dof: int, window: int) -> float:
     correlation of the sums, and the expected number of alarms for each sample if an alarm is such
     a crossing.
 
-    Parameters
-    ----------
-    threshold : c > 0.
-    dof : degrees of freedom of one term.
-    window : terms in the sum.
+    Args:
+        threshold: c > 0.
+        dof: degrees of freedom of one term.
+        window: terms in the sum.
     """
     if window == 1:
         return float(stats.chi2.cdf(threshold, dof) * stats.chi2.sf(threshold, dof))
@@ -82,20 +78,17 @@ def nis_threshold(
 ) -> tuple[float, float]:
     """Return the threshold of the windowed NIS, and the share of samples above it.
 
-    Parameters
-    ----------
-    dof : outputs measured at each sample.
-    window : samples.
-    false_alarms_per_hour : up-crossings of the threshold in an hour without a change.
-    rate : samples per second.
+    Args:
+        dof: outputs measured at each sample.
+        window: samples.
+        false_alarms_per_hour: up-crossings of the threshold in an hour without a change.
+        rate: samples per second.
 
-    Returns
-    -------
-    (threshold, probability that a window's sum is above it).
+    Returns:
+        (threshold, probability that a window's sum is above it).
 
-    Raises
-    ------
-    ParameterError : rates not positive, or so high that no threshold gives them.
+    Raises:
+        ParameterError: rates not positive, or so high that no threshold gives them.
     """
     allowed = allowed_per_sample(false_alarms_per_hour, rate)
     if not (dof >= 1 and window >= 1):
@@ -130,18 +123,16 @@ def nis_test(
 ) -> Alarms:
     """Test whether innovations are larger than the filter believes: any change shows.
 
-    Parameters
-    ----------
-    nis, measured : of a :class:`~estimators.filtering.FilterResult`, shape (K,).
-    window : samples; longer windows find smaller changes, later.
-    false_alarms_per_hour : stated rate; with all outputs measured at each sample it is exact.  With
-        gaps, each window is held to the same probability at its own degrees of freedom.
-    rate : samples per second.
-    start : time of the first sample, s.
+    Args:
+        nis, measured: of a :class:`~estimators.filters.filtering.FilterResult`, shape (K,).
+        window: samples; longer windows find smaller changes, later.
+        false_alarms_per_hour: stated rate; with all outputs measured at each sample it is exact.
+            With gaps, each window is held to the same probability at its own degrees of freedom.
+        rate: samples per second.
+        start: time of the first sample, s.
 
-    Raises
-    ------
-    SignalError, ParameterError : see :func:`windowed_nis` and :func:`nis_threshold`.
+    Raises:
+        SignalError, ParameterError: see :func:`windowed_nis` and :func:`nis_threshold`.
     """
     total, dof = windowed_nis(nis, measured, window)
     most = int(np.max(measured, initial=0))

@@ -13,12 +13,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.backend import backend_in_use, compiled, mapped
-from apu_casadi.errors import EstimationError, ParameterError, SignalError, nearest
-from apu_casadi.sharing import keep
-from estimators.filtering import FilterResult
-from estimators.model import FilterModel
-from estimators.recording import Recording, plain_numbers
+from apu_casadi.core.backend import backend_in_use, compiled, mapped
+from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.core.sharing import keep
+from estimators.filters.filtering import FilterResult
+from estimators.models.filtermodel import FilterModel
+from estimators.models.recording import Recording, plain_numbers
 
 __all__ = ["Jump", "LinearFilter", "columns_of", "linear_filter", "linearised", "project"]
 
@@ -27,13 +27,12 @@ __all__ = ["Jump", "LinearFilter", "columns_of", "linear_filter", "linearised", 
 class Jump:
     """A change that begins at some sample and stays.
 
-    Parameters
-    ----------
-    kind : ``"state"`` (the state is displaced once), ``"parameter"`` (a known parameter has another
-        value from then on), ``"sensor"`` (bias of an output from then on), or ``"gain"`` (an output
-        is multiplied by 1 + size).
-    name : of the state, parameter or output.
-    scale : size of a unit jump, own unit.
+    Args:
+        kind: ``"state"`` (the state is displaced once), ``"parameter"`` (a known parameter has
+            another value from then on), ``"sensor"`` (bias of an output from then on), or
+            ``"gain"`` (an output is multiplied by 1 + size).
+        name: of the state, parameter or output.
+        scale: size of a unit jump, own unit.
     """
 
     kind: str
@@ -41,7 +40,6 @@ class Jump:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the kind."""
         kinds = ("state", "parameter", "sensor", "gain")
         if self.kind not in kinds:
             raise ParameterError(f"kind of jump {self.kind!r} {nearest(self.kind, kinds)}")
@@ -50,9 +48,8 @@ class Jump:
 def columns_of(names: Sequence[str], known: Sequence[str]) -> list[int]:
     """Return the positions of jumps among those that are known.
 
-    Raises
-    ------
-    SignalError : unknown name; the nearest is named.
+    Raises:
+        SignalError: unknown name; the nearest is named.
     """
     for n in names:
         if n not in known:
@@ -67,13 +64,12 @@ class LinearFilter:
     The prediction error e and innovation nu, without noise, go as nu = H e + output,
     e(k+1) = A e - L nu + drift; a jump begins with e = state.
 
-    Parameters
-    ----------
-    names : of the q jumps.
-    A, L, H : (K, nx, nx), (K, nx, ny), (K, ny, nx); L is the gain to the next prediction.
-    S : covariance of the innovations, (K, ny, ny).
-    innovation : (K, ny), 0 where nothing was measured, and so are the rows of H and ``output``.
-    state : (nx, q). drift : (K, nx, q). output : (K, ny, q).
+    Args:
+        names: of the q jumps.
+        A, L, H: (K, nx, nx), (K, nx, ny), (K, ny, nx); L is the gain to the next prediction.
+        S: covariance of the innovations, (K, ny, ny).
+        innovation: (K, ny), 0 where nothing was measured, and so are the rows of H and ``output``.
+        state: (nx, q). drift : (K, nx, q). output : (K, ny, q).
     """
 
     names: tuple[str, ...]
@@ -94,9 +90,8 @@ class LinearFilter:
     def columns(self, names: Sequence[str]) -> list[int]:
         """Return the positions of jumps.
 
-        Raises
-        ------
-        SignalError : unknown name.
+        Raises:
+            SignalError: unknown name.
         """
         return columns_of(names, self.names)
 
@@ -129,16 +124,14 @@ def linear_filter(
 
     y = H x + v, x(k+1) = A x + w with covariances R, Q and E[w v'] = ``cross``.
 
-    Parameters
-    ----------
-    y : (K, ny); NaN where nothing was measured.
-    A, H, Q, R, P0, m0 : the model and the belief before the first sample; m0 = 0 by default.
-    names, state, drift, output : jumps, (nx, q), (nx, q), (ny, q); 0 by default.
-    cross : (nx, ny), 0 by default.
+    Args:
+        y: (K, ny); NaN where nothing was measured.
+        A, H, Q, R, P0, m0: the model and the belief before the first sample; m0 = 0 by default.
+        names, state, drift, output: jumps, (nx, q), (nx, q), (ny, q); 0 by default.
+        cross: (nx, ny), 0 by default.
 
-    Raises
-    ------
-    SignalError : shapes that do not fit.
+    Raises:
+        SignalError: shapes that do not fit.
     """
     y = plain_numbers(y, "y", gaps=True)
     nx, q = A.shape[0], len(names)
@@ -193,17 +186,15 @@ def linearised(
     For an extended Kalman filter these are the very matrices that it used; for an unscented one an
     approximation of the same order as its own.
 
-    Parameters
-    ----------
-    model, data : what the filter was run with.
-    result : of a run with ``full=True``.
-    jumps : what may change; their names must differ.
-    backend : see :func:`apu_casadi.backend.compiled`.
+    Args:
+        model, data: what the filter was run with.
+        result: of a run with ``full=True``.
+        jumps: what may change; their names must differ.
+        backend: see :func:`apu_casadi.core.backend.compiled`.
 
-    Raises
-    ------
-    EstimationError : the filter did not keep what is needed.
-    SignalError : a jump of an unknown state, parameter or output.
+    Raises:
+        EstimationError: the filter did not keep what is needed.
+        SignalError: a jump of an unknown state, parameter or output.
     """
     r = result
     if r.mean_pred is None or r.cov_pred is None:
@@ -284,19 +275,16 @@ def project(innovation: np.ndarray, S: np.ndarray, direction: np.ndarray) -> np.
     z = d' S^-1 nu / sqrt(d' S^-1 d): white and normal if the filter is consistent; a change that
     adds s d to the innovations shifts it by s sqrt(d' S^-1 d).
 
-    Parameters
-    ----------
-    innovation : (K, ny); NaN where nothing was measured.
-    S : (K, ny, ny) or (ny, ny), diagonal where nothing was measured, as in a filter's result.
-    direction : (K, ny) or (ny,).
+    Args:
+        innovation: (K, ny); NaN where nothing was measured.
+        S: (K, ny, ny) or (ny, ny), diagonal where nothing was measured, as in a filter's result.
+        direction: (K, ny) or (ny,).
 
-    Returns
-    -------
-    z, shape (K,); NaN where nothing along the direction was measured.
+    Returns:
+        z, shape (K,); NaN where nothing along the direction was measured.
 
-    Raises
-    ------
-    SignalError : a direction that is zero though all was measured.
+    Raises:
+        SignalError: a direction that is zero though all was measured.
     """
     nu = plain_numbers(innovation, "innovation", gaps=True)
     there = ~np.isnan(nu)

@@ -18,7 +18,7 @@ import os
 import sys
 from pathlib import Path
 
-from scenarios import jsontext, usage
+from scenarios.shell import jsontext, usage
 
 NAME = "bench"
 HELP = "measure times and their accuracy (takes minutes)"
@@ -40,21 +40,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print, write."""
-    from scenarios import bench, pages, registry
+    from scenarios import registry
+    from scenarios.bench import benchmarks
+    from scenarios.shell import markdown
 
     if args.list:
-        print("\n".join(bench.known()))
+        print("\n".join(benchmarks.known()))
         return 0
     usage.count("--runs", args.runs)
     if args.pycycle_python:
         os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
-    size = bench.Size()
+    size = benchmarks.Size()
     if args.runs is not None:
         size = dataclasses.replace(size, runs=args.runs)
     names = None
     if args.only is not None:
         names = [n.strip() for n in args.only.split(",") if n.strip()]
-        names += [n for n in bench.PEERS if args.peers and n not in names]
+        names += [n for n in benchmarks.PEERS if args.peers and n not in names]
     if args.page:
         registry.prepare(Path(args.page).parent)
     show = not args.quiet and not args.json and sys.stderr.isatty()
@@ -62,18 +64,18 @@ def run(args: argparse.Namespace) -> int:
     def say(name: str) -> None:
         print(f"measuring {name} ...", file=sys.stderr)
 
-    report = bench.run(names, size=size, peers=args.peers, say=say if show else None)
+    report = benchmarks.run(names, size=size, peers=args.peers, say=say if show else None)
     made = []
     if args.page:
         page, image = Path(args.page), None
         if report.curves:
             image = "docs/images/bench_linear.png"
-            made.append(bench.write_plot(report.curves, size, page.parent / image))
-        made.append(pages.write_text(page, bench.page(report, image)))
+            made.append(benchmarks.write_plot(report.curves, size, page.parent / image))
+        made.append(markdown.write_text(page, benchmarks.page(report, image)))
     if args.json:
         jsontext.show(report.to_dict())
     else:
-        print(bench.table(report))
+        print(benchmarks.table(report))
         if made:
             print("\nwritten:", *(f"  {path}" for path in made), sep="\n")
     return 0 if all(r.accurate for rows in report.rows.values() for r in rows) else 1

@@ -20,11 +20,11 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from scenarios import jsontext, progress
+from scenarios.shell import jsontext, progress
 
 if TYPE_CHECKING:
-    from apu_casadi.calibration import CalibrationPoint, CalibrationResult
-    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.calibration import CalibrationPoint, CalibrationResult
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
 
 NAME = "calibrate"
 HELP = "fit map numbers to table or test-bench points"
@@ -54,9 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def published_points() -> list[CalibrationPoint]:
     """Return the points that the defaults were fitted to, from Tables 4 and 5."""
-    from apu_casadi.calibration import CalibrationPoint
-    from apu_casadi.gasgenerator import GasGeneratorParameters
-    from scenarios.validation import reference
+    from apu_casadi.gaspath.calibration import CalibrationPoint
+    from apu_casadi.gaspath.gasgenerator import GasGeneratorParameters
+    from scenarios.validation.comparison import reference
 
     p = GasGeneratorParameters()
     table4, table5 = (
@@ -92,8 +92,8 @@ def uncalibrated() -> GasGenerator:
     """Return the default engine with the maps' shapes as published."""
     import dataclasses
 
-    from apu_casadi.gasgenerator import GasGenerator
-    from apu_casadi.maps import MapCalibration
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
 
     gg, plain = GasGenerator(), MapCalibration()
     return dataclasses.replace(
@@ -105,8 +105,8 @@ def uncalibrated() -> GasGenerator:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, and print the result."""
-    from apu_casadi.calibration import calibrate, read_points, write_points
-    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.calibration import calibrate, read_points, write_points
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
 
     points = read_points(args.file) if args.file else published_points()
     if args.file:
@@ -126,13 +126,12 @@ def run(args: argparse.Namespace) -> int:
 def _plausible(path: str, points: Sequence[CalibrationPoint]) -> None:
     """Refuse numbers that their quantity cannot have: a slip, or another unit than SI.
 
-    Raises
-    ------
-    DataError : with file, point, name and value.
+    Raises:
+        DataError: with file, point, name and value.
     """
-    from apu_casadi.errors import DataError
-    from apu_casadi.gasgenerator import GasGenerator
-    from scenarios.estimation.plausible import PLAUSIBLE
+    from apu_casadi.core.errors import DataError
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from estimators.apu.recordings.plausible import PLAUSIBLE
 
     units = {s.name: s.unit for s in (*GasGenerator.Y, *GasGenerator.U)}
     for p in points:
@@ -166,7 +165,7 @@ def report(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _in_code(result: CalibrationResult) -> dict[str, float]:
-    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
 
     gg = GasGenerator()
     parts = (n.partition(".") for n in result.names)

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from scenarios import guard, jsontext, usage
+from scenarios.shell import guard, jsontext, usage
 
 NAME = "campaign"
 HELP = "run many joint scenarios with random faults"
@@ -55,8 +55,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the campaign; status 0 even if runs were refused, which the result tells."""
     from pathlib import Path
 
-    from apu_casadi.conditions import day_words
-    from scenarios import campaigns, notices, registry
+    from apu_casadi.gaspath.conditions import day_words
+    from scenarios import campaigns, registry
+    from scenarios.shell import notices
 
     usage.count("--runs", args.runs)
     usage.count("--workers", args.workers, most=1024)

@@ -9,14 +9,14 @@ import argparse
 import sys
 import time
 
-from scenarios import jsontext
+from scenarios.shell import jsontext
 
 NAME = "compile"
 HELP = "compile the hot functions to C libraries ahead of time"
 
 HOT: tuple[tuple[str, str], ...] = (
     ("gas_generator", "scenarios.commands.compile:gas_generator_functions"),
-    ("trim", "apu_casadi.trimsolver:hot_functions"),
+    ("trim", "apu_casadi.gaspath.steady.trimsolver:hot_functions"),
     ("joint", "scenarios.commands.compile:joint_functions"),
 )
 """(name, "module:callable"); the callable compiles its functions and returns their names."""
@@ -38,8 +38,8 @@ def run(args: argparse.Namespace) -> int:
     """Compile every group; return 1 if there is no compiler."""
     from importlib import import_module
 
-    from apu_casadi import backend
-    from apu_casadi.errors import BackendError, nearest
+    from apu_casadi.core import backend
+    from apu_casadi.core.errors import BackendError, nearest
 
     if args.clear:
         n = backend.clear_cache()
@@ -79,8 +79,8 @@ def run(args: argparse.Namespace) -> int:
 
 def gas_generator_functions() -> list[str]:
     """Compile state update, output and their combination of the default engine."""
-    from apu_casadi.backend import compiled
-    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.core.backend import compiled
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
 
     gg = GasGenerator()
     return [str(compiled(f).name()) for f in (gg.f, gg.g, gg.step)]
@@ -88,12 +88,12 @@ def gas_generator_functions() -> list[str]:
 
 def joint_functions() -> list[str]:
     """Compile what joint runs by exact propagation use, with a healthy and a faulted machine."""
-    from apu_casadi.apu import Apu
-    from apu_casadi.backend import loaded_functions
-    from apu_casadi.events import FaultChange
-    from apu_casadi.machine.load import SeriesLoad
-    from apu_casadi.machine.ttsc import Ttsc
-    from apu_casadi.multirate import simulate_joint
+    from apu_casadi.core.backend import loaded_functions
+    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.events import FaultChange
+    from apu_casadi.unit.multirate import simulate_joint
 
     apu, load = Apu(), SeriesLoad.from_power(100e3)
     for waveform_dt in (50e-6, None):

@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from apu_casadi.conditions import DEFAULT_DAY
-from scenarios import jsontext, progress, usage
+from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from scenarios.commands.given import program
+from scenarios.shell import jsontext, progress, usage
 
 NAME = "deck"
 HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
@@ -41,11 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Solve the grid and write it."""
-    from apu_casadi import files, results
-    from apu_casadi.errors import ScenarioError
-    from apu_casadi.gasgenerator import GasGenerator
-    from apu_casadi.steadypoint import MEANING, Status
-    from apu_casadi.trimbatch import performance_deck
+    from apu_casadi.core import files, results
+    from apu_casadi.core.errors import ScenarioError
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.steady.steadypoint import MEANING, Status
+    from apu_casadi.gaspath.steady.trimbatch import performance_deck
 
     usage.count("--threads", args.threads, most=1024)
     axes: dict[str, Any] = {
@@ -92,7 +92,7 @@ def _axis(option: str, text: str) -> list[float]:
     """Read FROM:TO:COUNT or a list."""
     import numpy as np
 
-    from apu_casadi.errors import ScenarioError
+    from apu_casadi.core.errors import ScenarioError
 
     wrong = ScenarioError(f"{option}: values must be finite and differ, got {text!r}")
     try:

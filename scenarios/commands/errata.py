@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from scenarios import jsontext, progress
+from scenarios.shell import jsontext, progress
 
 NAME = "errata"
 HELP = "what the paper leaves open, what was chosen, and what it changes"
@@ -23,17 +23,18 @@ def run(args: argparse.Namespace) -> int:
     """Compute the effects; print or write the page."""
     from pathlib import Path
 
-    from apu_casadi import files
-    from scenarios import errata, pages
+    from apu_casadi.core import files
+    from scenarios.pages import errata_page
+    from scenarios.shell import markdown
 
     progress.tell("computing the effects, about a minute", quiet=args.json)
     if args.write is not None:
         files.folder(Path(args.write).parent)  # not after a minute of work
-        path = pages.write_text(args.write, errata.page())
+        path = markdown.write_text(args.write, errata_page.page())
     if args.json:
-        jsontext.show(errata.report())
+        jsontext.show(errata_page.report())
     elif args.write is not None:
         print(f"written: {path}")
     else:
-        print(errata.page(), end="")
+        print(errata_page.page(), end="")
     return 0

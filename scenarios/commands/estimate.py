@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from scenarios import jsontext, usage
+from scenarios.shell import jsontext, usage
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
@@ -90,19 +90,20 @@ def run(args: argparse.Namespace) -> int:
 
 def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
-    from apu_casadi import results
-    from apu_casadi.errors import ScenarioError
-    from scenarios import notices, registry
-    from scenarios.commands.run import _bar
-    from scenarios.estimation import jointrun
-    from scenarios.pages import write_text
+    from apu_casadi.core import results
+    from apu_casadi.core.errors import ScenarioError
+    from scenarios import registry
+    from scenarios.shell import notices
+    from scenarios.shell.markdown import write_text
+    from scenarios.shell.progress import bar
+    from scenarios.studies import jointrun
 
     if args.seed < 0:
         raise ScenarioError(f"--seed must be >= 0, got {args.seed}")
     s = registry.get(args.scenario)
     folder = registry.prepare(args.out or f"results/estimate_{s.name}")
     show = not args.quiet and sys.stderr.isatty()
-    with _bar(f"{s.name}, truth", s.duration, show=show) as progress:
+    with bar(f"{s.name}, truth", s.duration, show=show) as progress:
         truth = jointrun.truth(s, progress=progress)
     if show:
         print("estimating ...", file=sys.stderr)
@@ -131,16 +132,16 @@ def _joint(args: argparse.Namespace) -> int:
 
 def _study(args: argparse.Namespace) -> int:
     """Run a study over fresh random seeds; parts that are kept are not run again."""
-    from apu_casadi.errors import ParameterError, nearest
+    from apu_casadi.core.errors import ParameterError, nearest
     from scenarios import registry
-    from scenarios.estimation import studies
-    from scenarios.estimation.kept import understood
-    from scenarios.estimation.reports import REPORTS
+    from scenarios.pages.reports import REPORTS
+    from scenarios.studies import catalogue
+    from scenarios.studies.kept import understood
 
-    known = [*studies.STUDIES, "all"]
+    known = [*catalogue.STUDIES, "all"]
     if args.study not in known:
         raise ParameterError(f"unknown study {args.study!r} {nearest(args.study, known)}")
-    names = list(studies.STUDIES) if args.study == "all" else [args.study]
+    names = list(catalogue.STUDIES) if args.study == "all" else [args.study]
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
     usage.count("--seeds", args.seeds, least=2)
@@ -148,18 +149,18 @@ def _study(args: argparse.Namespace) -> int:
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
     for name in names:
-        n = args.seeds or studies.get(name).seeds
-        todo = list(studies.get(name).parts) if args.again else studies.pending(
-            studies.get(name), folder, n
+        n = args.seeds or catalogue.get(name).seeds
+        todo = list(catalogue.get(name).parts) if args.again else catalogue.pending(
+            catalogue.get(name), folder, n
         )  # fmt: skip
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
-            record = studies.run(name, folder, n_seeds=n, again=args.again, progress=progress)
+            record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
         with understood(name):
-            found[name] = REPORTS[name].claims(studies.results(record))
+            found[name] = REPORTS[name].claims(catalogue.results(record))
         if not args.json:
-            remark = studies.other_code(studies.get(name), record)
+            remark = catalogue.other_code(catalogue.get(name), record)
             if remark:
                 print(f"  {remark}", flush=True)
             for c in found[name]:
@@ -200,17 +201,18 @@ def _study_bar(name: str, *, show: bool) -> Iterator[Callable[[str, float, float
 
 def _page(args: argparse.Namespace) -> int:
     """Write the page and its figures from the kept studies."""
-    from apu_casadi import files
-    from apu_casadi.errors import DataError
-    from scenarios.estimation import page, studies
-    from scenarios.pages import write_text
+    from apu_casadi.core import files
+    from apu_casadi.core.errors import DataError
+    from scenarios.pages import estimation_page
+    from scenarios.shell.markdown import write_text
+    from scenarios.studies import catalogue
 
     try:
-        records = page.load(args.source)
-        made = page.write(args.write, records)
+        records = estimation_page.load(args.source)
+        made = estimation_page.write(args.write, records)
         if args.readme:
             path = Path(args.readme)
-            text = page.put_summary(path.read_text(encoding="utf-8"), records)
+            text = estimation_page.put_summary(path.read_text(encoding="utf-8"), records)
             made.append(write_text(path, text))
     except OSError as e:
         place = e.filename or args.readme or args.write
@@ -220,7 +222,7 @@ def _page(args: argparse.Namespace) -> int:
     print("written:", *(f"  {p}" for p in made), sep="\n")
     # not on the page, which is what the kept numbers say, whatever the code has become
     for name, record in records.items():
-        remark = studies.other_code(studies.get(name), record)
+        remark = catalogue.other_code(catalogue.get(name), record)
         if remark:
             print(f"{name}: {remark}")
     return 0
@@ -228,7 +230,7 @@ def _page(args: argparse.Namespace) -> int:
 
 def _sensors(args: argparse.Namespace) -> int:
     """Print the 1-sigma tables with their sources."""
-    from scenarios.estimation.sensors import ELECTRICAL, GAS_PATH
+    from estimators.apu.sensors import ELECTRICAL, GAS_PATH
 
     sets = {"gas path, every 20 ms": GAS_PATH, "electrical, at 10 kHz": ELECTRICAL}
     if args.json:

@@ -26,16 +26,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY, day_words
-from apu_casadi.errors import DataError, ParameterError, nearest
-from scenarios import jsontext
+from apu_casadi.core.errors import DataError, ParameterError, nearest
+from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, day_words
 from scenarios.commands.given import ambient_arguments, ambient_given, program
+from scenarios.shell import jsontext
 
 if TYPE_CHECKING:
-    from estimators.fit import Profile
-    from scenarios.estimation.fitting import EngineData, EngineFit
-    from scenarios.estimation.recorded import Reading, Table
-    from scenarios.estimation.sensors import SensorSet
+    from estimators.apu.fitting import EngineData, EngineFit
+    from estimators.apu.recordings.recorded import Reading, Table
+    from estimators.apu.sensors import SensorSet
+    from estimators.batch.fit import Profile
 
 NAME = "fit"
 HELP = "fit health factors to recorded data (CSV, Parquet, netCDF)"
@@ -113,8 +113,8 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
 
 
 def _reading(args: argparse.Namespace) -> Reading:
-    from scenarios.estimation.plausible import parse_limits
-    from scenarios.estimation.recorded import Reading
+    from estimators.apu.recordings.plausible import parse_limits
+    from estimators.apu.recordings.recorded import Reading
 
     missing = [_number(n, "--missing", args.missing) for n in _names(args.missing)]
     return Reading(
@@ -125,10 +125,10 @@ def _reading(args: argparse.Namespace) -> Reading:
 
 def run(args: argparse.Namespace) -> int:
     """Read, fit, print; return 0."""
-    from estimators.fit import profile
-    from scenarios.estimation import fitting
-    from scenarios.estimation.recorded import parse_mapping, read_table
-    from scenarios.estimation.runfiles import recorded_ambient
+    from estimators.apu import fitting
+    from estimators.apu.recordings.recorded import parse_mapping, read_table
+    from estimators.apu.recordings.runfiles import recorded_ambient
+    from estimators.batch.fit import profile
 
     mapping = parse_mapping(args.column)
     _known_targets(mapping)
@@ -238,9 +238,9 @@ def _sensors(items: Sequence[str]) -> SensorSet:
 
     import numpy as np
 
-    from apu_casadi.gasgenerator import GasGenerator
-    from scenarios.estimation.recorded import UNITS, convert
-    from scenarios.estimation.sensors import GAS_PATH, Sensor, SensorSet
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from estimators.apu.recordings.recorded import UNITS, convert
+    from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 
     known = {s.name: s for s in GAS_PATH.sensors}
     for item in items:
@@ -279,8 +279,8 @@ def _sensors(items: Sequence[str]) -> SensorSet:
 
 
 def _known_targets(mapping: Mapping[str, Any]) -> None:
-    from apu_casadi.gasgenerator import GasGenerator
-    from scenarios.estimation.fitting import AMBIENT
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from estimators.apu.fitting import AMBIENT
 
     valid = [*GasGenerator.Y.names, *AMBIENT, "time"]
     for name in mapping:
@@ -297,8 +297,8 @@ def _data(
     """
     import numpy as np
 
-    from apu_casadi.gasgenerator import GasGenerator
-    from scenarios.estimation.fitting import AMBIENT, INPUTS, EngineData
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from estimators.apu.fitting import AMBIENT, INPUTS, EngineData
 
     Y, U = GasGenerator.Y, GasGenerator.U
     readings = {s: table.get(s, Y[s].unit) for s in sensors.names if s in table}
@@ -373,9 +373,9 @@ def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Name
 
 def _ignored(tables: Sequence[Table], sensors: SensorSet, time: str | None) -> list[str]:
     """Columns that the fit does not use, with a guess of what they may be."""
-    from apu_casadi.gasgenerator import GasGenerator
-    from scenarios.estimation.fitting import AMBIENT
-    from scenarios.estimation.timestamps import is_time_name
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from estimators.apu.fitting import AMBIENT
+    from estimators.apu.recordings.timestamps import is_time_name
 
     used = {*sensors.names, *AMBIENT, time}
     out: dict[str, None] = {}
@@ -398,7 +398,7 @@ def report(
     fit: EngineFit, profiles: Sequence[Profile], ignored: Sequence[str], *, steady: bool
 ) -> dict[str, Any]:
     """Return the result as plain numbers; what is unbounded or unknown is None."""
-    from scenarios.estimation.fitting import words
+    from estimators.apu.fitting import words
 
     r = fit.result
 
@@ -472,7 +472,7 @@ def verdict(chi2: float, freedom: int, p: float) -> str:
 
 def text(found: Mapping[str, Any]) -> str:
     """Return the report as text."""
-    from scenarios.estimation.fitting import INPUTS, words
+    from estimators.apu.fitting import INPUTS, words
 
     rows = found["parameters"]
     width = max(len(r["name"]) for r in rows)
@@ -558,9 +558,9 @@ def _day(ambient: Mapping[str, Any]) -> str:
 
 def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]]) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
-    from apu_casadi import files
-    from apu_casadi.fitplot import plot_fit
-    from apu_casadi.gasgenerator import GasGenerator
+    from apu_casadi.core import files
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from scenarios.figures.fitplot import plot_fit
 
     first = Path(path)
     if first.suffix.lower() not in (".png", ".pdf", ".svg"):

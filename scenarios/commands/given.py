@@ -1,6 +1,6 @@
 """The options of ambient conditions, alike in every command, and the line that tells them.
 
-Their defaults are those of :mod:`apu_casadi.conditions`; what a command assumed, it prints.
+Their defaults are those of :mod:`apu_casadi.gaspath.conditions`; what a command assumed, it prints.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from apu_casadi.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
+from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
 
 OPTIONS = {"altitude": "altitude", "Mach": "mach", "dT_isa": "disa", "war": "humidity"}
 """The option of each condition, without its dashes."""
@@ -19,9 +19,8 @@ _METAVAR = {"altitude": "M", "Mach": "MA", "dT_isa": "K", "war": "RATIO"}
 def ambient_arguments(parser: argparse.ArgumentParser, *, otherwise: str = "") -> None:
     """Declare ``--altitude``, ``--mach``, ``--disa`` and ``--humidity`` (also ``--war``), numbers.
 
-    Parameters
-    ----------
-    otherwise : what stands in for an option before the default day does, for the help.
+    Args:
+        otherwise: what stands in for an option before the default day does, for the help.
     """
     for name, c in CONDITIONS.items():
         flags = [f"--{OPTIONS[name]}"] + (["--war"] if name == "war" else [])

@@ -16,15 +16,15 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.conditions import DEFAULT_DAY, day_words
-from scenarios import jsontext, progress, usage
+from apu_casadi.gaspath.conditions import DEFAULT_DAY, day_words
 from scenarios.commands.given import program
+from scenarios.shell import jsontext, progress, usage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from estimators.identifiability import Identifiability, SensorComparison
-    from scenarios.estimation.identify import Severity, Trials
+    from estimators.apu.identify import Severity, Trials
+    from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
 SWEPT = (0.005, 0.01, 0.02, 0.05, 0.1)  # priors of the printed sweep
@@ -60,10 +60,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compute, print and draw."""
-    from apu_casadi import files
-    from apu_casadi.errors import ParameterError
-    from estimators.identifiability import compare_sensors, which_to_add
-    from scenarios.estimation import identify as study
+    from apu_casadi.core import files
+    from apu_casadi.core.errors import ParameterError
+    from estimators.apu import identify as study
+    from estimators.information.identifiability import compare_sensors, which_to_add
 
     usage.count("--trials", args.trials, least=0)
     usage.count("--samples", args.samples, most=1_000_000_000)
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
             )
     ramp = None
     if args.transient:
-        from estimators.identifiability import identify
+        from estimators.information.identifiability import identify
 
         ramp = {
             label: identify(study.gas_path_transient(power=p, prior=options["prior"]))
@@ -188,7 +188,7 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
         f"{args.samples} samples of 20 ms averaged, prior {args.prior:g} % on each health factor; "
         f"gain errors: {gains};",
         f"true speed and fuel flow unknown; efficiency behind PW known to {args.eta_bias:g} %; "
-        "noise: scenarios.estimation.sensors.",
+        "noise: estimators.apu.sensors.",
         *(f"{n}: shaft power {c['PW'] / 1e3:g} kW, {day_words(c['ambient'])}; healthy engine"
           for n, c in ((n, _condition(n)) for n in _names(args.point))),
         f"{program()}" + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
@@ -197,7 +197,7 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
 
 def _condition(point: str) -> dict[str, Any]:
     """Shaft power and all ambient conditions of a named point."""
-    from scenarios.estimation.identify import POINTS
+    from estimators.apu.identify import POINTS
 
     given = POINTS[point]
     return {"PW": given["PW"],
@@ -284,7 +284,7 @@ def _power(
     needed: dict[str, int | None],
     point: str,
 ) -> list[str]:
-    from scenarios.estimation.identify import AIMS, ETA_BIAS, PRIOR
+    from estimators.apu.identify import AIMS, ETA_BIAS, PRIOR
 
     one = next(iter(power.values()))
     null = ", ".join(f"{n} {v:+.3f}" for n, v in one["null"].items() if abs(v) > 1e-6)
@@ -424,8 +424,8 @@ def _electrical(rows: list[Severity]) -> list[str]:
 
 
 def _figure(point: str, samples: int) -> Any:
-    from apu_casadi.estimationplot import plot_gain_of_a_sensor
-    from scenarios.estimation import identify as study
+    from estimators.apu import identify as study
+    from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 
     noise = study.GAS_PATH["PW"].noise
     priors = list(study.PRIORS)

@@ -11,8 +11,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.conditions import day_words
-from scenarios import jsontext
+from apu_casadi.gaspath.conditions import day_words
 from scenarios.commands.given import (
     ambient_arguments,
     ambient_given,
@@ -20,9 +19,10 @@ from scenarios.commands.given import (
     ambient_of,
     program,
 )
+from scenarios.shell import jsontext
 
 if TYPE_CHECKING:
-    from apu_casadi.linearisation import LinearModel
+    from apu_casadi.unit.linearisation import LinearModel
 
 NAME = "linearise"
 HELP = "print and draw the eigenvalues at a steady point"
@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
     model = linear_model(args)
     path = None
     if not args.no_figures:
-        from apu_casadi import files
-        from apu_casadi.eigenplot import plot_eigenvalues
+        from apu_casadi.core import files
         from scenarios import registry
+        from scenarios.figures.eigenplot import plot_eigenvalues
 
         label = f"{_load(args)} each, {day_words(ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
@@ -85,14 +85,14 @@ def _load(args: argparse.Namespace) -> str:
 
 def linear_model(args: argparse.Namespace) -> LinearModel:
     """Return the linear model that the options describe."""
-    from apu_casadi.apu import Apu
-    from apu_casadi.events import Ambient
-    from apu_casadi.linearisation import (
+    from apu_casadi.machine.loads.load import ConstantPowerLoad, Load, SeriesLoad
+    from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.events import Ambient
+    from apu_casadi.unit.linearisation import (
         linearise_gas_generator,
         linearise_generator,
         linearise_joint,
     )
-    from apu_casadi.machine.load import ConstantPowerLoad, Load, SeriesLoad
 
     apu = Apu()
     load: Load

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from scenarios import jsontext
+from scenarios.shell import jsontext
 
 NAME = "list"
 HELP = "list the scenarios of the library"

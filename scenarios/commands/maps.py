@@ -22,11 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw both maps and print the paths."""
-    from apu_casadi import files, results
-    from apu_casadi.errors import DataError
-    from apu_casadi.gasgenerator import GasGenerator
-    from apu_casadi.mapplots import default_lines, plot_compressor_map, plot_turbine_map
-    from scenarios import progress, registry
+    from apu_casadi.core import files, results
+    from apu_casadi.core.errors import DataError
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from scenarios import registry
+    from scenarios.figures.mapplots import default_lines, plot_compressor_map, plot_turbine_map
+    from scenarios.shell import progress
 
     ds = None if args.trajectory is None else results.load(args.trajectory)
     folder = registry.prepare(args.out)

@@ -10,8 +10,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from apu_casadi.errors import ScenarioError
-from scenarios import jsontext
+from apu_casadi.core.errors import ScenarioError
+from scenarios.shell import jsontext
 
 NAME = "multirate"
 HELP = "measure the error of the multi-rate exchange (takes minutes)"
@@ -34,28 +34,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its results."""
-    from scenarios import multirate_study as study
-    from scenarios import pages, registry
-    from scenarios.commands.run import _bar
+    from scenarios import registry
+    from scenarios.shell import markdown
+    from scenarios.shell.progress import bar
+    from scenarios.studies import multirate_study as study
 
     steps = study.STEPS if args.steps is None else _steps(args.steps, study.COMMON)
     folder = registry.prepare(args.out or "results/multirate")
     show = not args.quiet and sys.stderr.isatty()
     if args.page and study.PAPER_STEP not in steps:
         raise ScenarioError("--page needs the paper's 20 ms among --steps")
-    with _bar(NAME, study.simulated(steps), show=show) as progress:
+    with bar(NAME, study.simulated(steps), show=show) as progress:
         rows = study.measure(steps=steps, progress=progress)
     report = study.report(rows)
     text = jsontext.dumps(report)
     made = [study.write_figure(rows, folder / "multirate_error.png")]
-    made.append(pages.write_text(folder / "multirate.json", text + "\n"))
+    made.append(markdown.write_text(folder / "multirate.json", text + "\n"))
     if args.page:
         page = Path(args.page)
         registry.prepare(page.parent / "images")
         made.append(
             study.write_figure(rows, page.parent / "images" / "multirate_error.png", dpi=120)
         )
-        made.append(pages.write_text(page, study.page(rows)))
+        made.append(markdown.write_text(page, study.page(rows)))
     if args.json:
         print(text)
         return 0

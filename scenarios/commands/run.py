@@ -7,13 +7,12 @@ SCENARIO is a name of the library (see ``apu list``), a .toml file, or a .py fil
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
-from scenarios import jsontext
+from scenarios.shell import jsontext
+from scenarios.shell.progress import bar
 
 NAME = "run"
 HELP = "run a scenario of the library or of a file"
@@ -47,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the scenario and write its results."""
-    from scenarios import notices, registry
+    from scenarios import registry
+    from scenarios.shell import notices
 
     s = registry.get(args.scenario)
     if args.no_waveforms:
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         s = s.change(exchange=args.exchange)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
-    with _bar(s.name, s.duration, show=show) as progress:
+    with bar(s.name, s.duration, show=show) as progress:
         ds = registry.run(s, progress=progress, solver=args.solver, phasors=args.phasors)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
@@ -72,29 +72,6 @@ def run(args: argparse.Namespace) -> int:
         for path in made:
             print(f"  {path}")
     return 0
-
-
-Progress = Callable[[float, float], None]
-
-
-@contextmanager
-def _bar(name: str, total: float, *, show: bool) -> Iterator[Progress]:
-    """Yield a callback that moves a progress bar on stderr, or does nothing."""
-    if not show:
-        yield lambda done, total: None
-        return
-    from tqdm import tqdm
-
-    form = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:g} s simulated [{elapsed}<{remaining}]"
-    columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
-    with tqdm(
-        total=total, desc=name, bar_format=form, ncols=columns, nrows=24, file=sys.stderr
-    ) as bar:
-
-        def progress(done: float, _: float) -> None:
-            bar.update(min(done, total) - bar.n)
-
-        yield progress
 
 
 def _faulty(value: float | None, form: str) -> str:
@@ -137,8 +114,8 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 
 def made_with(report: dict[str, Any]) -> list[str]:
     """Return the lines that tell what a run was made with, and whether the model holds."""
-    from apu_casadi.conditions import day_words
-    from apu_casadi.validity import exchange_words
+    from apu_casadi.gaspath.conditions import day_words
+    from apu_casadi.unit.validity import exchange_words
 
     solver, error = report["solver"] or {}, report["exchange_error"]
     lines = []

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from scenarios import jsontext, progress
+from scenarios.shell import jsontext, progress
 
 NAME = "study"
 HELP = "run a numerical study (trim)"
@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and print its table."""
-    from scenarios import trim_study, usage
+    from scenarios.shell import usage
+    from scenarios.studies import trim_study
 
     usage.count("--points", args.points, most=10_000_000)
     usage.count("--threads", args.threads, most=1024)

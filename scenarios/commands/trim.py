@@ -22,8 +22,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from apu_casadi.errors import OperatingPointError, SignalError, nearest
-from scenarios import jsontext
+from apu_casadi.core.errors import OperatingPointError, SignalError, nearest
 from scenarios.commands.given import (
     ambient_arguments,
     ambient_given,
@@ -31,6 +30,7 @@ from scenarios.commands.given import (
     ambient_of,
     program,
 )
+from scenarios.shell import jsontext
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -122,7 +122,7 @@ def _numbers(option: str, texts: list[str]) -> dict[str, float]:
 def _limits(texts: list[str]) -> Any:
     import dataclasses
 
-    from apu_casadi.steadypoint import Limits
+    from apu_casadi.gaspath.steady.steadypoint import Limits
 
     known = [f.name for f in dataclasses.fields(Limits)]
     given = _numbers("--limit", texts)
@@ -133,7 +133,7 @@ def _limits(texts: list[str]) -> Any:
 
 
 def _fixed(texts: list[str], PW_design: float, N_design: float) -> dict[str, Any]:
-    from apu_casadi.steadypoint import LoadLaw
+    from apu_casadi.gaspath.steady.steadypoint import LoadLaw
 
     out: dict[str, Any] = {}
     for name, value in _pairs("--fix", texts).items():
@@ -151,16 +151,16 @@ def _fixed(texts: list[str], PW_design: float, N_design: float) -> dict[str, Any
 
 
 def _gas(args: argparse.Namespace, mode: str) -> int:
-    from apu_casadi.cycle import Y
-    from apu_casadi.trimming import maximum_power, trim_gas_generator
+    from apu_casadi.gaspath.cycle import Y
+    from apu_casadi.gaspath.steady.trimming import maximum_power, trim_gas_generator
 
     ambient = ambient_of(args)
     health, limits = _numbers("--health", args.health), _limits(args.limit)
     extra: dict[str, float] = {}
     if mode == "--load":
-        from apu_casadi.apu import Apu
-        from apu_casadi.events import Ambient
-        from apu_casadi.machine.load import SeriesLoad
+        from apu_casadi.machine.loads.load import SeriesLoad
+        from apu_casadi.unit.apu import Apu
+        from apu_casadi.unit.events import Ambient
 
         if args.speed is not None:
             raise SignalError("--load is solved at governed speed; leave --speed out")
@@ -173,7 +173,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         point, g = joint.gas, joint.generator
         extra = {"V_t": g.V_t, "V_ref": g.V_ref, **_scalars(g.y)}
     else:
-        from apu_casadi.gasgenerator import GasGenerator
+        from apu_casadi.gaspath.gasgenerator import GasGenerator
 
         gg = GasGenerator()
         N = gg.parameters.N if args.speed is None else args.speed * math.pi / 30.0
@@ -227,8 +227,8 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
 
 
 def _generator(args: argparse.Namespace) -> int:
-    from apu_casadi.generator import Generator
-    from apu_casadi.machine.load import SeriesLoad
+    from apu_casadi.machine.generator import Generator
+    from apu_casadi.machine.loads.load import SeriesLoad
 
     gen = Generator()
     p = gen.machine
@@ -279,7 +279,7 @@ def _scalars(y: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _table(values: Mapping[str, float], names: list[str]) -> str:
-    from apu_casadi.cycle import Y
+    from apu_casadi.gaspath.cycle import Y
 
     rows = []
     for n in names:

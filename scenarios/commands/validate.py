@@ -11,7 +11,7 @@ import math
 import os
 import sys
 
-from scenarios import jsontext
+from scenarios.shell import jsontext
 
 NAME = "validate"
 HELP = "recompute published tables and numerical checks"
@@ -33,17 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the sections; return 1 if a row falls short."""
-    from scenarios import validation
+    from scenarios.validation import comparison
 
     if args.pycycle_python:
         os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
-    known = validation.sections()
+    known = comparison.sections()
     if args.list:
         for name, (title, _) in known.items():
             print(f"{name:<14} {title}")
         return 0
     if args.figures:
-        from scenarios import paper_figures
+        from scenarios.validation import paper_figures
 
         print(*paper_figures.write_figures(args.figures), sep="\n")
         return 0
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
         if name in known and sys.stderr.isatty():
             print(f"running {name} ...", file=sys.stderr)
         try:
-            rows = validation.run(name)
-        except validation.SkippedError as reason:
+            rows = comparison.run(name)
+        except comparison.SkippedError as reason:
             skipped[name] = str(reason)
             if not args.json:
                 print(f"\n{name}: {known[name][0]}\n  skipped: {reason}")
@@ -77,9 +77,10 @@ def run(args: argparse.Namespace) -> int:
         left_out = f"; skipped: {', '.join(skipped)}" if skipped else ""
         print(f"\n{total} rows, {failed} short of their tolerance{left_out}")
     if args.write:
-        from scenarios import pages, validation_page
+        from scenarios.pages import validation_page
+        from scenarios.shell import markdown
 
-        pages.write_text(args.write, validation_page.page(report, skipped))
+        markdown.write_text(args.write, validation_page.page(report, skipped))
     return 1 if failed or (args.only and skipped) else 0
 
 

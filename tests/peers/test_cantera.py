@@ -2,16 +2,16 @@
 
 import pytest
 
-from apu_casadi.gas import _cp_over_R, _species
-from scenarios import validation
-from scenarios.peers import gas
+from apu_casadi.gaspath.gas import _cp_over_R, species
+from scenarios.validation import comparison
+from scenarios.validation.peers import gas
 
 ct = pytest.importorskip("cantera", reason="cantera is not installed (extra 'peers')")
 
 
 def test_every_row_is_within_its_tolerance():
     """Both data sets, 200-2200 K, fuel-air ratio 0-0.04; the rows say why each tolerance."""
-    rows = validation.run("cantera")
+    rows = comparison.run("cantera")
     assert len(rows) == 2 * (4 + len(gas.BANDS))
     short = [f"{r.quantity}: {r.error:+.2e} > {r.tolerance:.0e}" for r in rows if not r.passed]
     assert not short, short
@@ -40,7 +40,7 @@ def test_mixture_balances_the_atoms():
 def test_nasa9_of_air_species_equals_cantera():
     """Cantera's airNASA9.yaml carries N2 and O2 of NASA/TP-2002-211556 (1e-6: printed digits)."""
     theirs = {s.name: s.thermo for s in ct.Species.list_from_file("airNASA9.yaml")}
-    ours = _species("nasa9")
+    ours = species("nasa9")
     for name in ("N2", "O2"):
         for T in gas.TEMPERATURES:
             cp = float(_cp_over_R(ours[name][1][0 if T < 1000 else 1], T)) * ct.gas_constant

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from apu_casadi.machine.load import SeriesLoad
-from apu_casadi.machine.parameters import MachineParameters
-from apu_casadi.machine.ttsc import Ttsc
-from scenarios.peers import machine
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.machinedata import MachineParameters
+from scenarios.validation.peers import machine
 
 P = MachineParameters()
 

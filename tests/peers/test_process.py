@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from apu_casadi.errors import SimulationError
+from apu_casadi.core.errors import SimulationError
 from scenarios.cli import main
-from scenarios.peers import cycle, process
+from scenarios.validation.peers import cycle, process
 
 
 def test_a_failing_peer_is_reported_with_what_it_said(tmp_path, monkeypatch):

@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from scenarios import validation
-from scenarios.peers import cycle
+from scenarios.validation import comparison
+from scenarios.validation.peers import cycle
 
 needs_pycycle = pytest.mark.skipif(
     not os.environ.get(cycle.VARIABLE), reason=f"{cycle.VARIABLE} names no Python with pyCycle"
@@ -15,7 +15,7 @@ needs_pycycle = pytest.mark.skipif(
 @needs_pycycle
 def test_every_row_is_within_its_tolerance():
     """Design, off-design line at constant speed and 8000 m; about a minute."""
-    rows = validation.run("pycycle")
+    rows = comparison.run("pycycle")
     short = [f"{r.quantity}: {r.error:+.2e} > {r.tolerance:.0e}" for r in rows if not r.passed]
     assert not short, short
     points = {r.quantity.split(":")[0] for r in rows if ": " in r.quantity}
@@ -25,11 +25,11 @@ def test_every_row_is_within_its_tolerance():
 def test_no_python_is_a_skip_with_the_reason(monkeypatch):
     """Without pyCycle the section says what to set, and what is named must exist."""
     monkeypatch.delenv(cycle.VARIABLE, raising=False)
-    with pytest.raises(validation.SkippedError, match=rf"{cycle.VARIABLE}.*--pycycle-python"):
-        validation.run("pycycle")
+    with pytest.raises(comparison.SkippedError, match=rf"{cycle.VARIABLE}.*--pycycle-python"):
+        comparison.run("pycycle")
     monkeypatch.setenv(cycle.VARIABLE, "no-such-python")
-    with pytest.raises(validation.SkippedError, match="no-such-python"):
-        validation.run("pycycle")
+    with pytest.raises(comparison.SkippedError, match="no-such-python"):
+        comparison.run("pycycle")
 
 
 def test_our_side_has_no_calibration_and_the_same_design_location():

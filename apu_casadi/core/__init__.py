@@ -1,0 +1,1 @@
+"""What every model stands on: named signals, state-space models, solvers, results, files."""

@@ -1,0 +1,72 @@
+"""Frozen parameter sets: every number has a unit, an origin and a range.
+
+A parameter set is a frozen dataclass whose fields are made by :func:`par`.  Users change values
+by ``dataclasses.replace`` or, with helpful errors, by :meth:`Parameters.change`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+from apu_casadi.core.checked import number
+from apu_casadi.core.errors import ParameterError, nearest
+
+
+def par(
+    default: float,
+    *,
+    unit: str,
+    source: str,
+    doc: str,
+    lo: float = -math.inf,
+    hi: float = math.inf,
+) -> Any:
+    """Declare a parameter: value, unit, origin, meaning and the closed range that makes sense."""
+    meta = {"unit": unit, "source": source, "doc": doc, "lo": lo, "hi": hi}
+    return dataclasses.field(default=default, metadata=meta)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Base of the parameter sets; checks every field made by :func:`par` on construction."""
+
+    def __post_init__(self) -> None:
+        """Raise :class:`ParameterError` for a value that is not a finite number in its range."""
+        for f in dataclasses.fields(self):
+            if "unit" not in f.metadata:
+                continue
+            value = getattr(self, f.name)
+            where = f"{type(self).__name__}.{f.name} [{f.metadata['unit']}]"
+            x = number(where, value, error=ParameterError)
+            if not isinstance(value, int | float):
+                value = x
+                object.__setattr__(self, f.name, value)
+            if not math.isfinite(value):
+                raise ParameterError(f"{where} must be finite, got {value!r}")
+            lo, hi = f.metadata["lo"], f.metadata["hi"]
+            if not lo <= value <= hi:
+                raise ParameterError(f"{where} = {value:g} is outside [{lo:g}, {hi:g}]")
+
+    def change(self, **values: Any) -> Self:
+        """Return a copy with some values changed.
+
+        Raises:
+            ParameterError: unknown name (the nearest valid one is named) or a value out of range.
+        """
+        names = [f.name for f in dataclasses.fields(self)]
+        for n in values:
+            if n not in names:
+                raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
+        return dataclasses.replace(self, **values)
+
+    def table(self) -> list[tuple[str, float, str, str, str]]:
+        """Return rows (name, value, unit, meaning, source), for printing and for file headers."""
+        return [
+            (f.name, getattr(self, f.name), f.metadata["unit"], f.metadata["doc"],
+             f.metadata["source"])
+            for f in dataclasses.fields(self)
+            if "unit" in f.metadata
+        ]  # fmt: skip

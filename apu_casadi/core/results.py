@@ -1,0 +1,355 @@
+"""Labelled results: datasets whose every variable has a unit and a meaning, kept as netCDF.
+
+A joint run has two time coordinates: ``time`` [s], the exchange grid of gas generator and machine,
+and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apu_casadi.core import files, netcdf3
+from apu_casadi.core.errors import DataError, SignalError, nearest
+from apu_casadi.core.filearrays import is_lazy
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apu_casadi.core.signals import Signal
+
+RPM = 30.0 / math.pi
+"""Revolutions per minute in one rad/s."""
+
+SUMMARY_WINDOW = 0.5
+"""Length [s] of the window at the end of a phase over which :func:`phase_summary` averages."""
+
+
+def _stations() -> dict[str, tuple[str, str]]:
+    places = {
+        "1": "ambient inlet",
+        "2": "compressor inlet",
+        "3": "compressor outlet",
+        "4": "combustor outlet",
+        "41": "turbine rotor inlet",
+        "5": "turbine outlet",
+        "8": "exhaust outlet",
+    }
+    table = {}
+    for n, place in places.items():
+        table[f"T{n}"] = ("K", f"{place} total temperature")
+        if n != "41":
+            table[f"P{n}"] = ("Pa", f"{place} total pressure")
+        if n != "1":
+            table[f"W{n}"] = ("kg/s", f"{place} mass flow")
+    table["P41"] = ("Pa", "turbine rotor inlet total pressure")
+    table["W31"] = ("kg/s", "combustor inlet mass flow")
+    table["Ps3"] = ("Pa", "compressor outlet static pressure")
+    return table
+
+
+CHANNELS: Mapping[str, tuple[str, str]] = {
+    "N": ("rad/s", "gas generator shaft speed"),
+    "PW": ("W", "shaft power delivered (PWSD)"),
+    "Wf": ("kg/s", "fuel flow"),
+    "SFC": ("kg/(W s)", "fuel flow over shaft and accessory power"),
+    "SNOx": ("1", "NOx severity index"),
+    "SM": ("1", "compressor surge (stability) margin"),
+    **_stations(),
+    "residual": ("1", "largest scaled residual of the gas path equations"),
+    "f_eta_c": ("1", "compressor efficiency factor"),
+    "f_W_c": ("1", "compressor flow capacity factor"),
+    "f_eta_t": ("1", "turbine efficiency factor"),
+    "f_W_t": ("1", "turbine flow capacity factor"),
+    "mu": ("1", "shorted fraction of the turns of a phase (0: healthy)"),
+    "k_rf": ("1", "fault resistance over that of the shorted turns (nan: healthy)"),
+    "kappa": ("1", "leakage partition of the shorted turns (nan: healthy)"),
+    "P_total": ("W", "mean mechanical power of both generators over one exchange (eq 8)"),
+    "P_e": ("W", "mean electrical output of one generator over one exchange"),
+    "P_loss_fault": ("W", "mean extra loss of the fault in one generator over one exchange"),
+    **{f"V_{p}_rms": ("V", f"phase {p} voltage, settled rms over one exchange") for p in "abc"},
+    **{f"I_{p}_rms": ("A", f"phase {p} current, settled rms over one exchange") for p in "abc"},
+    **{f"v_{p}": ("V", f"phase {p} terminal voltage") for p in "abc"},
+    **{f"i_{p}": ("A", f"phase {p} current") for p in "abc"},
+    "i_fault": ("A", "current of the fault branch"),
+    "V_fd": ("V", "field voltage"),
+    "i_fd": ("A", "field current"),
+    "T_e": ("N m", "electromagnetic torque of one generator"),
+    "P_inst": ("W", "instantaneous power of eq 8, both generators"),
+}
+"""Unit and meaning of every variable that a joint run may hold, by name."""
+
+_TIMES = {
+    "time": ("s", "time on the exchange grid"),
+    "time_w": ("s", "time of the waveform samples"),
+}
+
+
+def dataset(
+    times: Mapping[str, Any],
+    values: Mapping[str, Mapping[str, Any]],
+    *,
+    signals: Iterable[Signal] = (),
+    attrs: Mapping[str, str | int | float] | None = None,
+) -> xr.Dataset:
+    """Build a labelled dataset from arrays.
+
+    Args:
+        times: time coordinates [s] by name, each strictly increasing, shape (n,).
+        values: per time coordinate, arrays of shape (n,), also lazy ones of
+            :mod:`apu_casadi.core.filearrays`, or scalars by variable name.
+        signals: units and meanings; they come before those of :data:`CHANNELS`.
+        attrs: attributes of the dataset; text or numbers.
+
+    Returns:
+        xarray.Dataset with ``units`` and ``long_name`` on every variable and coordinate.
+
+    Raises:
+        SignalError: a name of unknown unit, a name on two time coordinates, a wrong shape, or a
+            time coordinate that is not increasing.
+
+    Examples:
+        >>> ds = dataset({"time": [0.0, 0.02]}, {"time": {"T4": [1273.0, 1272.0]}})
+        >>> ds["T4"].attrs["units"]
+        'K'
+    """
+    import xarray as xr
+
+    known = {**CHANNELS, **{s.name: (s.unit, s.doc) for s in signals}}
+    coords = {}
+    for dim, t in times.items():
+        t = np.asarray(t, dtype=float)
+        if t.ndim != 1 or t.size == 0 or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
+            raise SignalError(
+                f"{dim}: a strictly increasing, finite 1-D array is expected, shape {t.shape} given"
+            )
+        unit, doc = _TIMES.get(dim, ("s", dim))
+        coords[dim] = (dim, t, {"units": unit, "long_name": doc})
+    variables: dict[str, Any] = {}
+    for dim, group in values.items():
+        if dim not in coords:
+            raise SignalError(f"values on unknown coordinate {dim!r} {nearest(dim, coords)}")
+        n = coords[dim][1].size
+        for name, value in group.items():
+            if name not in known:
+                raise SignalError(f"unit of {name!r} unknown {nearest(name, known)}")
+            if name in variables:
+                raise SignalError(f"{name}: given on {variables[name][0]} and on {dim}")
+            a = value if is_lazy(value) else np.asarray(value, dtype=float)
+            if a.shape not in ((), (n,)):
+                raise SignalError(f"{name}: shape ({n},) as {dim} expected, got {a.shape}")
+            unit, doc = known[name]
+            a = np.full(n, float(a)) if a.ndim == 0 else a
+            variables[name] = (dim, a, {"units": unit, "long_name": doc})
+    return xr.Dataset(variables, coords=coords, attrs=dict(attrs or {}))
+
+
+def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
+    """Write a dataset as netCDF 3 and return the path; attributes survive.
+
+    The file is written under a temporary name beside ``path`` and renamed when it is complete: an
+    interrupted write never leaves a damaged file under the final name.  Long variables are written
+    in pieces of a few MiB.
+
+    Raises:
+        DataError: the file cannot be written there, or a variable has 4 GiB or more.
+    """
+    path = Path(path)
+    with files.whole(path) as target, target.open("wb") as f:
+        netcdf3.write(ds, f)
+    return path
+
+
+def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
+    """Read a dataset that :func:`save` wrote.
+
+    Args:
+        path: of the file.
+        lazy: read values when they are asked for, each time anew, so that a file larger than memory
+            can be looked at; the file stays open with the dataset.  Otherwise all are read now.
+
+    Raises:
+        DataError: the file is missing, is no netCDF 3 file, or is damaged.
+    """
+    path = Path(path)
+    start, size = files.beginning(path, 8)
+    if start[:3] != b"CDF":
+        raise DataError(f"{path}: not a netCDF 3 file (it begins with {start!r})")
+    try:
+        ds = netcdf3.open_lazily(path)
+        ds = ds if lazy else ds.load()
+    except Exception as e:  # a damaged file fails anywhere inside the reader, with any type
+        raise DataError(
+            f"{path}: damaged netCDF file of {size} bytes ({type(e).__name__}: {e}); "
+            "run the scenario again"
+        ) from e
+    # the number of records counts for nothing where no dimension can grow
+    if start[4:8] != bytes(4) and not ds.encoding.get("unlimited_dims"):
+        raise DataError(f"{path}: damaged netCDF file: its header tells of records that it lacks")
+    ds.encoding["source"] = str(path)
+    return ds
+
+
+def _source(ds: xr.Dataset) -> str:
+    """Return the file that a dataset was read from, as the beginning of a message."""
+    source = ds.encoding.get("source")
+    return f"{source}: " if source else ""
+
+
+def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the phases of a run as dictionaries with name, start [s] and end [s].
+
+    Without a ``phases`` attribute the whole run is one phase.
+
+    Raises:
+        DataError: no ``time`` coordinate, or an attribute that holds something else.
+    """
+    if "time" not in ds.coords or ds.sizes.get("time", 0) < 2:
+        raise DataError(
+            f"{_source(ds)}the dataset lacks a 'time' coordinate of at least two samples"
+        )
+    t = ds["time"].values
+    if (
+        t.ndim != 1
+        or t.dtype.kind not in "fiu"
+        or not (np.isfinite(t).all() and np.all(t[1:] > t[:-1]))
+    ):
+        raise DataError(f"{_source(ds)}'time' does not increase from sample to sample")
+    text = ds.attrs.get("phases")
+    if text is None:
+        return [{"name": "run", "start": float(t[0]), "end": float(t[-1])}]
+    try:
+        rows = json.loads(text)
+        rows = [
+            {"name": str(r["name"]), "start": float(r["start"]), "end": float(r["end"])}
+            for r in rows
+        ]
+    except (TypeError, ValueError, KeyError) as e:
+        raise DataError(
+            f"{_source(ds)}attribute 'phases' is not a list of name, start and end: {e!r}"
+        ) from e
+    if not rows:
+        raise DataError(f"{_source(ds)}attribute 'phases' is an empty list")
+    for r in rows:
+        if not r["end"] > r["start"]:
+            raise DataError(
+                f"{_source(ds)}phase {r['name']!r} ends at {r['end']:g} s, before it starts"
+            )
+    return rows
+
+
+def severity(mu: float, k_rf: float, kappa: float) -> dict[str, float | None]:
+    """Return mu, k_rf, kappa and h = mu/(k_rf + 1 - mu) together; None where there is no fault."""
+    if not mu > 0:
+        return {"mu": 0.0, "k_rf": None, "kappa": None, "h": 0.0}
+    return {"mu": mu, "k_rf": k_rf, "kappa": kappa, "h": mu / (k_rf + 1.0 - mu)}
+
+
+_MEANS = (
+    ("N_rpm", "N", RPM),
+    ("PW_kW", "PW", 1e-3),
+    ("Wf", "Wf", 1.0),
+    ("SFC", "SFC", 1.0),
+    ("T3", "T3", 1.0),
+    ("P3_kPa", "P3", 1e-3),
+    ("T4", "T4", 1.0),
+    ("T5", "T5", 1.0),
+    ("SM_percent", "SM", 100.0),
+    *((f"V_{p}_rms", f"V_{p}_rms", 1.0) for p in "abc"),
+    *((f"I_{p}_rms", f"I_{p}_rms", 1.0) for p in "abc"),
+    ("P_e", "P_e", 1.0),
+    ("P_loss_fault", "P_loss_fault", 1.0),
+)
+_HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
+_HEALTHY_NAN = ("k_rf", "kappa")
+
+
+class _Columns:
+    """Values of a dataset by name; those in a file are read anew each time, not all are held."""
+
+    def __init__(self, ds: xr.Dataset) -> None:
+        self.ds = ds
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        v = self.ds[name]
+        if v.dims != ("time",) or v.dtype.kind not in "fiu":
+            where = ", ".join(map(str, v.dims)) or "no dimension"
+            raise DataError(
+                f"{_source(self.ds)}{name}: numbers on time are expected, "
+                f"{v.dtype} on {where} found"
+            )
+        values: np.ndarray = v.values
+        if name not in _HEALTHY_NAN and not np.isfinite(values).all():
+            k = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise DataError(
+                f"{_source(self.ds)}{name} = {values[k]:g} at t = {self.ds['time'].values[k]:g} s "
+                "is no finite number"
+            )
+        return values
+
+
+def _holding(ds: xr.Dataset, attribute: str, key: str, end: float) -> str | None:
+    """Return what the run's attribute says of the time just before ``end`` [s]."""
+    try:
+        rows = json.loads(ds.attrs[attribute])
+        held = [r for r in rows if float(r["t"]) < end - 1e-9]
+        return None if held[-1][key] is None else str(held[-1][key])
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+
+
+def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
+    """Summarise a joint run phase by phase.
+
+    Each row holds name, start, end [s] and window [s]; the means over the last 0.5 s of the phase
+    (over all of a shorter one) of N_rpm, PW_kW, Wf [kg/s], SFC [kg/(W s)], T3, T4, T5 [K], P3_kPa,
+    SM_percent, V_a_rms ... [V], I_a_rms ... [A], and P_e and P_loss_fault [W] of one generator; the
+    extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
+    its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
+    (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
+    and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
+
+    Raises:
+        DataError: a variable is missing, is not finite or no number, or a phase holds no sample.
+    """
+    needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
+    missing = [v for v in needed if v not in ds]
+    if missing:
+        raise DataError(f"{_source(ds)}the dataset lacks {', '.join(missing)}")
+    spans = phases(ds)
+    t = ds["time"].values
+    tol = 1e-9
+    col = _Columns(ds)
+    rows = []
+    for k, p in enumerate(spans):
+        # a sample is the end of a step: the one at a boundary belongs to the earlier phase
+        before_end = t <= p["end"] + tol
+        whole = ((t > p["start"] + tol) | ((k == 0) & (t >= p["start"] - tol))) & before_end
+        window = min(SUMMARY_WINDOW, p["end"] - p["start"])
+        tail = (t > p["end"] - window + tol) & before_end
+        if not tail.any():
+            raise DataError(
+                f"{_source(ds)}phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no "
+                f"sample; time runs from {t[0]:g} to {t[-1]:g} s"
+            )
+        row: dict[str, Any] = {**p, "window": window}
+        for key, v, scale in _MEANS:
+            row[key] = float(np.mean(col[v][tail]) * scale)
+        inside = {v: col[v][whole] for v in ("N", "T4", "SM")}
+        row["N_rpm_min"] = float(inside["N"].min() * RPM)
+        row["N_rpm_max"] = float(inside["N"].max() * RPM)
+        row["T4_max"] = float(inside["T4"].max())
+        row["SM_percent_min"] = float(inside["SM"].min() * 100.0)
+        end = int(np.flatnonzero(tail)[-1])
+        row.update({v: float(col[v][end]) for v in _HEALTH})
+        row.update(severity(*(float(col[v][end]) for v in ("mu", "k_rf", "kappa"))))
+        row["fault_phase"] = _holding(ds, "faults", "phase", p["end"]) if row["mu"] else None
+        row["load"] = _holding(ds, "loads", "load", p["end"])
+        rows.append(row)
+    return rows

@@ -1,0 +1,1 @@
+"""The gas generator: gas, components, maps, cycle, steady points."""

@@ -1,0 +1,1 @@
+"""Steady points of the gas generator: any two quantities fixed, one at a time or many."""

@@ -1,0 +1,1 @@
+"""Electrical loads, one module each."""

@@ -1,0 +1,540 @@
+"""Exchange steps of which only means are wanted: exact propagation with few samples.
+
+Waveforms need a sample every 50 us; rms values, powers and phasors do not, if the quadrature
+knows what ripples.
+
+* Constant coefficients (healthy, balanced): in the rotor's frame nothing ripples.  A phase
+  quantity is c0 + c1 cos theta + s1 sin theta + c2 cos 2 theta + s2 sin 2 theta with smooth
+  coefficients, sampled at a few instants that lie denser at the start of the step, where the
+  speed has just changed.  Polynomials through them times the harmonics are integrated in closed
+  form (Filon's method).
+* Periodic coefficients (fault, unbalanced load): the samples are a fixed *angle* apart, so that
+  after half a turn the same few transition matrices come again (:class:`Parity`).  The step ends
+  between two samples; state and means there come from polynomials through the ten around it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.means import Term, window
+from apu_casadi.core.sharing import Rebuilt, kept
+from apu_casadi.core.statespace import StateSpace
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.propagation import (
+    SPEED_RANGE,
+    applicable,
+    cached_table,
+    end_weights,
+    exciter_step,
+    leap,
+    linear_states,
+    parity,
+    symmetry,
+    through,
+)
+
+#: Panels of a step with constant coefficients: number of panels and share of the step of each.
+#: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
+PANELS = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
+STRIDES = 28  # strides in a turn, where coefficients are periodic: 14 in a period of what ripples
+PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
+HARMONICS = (12, 20, 30)  # of the rotor angle that a function takes; the first that fits
+#: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
+#: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
+DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
+END_TOL = 1e-5  # nominal units: doubt about the state at the end, whose error is much smaller
+_AROUND = 10  # samples around the end of the step that its polynomial goes through
+_PHASES = 5  # rotor angles that tell the harmonics 0, 1, 2 apart
+
+
+# ------------------------------------------------------------------------------ constant
+
+
+def _filon(w: Any, h: float, k: int) -> tuple[list[Any], list[Any]]:
+    """Weights of the integrals of f cos(k w t) and f sin(k w t) over a panel around t = 0.
+
+    f is the polynomial through its values at t = -2 h, -h, 0, h, 2 h.  With moments
+    M_p = int x^p exp(j l x) dx over [-2, 2], l = k w h: by parts,
+    M_p = [x^p exp(j l x) / (j l)] - p / (j l) M_(p-1).
+    """
+    x = np.arange(-2.0, 3.0)
+    lagrange = np.linalg.inv(np.vander(x, increasing=True))  # column i: powers of polynomial i
+    a = 2.0
+    even, odd = [], []  # real parts of M_0, M_2, M_4; imaginary parts of M_1, M_3
+    if k == 0:
+        even, odd = [2 * a ** (p + 1) / (p + 1) for p in (0, 2, 4)], [0.0, 0.0]
+    else:
+        l = k * w * h
+        sin, cos = ca.sin(a * l), ca.cos(a * l)
+        for p in range(5):
+            if p % 2 == 0:
+                even.append((2 * a**p * sin - p * (odd[-1] if p else 0.0)) / l)
+            else:
+                odd.append((-2 * a**p * cos + p * even[-1]) / l)
+    c = [h * sum(lagrange[2 * p, i] * even[p] for p in range(3)) for i in range(5)]
+    s = [h * sum(lagrange[2 * p + 1, i] * odd[p] for p in range(2)) for i in range(5)]
+    return c, s
+
+
+def _constant_weights(dt: Any, w: Any, theta0: Any, highest: int) -> Any:
+    """Weights of c0, c1, s1, ... in the mean over a step, the start included.
+
+    Shape (2 highest + 1, samples).
+    """
+    intervals = [n * 4 for n, _ in PANELS]
+    weights = [[ca.SX(0)] * (1 + sum(intervals)) for _ in range(2 * highest + 1)]
+    t, first = 0.0, 0
+    for number, share in PANELS:
+        h = share / 4
+        local = [_filon(w * dt, h, k) for k in range(highest + 1)]
+        for _ in range(number):
+            middle = theta0 + w * dt * (t + 2 * h)
+            for k in range(highest + 1):
+                c, s = ca.cos(k * middle), ca.sin(k * middle)
+                for i, (a, b) in enumerate(zip(*local[k], strict=True)):
+                    # exp(j k (middle + w t)): real part with c_k, imaginary part with s_k
+                    row = weights[max(0, 2 * k - 1)]
+                    row[first + i] += c * a - s * b
+                    if k:
+                        row = weights[2 * k]
+                        row[first + i] += s * a + c * b
+            t, first = t + share, first + 4
+    return ca.vertcat(*(ca.horzcat(*row) for row in weights))
+
+
+def _shares() -> np.ndarray:
+    """Share of the step that has passed at each sample of a step with constant coefficients."""
+    ends = np.cumsum([0.0, *(share for n, share in PANELS for _ in range(n))])
+    inside = ends[:-1, None] + np.diff(ends)[:, None] * np.arange(1, 5) / 4
+    return np.append(0.0, inside.ravel())
+
+
+def _shifted(weights: Any, term: Term, highest: int) -> list[Any]:
+    """Weights of c0, c1, s1, ... in the mean of a term's value times its harmonic.
+
+    By the addition theorems, from those of all harmonics; ``highest`` is that of the value itself.
+    """
+    m = term.k
+
+    def C(k: int) -> Any:
+        return weights[max(0, 2 * abs(k) - 1)]
+
+    def S(k: int) -> Any:
+        return (1 if k > 0 else -1) * weights[2 * abs(k)] if k else ca.SX(0)
+
+    if not term.trig:
+        return [weights[i] for i in range(2 * highest + 1)]
+    out = []
+    for k in range(highest + 1):
+        cos = C(k - m) + C(k + m) if term.trig == "cos" else S(m + k) + S(m - k)
+        sin = S(k + m) + S(k - m) if term.trig == "cos" else C(k - m) - C(k + m)
+        out += [cos / 2, sin / 2] if k else [cos / 2]
+    return out
+
+
+def _harmonics(
+    ss: StateSpace, at_sample: tuple[Any, Any, Any], quad: Sequence[str], weights: Any, share: Any
+) -> Any:
+    """What each mean of ``quad`` gets from one sample (x, u, theta); shape (means,)."""
+    x, u, th = at_sample
+    asked = [Term.of(q) for q in quad]
+    own = list(dict.fromkeys((q.base, q.power) for q in asked))
+    y = ss.g(x, u, th)
+    values = ca.vertcat(*(Term(b, n, "", 0, False).value(ss, y) for b, n in own))
+    parts = _parts(ss, x, u, th, ca.Function("terms", [x, u, th], [values]))
+    light = weights * window(share)
+    total = []
+    for q in asked:
+        own_parts = parts[own.index((q.base, q.power))]
+        factors = _shifted(light if q.weighted else weights, q, len(own_parts) // 2)
+        total.append(sum(f * p for f, p in zip(factors, own_parts, strict=True)))
+    return ca.vertcat(*total)
+
+
+def _parts(ss: StateSpace, x: Any, u: Any, th: Any, terms: ca.Function) -> list[list[Any]]:
+    """Coefficients c0, c1, s1, c2, s2 of each term, at one sample; c0 alone where that is all."""
+    at = ss.x.index("theta_e")
+    phi = 2 * math.pi * np.arange(_PHASES) / _PHASES
+    values = []
+    for angle in phi:
+        x_phi = ca.SX(x)
+        x_phi[at] = float(angle)
+        values.append(ca.vertsplit(terms(x_phi, u, th)))
+    # what does not depend on the angle needs no more than its first value
+    draws = np.random.default_rng(0)
+    xd, ud = ss.x.nominals * draws.normal(size=len(ss.x)), np.abs(draws.normal(size=len(ss.u)))
+    seen = []
+    for angle in phi:
+        xd[at] = angle
+        seen.append(np.asarray(terms(xd, ud, np.ones(len(ss.theta)))).ravel())
+    plain = np.ptp(seen, axis=0) <= 1e-9 * np.abs(seen).max(axis=0)
+    found = []
+    for i, flat in enumerate(plain):
+        if flat:
+            found.append([values[0][i]])
+            continue
+        f = [v[i] for v in values]
+        parts = [sum(f) / _PHASES]
+        for k in (1, 2):
+            for trig in (np.cos, np.sin):
+                parts.append(sum(2 / _PHASES * float(trig(k * p)) * v
+                                 for p, v in zip(phi, f, strict=True)))  # fmt: skip
+        found.append(parts)
+    return found
+
+
+def _constant_step(gen: Generator, ss: StateSpace, quad: tuple[str, ...]) -> ca.Function:
+    nx, nu, n_P = len(ss.x), len(ss.u), parity(ss, 1).even.size
+    X0, U, dt = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("dt")
+    series = ca.MX.sym("series", len(PANELS) * 4 * n_P)
+    ranges = ca.MX.sym("range", 4)  # of the speed; and where the step lies in a longer one
+    w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
+    s = (w - ranges[0]) / ranges[1]
+    powers = ca.vertcat(1, s, s**2, s**3)
+    step, V_of = leap(gen, ss, 1, True)
+    x, V, P, u = (ca.SX.sym(k, n) for k, n in zip("xVPu", (nx, 3, n_P, nu), strict=True))
+    h = ca.SX.sym("h")
+    xk, Vk, states = x, V, []
+    for _ in range(4):
+        xk, Vk = step(xk, Vk, P, u, ca.SX(0, 1), h)
+        states.append(xk)
+    panel = ca.Function("panel", [x, V, P, u, h], [ca.horzcat(*states), Vk], {"cse": True})
+    x_k, V_k = X0, ca.vertcat(*V_of(X0, U, ca.DM(0, 1)), 0)
+    samples = [X0]
+    for k, (number, share) in enumerate(PANELS):
+        P_k = ca.mtimes(ca.reshape(series[k * 4 * n_P : (k + 1) * 4 * n_P], n_P, 4), powers)
+        for _ in range(number):
+            four, V_k = panel(x_k, V_k, P_k, U, dt * share / 4)
+            x_k = four[:, 3]
+            samples.append(four)
+    X = ca.horzcat(*samples)
+    w_, d_, t_ = ca.SX.sym("w"), ca.SX.sym("dt"), ca.SX.sym("theta0")
+    highest = 2 + max((Term.of(q).k for q in quad), default=0)  # a square has two
+    rows = _constant_weights(d_, w_, t_, highest)
+    weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
+    W, share = ca.SX.sym("W", 2 * highest + 1), ca.SX.sym("share")
+    means = ca.Function(
+        "harmonics", [x, W, share, u], [_harmonics(ss, (x, u, ca.SX(0, 1)), quad, W, share)],
+        {"cse": True},
+    )  # fmt: skip
+    shares = ranges[2] + ranges[3] * ca.DM(_shares()).T
+    each = means.map("each", "serial", X.shape[1], [3], [])(X, weights(dt, w, X0[at]), shares, U)
+    return ca.Function(
+        f"means_{ss.name}",
+        [X0, ca.vertcat(series, ranges), U, dt],
+        [x_k, ca.sum2(each), V_k[2]],
+        ["x0", "series", "u", "dt"],
+        ["x", "mean", "miss"],
+    )
+
+
+# ------------------------------------------------------------------------------ periodic
+
+
+def _powers(polynomials: np.ndarray, s: Any) -> list[Any]:
+    """Values at s, by Horner's rule."""
+    values = []
+    for row in polynomials:
+        v: Any = float(row[-1])
+        for c in row[-2::-1]:
+            v = v * s + float(c)
+        values.append(v)
+    return values
+
+
+def _matrices(pairs: int, angles: int, *, odd: bool) -> ca.Function:
+    """Function (coefficients of an entry, relative speed, first angle) -> it at some angles.
+
+    One entry of a :class:`Table`: shape (2 pairs, 4) -> (angles,); the angles are a stride apart.
+    """
+    c, s, a = ca.SX.sym("c", 2 * pairs, 4), ca.SX.sym("s"), ca.SX.sym("trig", 2 * pairs, angles)
+    now = ((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0]
+    return ca.Function(f"entry_{odd}", [ca.vec(c), s, ca.vec(a)], [ca.mtimes(a.T, now)])
+
+
+def _trig(pairs: int, angles: int, *, odd: bool) -> ca.Function:
+    """Function (first angle) -> cos k theta, sin k theta in turn, k = 0, 2, ... or 1, 3, ..."""
+    first, columns = ca.SX.sym("theta"), []
+    for k in range(angles):
+        theta = first + 2 * math.pi / STRIDES * k
+        cos, sin = ca.cos(theta), ca.sin(theta)
+        cos2, sin2 = cos * cos - sin * sin, 2 * cos * sin
+        p, q = (cos, sin) if odd else (ca.SX(1), ca.SX(0))
+        for _ in range(pairs):
+            columns += [p, q]
+            p, q = p * cos2 - q * sin2, q * cos2 + p * sin2
+    return ca.Function("trig", [first], [ca.vertcat(*columns)], {"cse": True})
+
+
+class _Turn(NamedTuple):
+    """Half turns in a step, and the samples between which it may end."""
+
+    halves: int
+    first: int
+
+    @property
+    def samples(self) -> int:
+        return 1 + self.halves * STRIDES // 2
+
+
+def _turn(dt: float, w_rated: float) -> _Turn:
+    """How many strides are needed for the fastest speed, and where the slowest ends.
+
+    Half of the samples that its polynomial goes through lie beyond the end.
+    """
+    strides = dt * w_rated * STRIDES / (2 * math.pi)
+    halves = math.ceil(((1 + SPEED_RANGE) * strides + _AROUND // 2) / (STRIDES // 2))
+    return _Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND)
+
+
+def _end_weights(turn: _Turn) -> ca.Function:
+    """Function (length in strides) -> weights of the samples, shape (5, samples).
+
+    Rows: the mean, relative to a stride; the polynomial at the end of the step, through the
+    ``_AROUND`` samples around it; one through two fewer; the polynomial in the middle of the
+    exciter's last, shorter step; and what picks the sample where that step starts.
+    """
+    r = ca.SX.sym("r")
+    n = turn.samples
+    J = ca.floor(r)
+    s = r - J
+    near = _AROUND // 2
+    poly = through(1 - near, _AROUND)
+    k = np.arange(_AROUND)
+    integrals = np.hstack([np.zeros((_AROUND, 1)), poly / (k + 1)])
+    whole = integrals.sum(axis=1)  # of one interval between the middle two samples
+    # the intervals before J give to a sample near it what lies on its right
+    tail = [whole[i + 1 :].sum() for i in range(_AROUND)]
+    last = [t + v for t, v in zip(tail, _powers(integrals, s), strict=True)]
+    start = end_weights(_AROUND)
+    mean = [ca.SX(float(start[j])) if j < _AROUND else ca.SX(1) for j in range(n)]
+    full, fewer, middle, pick = ([ca.SX(0)] * n for _ in range(4))
+    at_full = _powers(poly, s)
+    at_fewer = _powers(through(2 - near, _AROUND - 2), s)
+    from_ = PACE * ca.floor(r / PACE)
+    r_middle = (from_ + r) / 2
+    at_middle = _powers(poly, r_middle - ca.floor(r_middle))
+    for j in range(turn.first, n):
+        here = [ca.eq(J, j - 1 + near - i) for i in range(_AROUND)]
+        mean[j] = ca.le(j, J - near) + sum(a * b for a, b in zip(here, last, strict=True))
+        full[j] = sum(a * b for a, b in zip(here, at_full, strict=True))
+        fewer[j] = sum(a * b for a, b in zip(here[1:-1], at_fewer, strict=True))
+        there = [ca.eq(ca.floor(r_middle), j - 1 + near - i) for i in range(_AROUND)]
+        middle[j] = sum(a * b for a, b in zip(there, at_middle, strict=True))
+        pick[j] = ca.eq(from_, j) if j % PACE == 0 else ca.SX(0)
+    rows = [ca.horzcat(*row) for row in (mean, full, fewer, middle, pick)]
+    return ca.Function("end_weights", [r], [ca.densify(ca.vertcat(*rows))], {"cse": True})
+
+
+def _periodic_step(
+    gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float, harmonics: int
+) -> ca.Function:
+    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
+    turn, kinds = _turn(dt, gen.machine.w_rated), parity(ss, 1)
+    n_even, n_odd = kinds.even.size, kinds.odd.size
+    pairs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
+    sizes = 4 * 2 * pairs[0] * n_even, 4 * 2 * pairs[1] * n_odd
+    X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
+    parameters, DT = ca.MX.sym("series", sum(sizes) + 4), ca.MX.sym("dt")
+    w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
+    s = (w - parameters[-4]) / parameters[-3]
+    theta0, stride = X0[at], 2 * math.pi / STRIDES
+    # transition matrices of the strides in half a turn, the same for every half turn
+    half_turn = STRIDES // 2
+    P = []
+    for i, (first, rows) in enumerate(((0, n_even), (sizes[0], n_odd))):
+        series = ca.reshape(parameters[first : first + sizes[i]], -1, rows)
+        entry = _matrices(pairs[i], half_turn, odd=bool(i)).map("all", "serial", rows, [1, 2], [])
+        trig = _trig(pairs[i], half_turn, odd=bool(i))(theta0)
+        P.append(entry(series, s, trig).T)
+    # half a turn; then the phases are reversed instead of the angle going on
+    step, V_of = leap(gen, ss, PACE, False, chained=True)
+    x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
+    Pe, Po = ca.SX.sym("P", n_even, half_turn), ca.SX.sym("Q", n_odd, half_turn)
+    h = ca.SX.sym("h")
+    xk, Vk, states = x, V, []
+    for k in range(0, half_turn, PACE):
+        these = [ca.vec(p[:, k : k + PACE]) for p in (Pe, Po)]
+        X, Vk = step(xk, Vk, ca.vertcat(*these), u, th, h)
+        xk = X[:, -1]
+        states.append(X)
+    sign = np.ones((nx, 1))
+    sign[ss.x.indices(linear_states(ss)), 0] = kinds.sign[: len(linear_states(ss))]
+    xk = xk * sign
+    xk[at] = x[at]
+    half = ca.Function(
+        "half", [x, V, Pe, Po, u, th, h], [xk, Vk, ca.horzcat(*states)], {"cse": True}
+    )
+    h_now = stride / w
+    x_k, V_k, samples = X0, ca.vertcat(V_of(X0, U, TH)[0], 0, 0), [X0]
+    for _ in range(turn.halves):
+        x_k, V_k, X = half(x_k, V_k, *P, U, TH, h_now)
+        samples.append(X)
+    X = ca.horzcat(*samples)
+    length = DT / h_now
+    weights = _end_weights(turn)(length)
+    held, HELD = ([u, th], [U, TH]) if nt else ([u], [U])
+    outputs, share = ss.g(x, u, th), ca.SX.sym("share")
+    terms = [Term.of(q).expression(ss, x, outputs, share) for q in quad]
+    terms.append(outputs[ss.y.index("V_t")])
+    y = ca.Function("y", [x, share, *held], [ca.vertcat(*terms)], {"cse": True})
+    # beyond the end of the step the weight goes on as the polynomial that it is
+    shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
+    Y = y.map("ys", "serial", turn.samples, list(range(2, 2 + len(held))), [])(X, shares, *HELD)
+    mean = ca.mtimes(Y[:-1, :], weights[0, :].T) / length
+    # the end of the step, with the phases as they are after so many half turns
+    tail = np.arange(turn.first, turn.samples)
+    turned = np.maximum(0, (tail - 1) // (STRIDES // 2)) % 2 == 1
+    reversed_ = np.where(turned, sign, 1.0)
+    X_tail = X[:, turn.first :] * reversed_
+    ends = ca.mtimes(X_tail, weights[1:, turn.first :].T)
+    linear = np.zeros((nx, 1))
+    linear[ss.x.indices(linear_states(ss)), 0] = 1
+    # the exciter's last step is as long as it must be
+    V_tail = Y[-1, turn.first :]
+    V_end, V_middle, V_start = (
+        ca.mtimes(V_tail, weights[k, turn.first :].T) for k in (1, 3, 4)
+    )  # fmt: skip
+    rest = DT - h_now * PACE * ca.floor(length / PACE)
+    _, exciter = exciter_step(gen, ss)
+    slow = [i for i in range(nx) if i != at and not linear[i, 0]]
+    x_end = ca.MX(ends[:, 0])
+    x_end[slow] = exciter(
+        ends[:, 3][slow], ca.vertcat(V_start, V_middle, V_end), U[ss.u.index("V_ref")], rest
+    )
+    x_end[at] = theta0 + w * DT
+    doubt = ca.mmax(ca.fabs(ends[:, 0] - ends[:, 1]) * linear / ss.x.nominals)
+    return ca.Function(
+        f"means_{ss.name}",
+        [X0, parameters, U, *([TH] if nt else []), DT],
+        [x_end, mean, ca.vertcat(V_k[2], doubt)],
+        ["x0", "series", "u", *(["theta"] if nt else []), "dt"],
+        ["x", "mean", "miss"],
+    )
+
+
+# ------------------------------------------------------------------------------ both
+
+
+@kept
+def _function(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float,
+              harmonics: int) -> ca.Function:  # fmt: skip
+    """Function (x0, series, u[, theta], dt) -> (x, mean, miss); ``dt`` only bounds the samples."""
+    if harmonics == 0:
+        return _constant_step(gen, ss, quad)
+    return _periodic_step(gen, ss, quad, dt, harmonics)
+
+
+@kept
+def _caller(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float, harmonics: int,
+            _in_use: str) -> Caller:  # fmt: skip
+    """The same in the backend in use, one for each layout."""
+    return Caller(compiled(_function(gen, ss, quad, dt, harmonics), level=3))
+
+
+class MeanStep(Rebuilt):
+    """Exchange steps without waveforms of one model variant with one load and fault.
+
+    Args:
+        gen, ss: generator and its model variant (:meth:`Generator.variant`).
+        u, theta: inputs and fault parameters; only w_r and V_ref may change afterwards.
+        dt: length of every step, s.
+        quad: what is averaged over the step, see :mod:`apu_casadi.core.means`.
+        within: where this step begins in a longer one, and which share of it it is; for weights.
+
+    Raises:
+        SimulationError: the model is not linear in its windings, a series does not converge or has
+            more than ``HARMONICS``, or the step is so short that samples cannot be spared.
+    """
+
+    outputs: tuple[str, ...] = ()
+    n_out = 0
+
+    def __init__(
+        self,
+        gen: Generator,
+        ss: StateSpace,
+        u: np.ndarray,
+        theta: np.ndarray,
+        *,
+        dt: float,
+        quad: Sequence[str],
+        within: tuple[float, float] = (0.0, 1.0),
+    ) -> None:
+        """Compute or fetch the tables, build or fetch the function."""
+        if not applicable(ss):
+            raise SimulationError(f"{ss.name}: a constant-power load is not linear")
+        self.ss, self.dt, self.quad = ss, dt, tuple(quad)
+        self.theta = np.array(theta, dtype=float)
+        w_rated = gen.machine.w_rated
+        if dt * w_rated < 4 * math.pi:
+            raise SimulationError(f"{ss.name}: a step of {dt:g} s has less than two turns")
+        self.constant = symmetry(ss, u, self.theta, w_rated)
+        if self.constant:
+            tables = [
+                cached_table(ss, u, self.theta, w_rated, h=dt * share / 4) for _, share in PANELS
+            ]
+            series, harmonics = [t.even.ravel() for t in tables], 0
+        else:
+            angle = 2 * math.pi / STRIDES
+            tables = [cached_table(ss, u, self.theta, w_rated, angle=angle)]
+            harmonics = next((k for k in HARMONICS if k >= tables[0].harmonics), 0)
+            if not harmonics:
+                raise SimulationError(
+                    f"{ss.name}: {tables[0].harmonics} harmonics of the rotor angle, "
+                    f"{HARMONICS[-1]} fit"
+                )
+            full = [(tables[0].even, harmonics + 2), (tables[0].odd, harmonics)]
+            series = [_filled(part, terms) for part, terms in full]
+        self._range = tables[0].centre, tables[0].half
+        self.parameters = np.concatenate([*series, self._range, within])
+        shape = 0.0 if self.constant else dt  # the panels are shares of the step
+        self.layout = (gen, ss, self.quad, shape, harmonics)
+        self.advance = _function(*self.layout)
+        drive = DRIVE_TOL["constant" if self.constant else "periodic"]
+        self.limits = np.array([drive] if self.constant else [drive, END_TOL])
+        self._iw = ss.u.index("w_r")
+        self._compiled: Caller | None = None
+
+    def valid(self, w_r: float) -> bool:
+        """Whether the speed, rad/s electrical, lies in the range of the tables."""
+        return abs(w_r - self._range[0]) <= self._range[1]
+
+    def __call__(
+        self, x0: np.ndarray, u: np.ndarray, *, t0: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Advance one step; return the state at its end and the means.
+
+        Raises:
+            SimulationError: the exciter moves too fast, the samples do not resolve the windings, a
+                result is not finite, or the speed is outside the table.
+        """
+        w = float(u[self._iw])
+        if not self.valid(w):
+            raise SimulationError(f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table")
+        call = self._compiled
+        if call is None:
+            call = self._compiled = _caller(*self.layout, backend_in_use())
+        held = [self.theta] if self.theta.size else []
+        x, mean, miss = call(x0, self.parameters, u, *held, self.dt)
+        if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):
+            raise SimulationError(
+                f"{self.ss.name}: step from {t0:.6g} s: errors of E_fd and of the state at the end "
+                f"{miss.tolist()} > {self.limits.tolist()}, or values that are not finite"
+            )
+        return x, mean
+
+
+def _filled(part: np.ndarray, terms: int) -> np.ndarray:
+    """Series of a table with zeros up to ``terms``; terms, then powers, then entries."""
+    full = np.zeros((part.shape[2], part.shape[0], terms))
+    full[:, :, : part.shape[1]] = part.transpose(2, 0, 1)
+    return full.ravel()

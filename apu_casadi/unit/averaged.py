@@ -1,0 +1,266 @@
+"""The averaged models: what generator and unit do from one electrical period to the next.
+
+Under a balanced load nothing in the rotor's frame depends on the rotor angle, so the healthy
+machine is the same model with the angle left out.  A turn-to-turn short circuit brings the angle
+back: on the rotor's axes the shunt that it is seen as from outside (see
+:mod:`apu_casadi.machine.faults.ttsc`) has a constant part and one that turns at twice the
+electrical frequency, 800 Hz, and it drives the zero sequence at 400 Hz.  Here the generator's own
+equations are averaged over one turn of the angle with the state held, which keeps the constant
+part.
+
+To first order in the severity h this is not an approximation: about a healthy steady state the
+response to the two alternating parts alternates as well, and its mean over a period is zero.
+So derivatives by h at h = 0 are exact for period means.  At finite h the mean of the alternating
+part's square, of order h^2, is missing: simulate the generator itself then.
+
+Beside it is the unit: gas generator, averaged generators and governor coupled by (1)-(3) at every
+instant, for linearisation and for control design.  Between the 20 ms exchanges of
+:mod:`apu_casadi.unit.multirate` and the full model of :mod:`apu_casadi.unit.monolithic` it is a
+third, which has no 400 Hz in it: it alone has a constant steady state, and so eigenvalues, with
+load and machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.errors import SignalError
+from apu_casadi.core.sharing import kept
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.statespace import StateSpace
+from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.machine.generator import Generator, GeneratorPoint
+from apu_casadi.machine.park import Abc, abc_to_qd0
+from apu_casadi.unit.apu import Apu, JointPoint
+from apu_casadi.unit.control import governor
+
+# The angle enters f and g, and their derivatives by h at h = 0, through its first and second
+# harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.
+_ANGLES = 6
+
+_SEVERITY = Signals(
+    [
+        Signal(
+            "h", "1", "severity mu/(k_rf + 1 - mu) of a TTSC of one phase with kappa = mu",
+            default=0.0, nominal=0.01,
+        )
+    ]
+)  # fmt: skip
+
+_KEPT = (
+    "V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"
+)  # fmt: skip
+_AXES = Signals(
+    [
+        Signal("v_q", "V", "terminal voltage, q axis", nominal=300.0),
+        Signal("v_d", "V", "terminal voltage, d axis", nominal=300.0),
+        Signal("i_q", "A", "terminal current, q axis", nominal=300.0),
+        Signal("i_d", "A", "terminal current, d axis", nominal=300.0),
+        Signal("I_t", "A", "terminal current: rms of the space vector", nominal=300.0),
+    ]
+)
+
+
+def has_severity(gen: Generator, load_kind: str) -> bool:
+    """Tell whether the averaged model has the parameter h.
+
+    It has where the current of a fault with kappa = mu follows its voltage at once: grounded
+    neutral, no inductance in the load.  Elsewhere that current is a state of its own, whose time
+    constant vanishes with h, and there is no derivative by h at h = 0 at the instant of a step.
+    """
+    return gen.neutral == "grounded" and load_kind != "inductive"
+
+
+def _balanced_inputs(ss: StateSpace) -> Signals:
+    """Inputs of the averaged model: one value for all three phases."""
+    kept = [ss.u[n] for n in ("w_r", "V_ref", "P_load", "tau_load") if n in ss.u]
+    if "R_a" in ss.u:
+        kept.append(Signal("R", "ohm", "load resistance of each phase"))
+    if "L_a" in ss.u:
+        kept.append(Signal("L", "H", "load inductance of each phase", nominal=1e-4))
+    return Signals(kept)
+
+
+@kept
+def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpace:
+    """Return one generator, averaged over an electrical period, under a balanced load.
+
+    States are the generator's without the rotor angle; inputs w_r, V_ref and the load's R (and L),
+    or P_load and tau_load; theta is the severity h where :func:`has_severity`, else empty; outputs
+    are field, magnitudes, power, torque and the voltages and currents on the rotor's axes.
+
+    Args:
+        gen: the generator.
+        load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"``.
+    """
+    faulty = has_severity(gen, load_kind)
+    full = gen.state_space(load_kind, "coupled" if faulty else None)
+    X = Signals([s for s in full.x if s.name != "theta_e"])
+    U, TH = _balanced_inputs(full), _SEVERITY if faulty else Signals()
+    Y = Signals([*(full.y[n] for n in _KEPT), *_AXES])
+    (xv, x), (uv, u), (tv, th) = X.sx(), U.sx(), TH.sx()
+
+    inputs = dict.fromkeys(full.u.names, ca.SX(0))
+    inputs |= {n: u[n] for n in U.names if n in full.u}
+    inputs |= {f"{n}_{k}": u[n] for n in ("R", "L") if n in u for k in "abc"}
+    u_full = full.u.stack(inputs)
+    fault = ca.SX(0, 1)
+    if faulty:  # with k_rf = 0, h = mu/(1 - mu); only h matters if kappa = mu
+        values = {"mu": th["h"] / (1 + th["h"]), "k_rf": ca.SX(0), "phase_angle": ca.SX(0)}
+        fault = full.theta.stack(values)
+    angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES if faulty else np.zeros(1)
+    rate: Any = 0
+    mean: dict[str, Any] = dict.fromkeys((*_KEPT, "v_q", "v_d", "i_q", "i_d"), ca.SX(0))
+    for angle in angles:
+        x_full = full.x.stack({**x, "theta_e": ca.SX(float(angle))})
+        rate += full.f(x_full, u_full, fault) / angles.size
+        y = full.y.unpack(full.g(x_full, u_full, fault))
+        for a in "vi":
+            on_axes = abc_to_qd0(float(angle), Abc(*(y[f"{a}_{k}"] for k in "abc")))
+            y |= {f"{a}_q": on_axes.q, f"{a}_d": on_axes.d}
+        for n in mean:
+            mean[n] += y[n] / angles.size
+    tiny = 1e-6  # A; keeps the square root smooth for an open generator
+    mean["I_t"] = ca.sqrt((mean["i_q"] ** 2 + mean["i_d"] ** 2 + tiny**2) / 2)
+    rates = full.x.unpack(rate)
+    f, g = X.stack({n: rates[n] for n in X.names}), Y.stack(mean)
+
+    name = f"averaged_generator_{load_kind}" + ("" if gen.neutral == "grounded" else "_isolated")
+    no_z = ca.SX.sym("z", 0)
+    none = ca.SX(0, 1)
+    return StateSpace.of(
+        name,
+        (X, Signals(), U, TH, Y),
+        (xv, no_z, uv, tv),
+        dae=(f, none), f=f, g=g, z=none, cse=True,
+    )  # fmt: skip
+
+
+def load_kind(point: GeneratorPoint) -> str:
+    """Return the kind of load of a steady point."""
+    names = point.ss.u.names
+    return "constant_power" if "P_load" in names else "inductive" if "L_a" in names else "resistive"
+
+
+def generator_vectors(
+    gen: Generator, point: GeneratorPoint
+) -> tuple[StateSpace, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the averaged generator of a steady point, and x, u, theta (healthy) there.
+
+    Raises:
+        SignalError: the point's load is not balanced.
+    """
+    u_full = point.ss.u.unpack(point.u)
+    ss = averaged_generator(gen, load_kind(point))
+    x_full = point.ss.x.unpack(point.x)
+    values = {n: u_full[n] for n in ss.u.names if n in u_full}
+    for n in ("R", "L"):
+        if n not in ss.u:
+            continue
+        phases = [u_full[f"{n}_{k}"] for k in "abc"]
+        if not np.allclose(phases, phases[0], rtol=1e-9, atol=0):
+            raise SignalError(
+                f"the averaged generator needs a balanced load, got {n} = "
+                f"{', '.join(f'{p:g}' for p in phases)} {ss.u[n].unit} in phases a, b, c"
+            )
+        values[n] = phases[0]
+    x = ss.x.pack({n: x_full[n] for n in ss.x.names})
+    return ss, x, ss.u.pack(values), np.zeros(len(ss.theta))
+
+
+def _joint_signals(apu: Apu, load_kind: str) -> tuple[Signals, Signals, Signals, Signals]:
+    """Return x, u, theta and y of the averaged unit."""
+    gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
+    X = Signals([*gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x])
+    U = Signals([
+        *(gg.U[n] for n in AMBIENT),
+        Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0),
+        *(s for s in gen.u if s.name != "w_r"),
+    ])  # fmt: skip
+    return X, U, Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
+
+
+@kept
+def _joint(apu: Apu, load_kind: str) -> tuple[ca.Function, ca.Function]:
+    """Return the equations (x, z, u, theta) -> (ode, alg, y), and the search (x, u, theta) -> z."""
+    gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
+    X, U, TH, _ = _joint_signals(apu, load_kind)
+    x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
+    u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
+    N, Wf_I, x_gen = x[0], x[1], x[2:]
+    inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
+    health, h = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
+    u_gen = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
+    y_gen = gen.g(x_gen, u_gen, h)
+    fuel = governor(N=N, N_ref=inputs["N_ref"], Wf_I=Wf_I, par=apu.governor)
+    PW = apu.PW(y_gen[gen.y.index("P_total")])
+    u_gg = ca.vertcat(fuel.Wf, PW, *(inputs[n] for n in AMBIENT))
+    N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
+    ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_gen, u_gen, h))
+    z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
+    name = f"joint_averaged_{load_kind}"
+    return (
+        ca.Function(
+            f"{name}_equations", [x, z, u, theta], [ode, alg, ca.vertcat(y_gg, y_gen)],
+            ["x", "z", "u", "theta"], ["ode", "alg", "y"],
+        ),
+        ca.Function(f"{name}_z", [x, u, theta], [z_sol], ["x", "u", "theta"], ["z"]),
+    )  # fmt: skip
+
+
+def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
+    """Return the averaged unit as Function (x, z, u, theta) -> (ode, alg, y)."""
+    return _joint(apu, load_kind)[0]
+
+
+@kept
+def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
+    """Return the whole unit with averaged generators, continuous in time.
+
+    States are the rotor speed N, the governor's integrator Wf_I and those of the averaged
+    generator; inputs the ambient conditions, N_ref, V_ref and the load of each generator; theta
+    the health factors and h, which stands for the same fault in both machines, as (8) counts
+    them; outputs those of both models.  Shaft power is that of the very instant, (1), and the
+    generators' speed too, (2): nothing is exchanged and nothing held.
+
+    Args:
+        apu: the unit.
+        load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"``.
+    """
+    X, U, TH, Y = _joint_signals(apu, load_kind)
+    Z = apu.gas_generator.z
+    equations, z_of = _joint(apu, load_kind)
+    sizes = (("x", X), ("z", Z), ("u", U), ("theta", TH))
+    x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in sizes)
+    ode, alg, _ = equations(x, z, u, theta)
+    z_sol = z_of(x, u, theta)
+    f, _, y = equations(x, z_sol, u, theta)
+    name, signals = f"joint_averaged_{load_kind}", (X, Z, U, TH, Y)
+    return StateSpace.of(name, signals, (x, z, u, theta), dae=(ode, alg), f=f, g=y, z=z_sol)
+
+
+def joint_vectors(
+    apu: Apu, point: JointPoint
+) -> tuple[StateSpace, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the averaged unit of a steady point (:meth:`Apu.steady_state`), and x, u, theta there.
+
+    Raises:
+        SignalError: the point's load is not balanced.
+    """
+    gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, point.generator)
+    ss = joint_averaged(apu, load_kind(point.generator))
+    gas = GasGenerator.U.unpack(point.gas.u)
+    values: Mapping[str, float] = {
+        **{n: gas[n] for n in AMBIENT},
+        "N_ref": apu.N_ref,
+        **{n: v for n, v in gen_ss.u.unpack(u_gen).items() if n != "w_r"},
+    }
+    x = np.concatenate([point.gas.x, [gas["Wf"]], x_gen])
+    theta = np.concatenate([point.gas.theta, np.zeros(len(gen_ss.theta))])
+    return ss, x, ss.u.pack(values), theta

@@ -1,0 +1,221 @@
+"""What changes from outside during a run: ambient conditions, and load, health and fault events.
+
+An event takes effect at its instant ``t`` [s] and holds until the next one of its kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from apu_casadi.core import checked
+from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
+
+if TYPE_CHECKING:
+    from apu_casadi.machine.faults.ttsc import Ttsc
+
+HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
+    {
+        "f_eta_c": "compressor efficiency factor",
+        "f_W_c": "compressor flow capacity factor",
+        "f_eta_t": "turbine efficiency factor",
+        "f_W_t": "turbine flow capacity factor",
+    }
+)
+"""The health factors of the gas path, one when healthy, with their meaning."""
+
+HEALTH_LO, HEALTH_HI = 0.5, 1.5
+"""A health factor lies in (HEALTH_LO, HEALTH_HI]."""
+
+
+def number(
+    value: Any,
+    what: str,
+    *,
+    lo: float = -math.inf,
+    hi: float = math.inf,
+    open_lo: bool = False,
+    unit: str = "",
+) -> float:
+    """Return ``value`` as a float when it is a finite number in [lo, hi], or in (lo, hi].
+
+    Raises:
+        ScenarioError: not a number (booleans are none), not finite, or outside the interval.
+    """
+    u = f" {unit}" if unit else ""
+    try:
+        x = checked.number(what, value, error=ScenarioError)
+    except ScenarioError:
+        raise ScenarioError(f"{what}: a number is expected, got {value!r}") from None
+    if not math.isfinite(x):
+        raise ScenarioError(f"{what}: must be finite, got {x!r}")
+    if x < lo or x > hi or (open_lo and x <= lo):
+        if math.isinf(hi):
+            must = f"must be {'>' if open_lo else '>='} {lo:g}{u}"
+        else:
+            must = f"must lie in {'(' if open_lo else '['}{lo:g}, {hi:g}]{u}"
+        raise ScenarioError(f"{what}: {must}, got {x:g}")
+    return x
+
+
+def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
+    """Return the checked factors as a new dictionary of floats.
+
+    Raises:
+        ScenarioError: not a mapping, unknown name (the nearest is named), or outside (0.5, 1.5].
+    """
+    if not isinstance(factors, Mapping):
+        raise ScenarioError(f"{what}: a table of factors is expected, got {factors!r}")
+    checked = {}
+    for name, value in factors.items():
+        if name not in HEALTH_FACTORS:
+            raise ScenarioError(f"{what}: unknown {name!r} {nearest(str(name), HEALTH_FACTORS)}")
+        checked[name] = number(value, f"{what}.{name}", lo=HEALTH_LO, hi=HEALTH_HI, open_lo=True)
+    return checked
+
+
+SAME_INSTANT = 1e-9  # s; events closer than this are at one instant
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Ambient and flight conditions.
+
+    Args:
+        altitude: pressure altitude [m].
+        Mach: flight Mach number [1].
+        dT_isa: deviation from the standard day [K].
+        war: water to dry air mass ratio [1].
+
+    Defaults and ranges are those of :data:`apu_casadi.gaspath.conditions.CONDITIONS`, as
+    everywhere.
+
+    Raises:
+        ScenarioError: a value outside its range.
+    """
+
+    altitude: float = DEFAULT_DAY["altitude"]
+    Mach: float = DEFAULT_DAY["Mach"]
+    dT_isa: float = DEFAULT_DAY["dT_isa"]
+    war: float = DEFAULT_DAY["war"]
+
+    def __post_init__(self) -> None:
+        for name, c in CONDITIONS.items():
+            unit = "" if c.unit == "1" else c.unit
+            value = number(getattr(self, name), name, lo=c.lo, hi=c.hi, unit=unit)
+            object.__setattr__(self, name, value)
+
+
+def _time(t: Any, what: str) -> None:
+    number(t, f"{what}.t", lo=0.0, unit="s")
+
+
+@dataclass(frozen=True)
+class LoadChange:
+    """From ``t`` [s] on, each generator feeds ``load`` (an object of ``machine.load``).
+
+    Raises:
+        ScenarioError: ``t`` negative or not finite, or a load that is a bare number or text.
+    """
+
+    t: float
+    load: Any
+
+    def __post_init__(self) -> None:
+        _time(self.t, "LoadChange")
+        if self.load is None or isinstance(self.load, bool | int | float | str | Mapping):
+            raise ScenarioError(
+                f"LoadChange.load: a load object (SeriesLoad, ConstantPowerLoad, OpenLoad) is "
+                f"expected, got {self.load!r}"
+            )
+
+
+@dataclass(frozen=True)
+class HealthChange:
+    """From ``t`` [s] on, the named health factors hold; the others keep their values.
+
+    Raises:
+        ScenarioError: ``t`` negative or not finite, an unknown factor, or one outside (0.5, 1.5].
+    """
+
+    t: float
+    factors: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check time and factors, and keep a read-only copy of the factors."""
+        _time(self.t, "HealthChange")
+        checked = health_factors(self.factors, "HealthChange.factors")
+        object.__setattr__(self, "factors", MappingProxyType(checked))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle through a plain dictionary, for process pools."""
+        return type(self), (self.t, dict(self.factors))
+
+    def __hash__(self) -> int:
+        return hash((self.t, tuple(sorted(self.factors.items()))))
+
+
+@dataclass(frozen=True)
+class FaultChange:
+    """From ``t`` [s] on, the stator has ``fault`` (a ``machine.ttsc.Ttsc``); None: it is healthy.
+
+    Raises:
+        ScenarioError: ``t`` negative or not finite, or a fault that is a bare number or text.
+    """
+
+    t: float
+    fault: Ttsc | None
+
+    def __post_init__(self) -> None:
+        _time(self.t, "FaultChange")
+        if isinstance(self.fault, bool | int | float | str | Mapping):
+            raise ScenarioError(
+                f"FaultChange.fault: a Ttsc or None is expected, got {self.fault!r}"
+            )
+
+
+Event = LoadChange | HealthChange | FaultChange
+
+
+def _refuse_second(i: int, e: Event, other: Event) -> None:
+    """Refuse what contradicts an event of its kind at its instant: the order would decide."""
+    if not isinstance(e, HealthChange) or not isinstance(other, HealthChange):
+        raise ScenarioError(f"events[{i}]: second {type(e).__name__} at t = {e.t:g} s")
+    for name, value in e.factors.items():
+        if other.factors.get(name, value) != value:
+            raise ScenarioError(
+                f"events[{i}]: at t = {e.t:g} s {name} = {value:g}, but {other.factors[name]:g} by "
+                "another event at that instant"
+            )
+
+
+def in_order(events: Iterable[Event], duration: float) -> tuple[Event, ...]:
+    """Return the events sorted by time, equal times in the order given.
+
+    Raises:
+        ScenarioError: something that is no event, an event at or beyond ``duration`` [s], two load
+            or two fault changes at one instant, or two values of one health factor.
+    """
+    events = tuple(events)
+    for i, e in enumerate(events):
+        if not isinstance(e, LoadChange | HealthChange | FaultChange):
+            raise ScenarioError(
+                f"events[{i}]: LoadChange, HealthChange or FaultChange expected, got {e!r}"
+            )
+        if e.t >= duration:
+            raise ScenarioError(
+                f"events[{i}]: t = {e.t:g} s is not before the end of the run at {duration:g} s"
+            )
+    order = sorted(range(len(events)), key=lambda i: events[i].t)
+    for k, i in enumerate(order):
+        for m in range(k - 1, -1, -1):
+            j = order[m]
+            if events[i].t - events[j].t > SAME_INSTANT:
+                break
+            if type(events[i]) is type(events[j]):
+                _refuse_second(i, events[i], events[j])
+    return tuple(events[i] for i in order)

@@ -1,0 +1,368 @@
+"""The electrical filter: its model with what makes recordings and starts for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core.errors import DataError, ParameterError, nearest
+from apu_casadi.core.sharing import Parametric, last
+from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.park import PHASE_ANGLE
+from apu_casadi.machine.terminals import (
+    FLUXES,
+    INPUTS,
+    SHUNTS,
+    balanced_state,
+    before,
+    jumps,
+    middle_weight,
+    midpoints,
+)
+from estimators.apu.electrical.gaps import evened, filled, usable
+from estimators.apu.electrical.machinemodel import electrical_model
+from estimators.apu.electrical.terminalsignals import (
+    ADMITTANCE,
+    GAIN_SENSORS,
+    JUMP_SIZES,
+    MEASURED,
+    PHASES,
+    PHASES_I,
+    PHASES_V,
+    VOLTAGES,
+)
+from estimators.apu.electrical.tuning import (
+    ANGLE_WALK_CONSIDERED,
+    FLUX_WALK,
+    H_SIGMA,
+    H_WALK,
+    H_WALK_GAINS,
+    HARMONIC_PERIODS,
+    JUMP,
+    LEAKY_START,
+    LEAKY_WALK,
+    LEAST_SUSCEPTANCE,
+    SMOOTH_LIMIT,
+    START_SIGMA,
+    START_SIGMA_SHUNT,
+)
+from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.filters.belief import Belief
+from estimators.models.filtermodel import FilterModel, Unknown, augment
+from estimators.models.recording import SAME_TIME, Recording, plain_numbers
+
+__all__ = ["GAINS", "ElectricalFilter", "electrical_filter"]
+
+#: Harmonics that each channel consists of, for what is missing of it.
+HARMONICS_OF = {**dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3)),
+                **dict.fromkeys(("V_fd", "i_fd"), (0, 2))}  # fmt: skip
+GAINS = ("none", "estimate", "consider")
+
+
+@dataclass(frozen=True, eq=False)
+class ElectricalFilter(Parametric):
+    """The filter's model with what makes priors and recordings for it.
+
+    Args:
+        model: for :func:`estimators.filters.ekf.extended_kalman_filter` and all others.
+        machine: its parameters.
+        sensors: 1-sigma table; noise of voltages, field voltage and speed is inside the model.
+        gains: ``"none"``, ``"estimate"`` or ``"consider"``: constant gain errors of the sensors.
+        kappa: None for full coupling, else the leakage partition that the model assumes.
+        phase: the faulty phase that the model assumes; None where it is found.
+        power: whether the mean power is a state.
+    """
+
+    model: FilterModel
+    machine: MachineParameters
+    sensors: SensorSet
+    gains: str
+    kappa: float | None
+    phase: str | None
+    power: bool
+
+    def recording(
+        self, samples: Mapping[str, Any], *, window: float | None = None, start: float | None = None
+    ) -> Recording:
+        """Make the filter's recording from samples by name.
+
+        Args:
+            samples: ``t`` (s) and w_r, v_a, v_b, v_c, V_fd, i_a, i_b, i_c, i_fd, each of shape
+                (K,). NaN is a missing sample.  A missing current is not used, the others are.
+                Voltages and speed that are missing are filled from the harmonics around
+                (:mod:`.gaps`), and so are instants that were left out; before the first and after
+                the last instant that has all of them nothing is used.
+            window: length of the windows of the mean power, s, with ``power``; default 0.02.
+            start: beginning of the first window, s; default the first instant.
+
+        Raises:
+            DataError: missing names, shapes, no usable instant, infinite samples, a gap with too
+                little around it.
+        """
+        names = ("t", "w_r", *VOLTAGES, *MEASURED)
+        missing = [n for n in names if n not in samples]
+        if missing:
+            raise DataError(f"samples lack {', '.join(missing)}")
+        a = {n: plain_numbers(samples[n], n, gaps=True) for n in names}
+        K = a["t"].size
+        wrong = [f"{n} {v.shape}" for n, v in a.items() if v.shape != (K,)]
+        if wrong:
+            raise DataError(f"samples of shape ({K},) expected, as t; got {', '.join(wrong)}")
+        a = evened(usable(a, ("w_r", *VOLTAGES)))
+        off = self._filled(a)
+        t = a["t"]
+        given = {n: a[n] for n in INPUTS.names}
+        v = np.array([a[n] for n in PHASES_V])
+        given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=JUMP), strict=True))
+        jumped = np.any([given[n] > 0 for n in JUMP_SIZES.names], axis=0)
+        mid = _middles(t, v, a["w_r"], jumped)
+        given |= {n: np.maximum(given[n], off) for n in JUMP_SIZES.names}
+        given |= {f"{n}_mid": m for n, m in zip(VOLTAGES, mid, strict=False)}
+        given["V_fd_mid"] = (a["V_fd"] + np.append(a["V_fd"][1:], a["V_fd"][-1])) / 2
+        given |= {f"{n}_next": np.append(a[n][1:], a[n][-1]) for n in VOLTAGES}
+        given["dt_last"] = np.append(0.0, np.diff(t))
+        if self.gains != "none":
+            given |= self._smooth(a, given)
+        if self.power:
+            given["keep"] = np.ones(t.size)
+            given["keep"][_window_starts(t, 0.02 if window is None else window, start)] = 0.0
+        u = self.model.u.pack(given)
+        y = np.array([a[n] for n in MEASURED])
+        sigma = np.array([[self.sensors.sigma(n, 0.0)] for n in MEASURED])
+        variance = np.broadcast_to(sigma**2, y.shape).copy()
+        return Recording(t, u, y, variance, self.model.p.pack({}))
+
+    def _filled(self, a: dict[str, np.ndarray]) -> np.ndarray:
+        """Fill the inputs in place; return by how much a step's voltage may be off, V, (K,)."""
+        t, w = a["t"], a["w_r"]
+        there = np.isfinite(w)
+        a["w_r"] = w = np.interp(t, t[there], w[there])
+        off = np.zeros(t.size)
+        for n in VOLTAGES:
+            a[n], e = filled(t, a[n], w, HARMONICS_OF[n], n)
+            if n in PHASES_V:
+                # below that the sensor's noise, which is in the model, stands for it
+                e = np.where(e > 3 * self.sensors.sigma(n, 0.0), e, 0.0)
+                off = np.maximum(off, np.maximum(e, np.append(e[1:], 0.0)))
+        return off
+
+    def _smooth(
+        self, a: Mapping[str, np.ndarray], given: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Return the predictions of readings about which a model with gains is written."""
+        t, w = a["t"], a["w_r"]
+        out = {}
+        full = {n: filled(t, a[n], w, HARMONICS_OF[n], n)[0] for n in GAIN_SENSORS}
+        share = middle_weight(w, np.append(np.diff(t), 0.0))
+        for names, harmonics in (((*PHASES_V, *PHASES_I), (1, 3)), (("V_fd", "i_fd"), (0, 2))):
+            # a missing current is predicted as well
+            x = np.array([full[n] for n in names])
+            for n, p in zip(names, before(t, x, w, harmonics=harmonics), strict=True):
+                off = np.abs(a[n] - p) > SMOOTH_LIMIT * self.sensors.sigma(n, 0.0)
+                out[f"{n}_smooth"] = p = np.where(off, a[n], p)
+                if n in VOLTAGES:
+                    rest = a[n] - p
+                    rest = (rest + np.append(rest[1:], 0.0)) * (share if n in PHASES_V else 0.5)
+                    # what the ends are short of their readings, the middle is, too: it cancels
+                    out[f"{n}_mid_smooth"] = given[f"{n}_mid"] - rest
+                    out[f"{n}_next_smooth"] = np.append(p[1:], a[n][-1])
+        turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+        v, i = (
+            2 / 3 * (turn @ before(t, np.array([full[n] for n in names]), w, space=True))
+            for names in (PHASES_V, PHASES_I)
+        )
+        p = self.machine
+        out["theta_smooth"] = np.angle(v + (p.r_s + 1j * w * (p.L_mq + p.L_ls)) * i)
+        return out
+
+    def prior(
+        self,
+        samples: Mapping[str, Any],
+        *,
+        period: float | None = None,
+        sigma: Mapping[str, float] | None = None,
+    ) -> Belief:
+        """Start from the first electrical period: a balanced machine at rest with its phasors.
+
+        The positive sequence of voltages and currents gives the angle and the fluxes, the mean
+        field current the field.  A severity h_k takes h_k v/(3 r_s) of the positive sequence from
+        the machine, and gain errors are in the readings: the start moves with both, and the prior
+        holds the correlations (h by ``H_SIGMA``).  A leaky fault has been there for long: its
+        current is that of the phase's voltage phasor.  Unbalance and transients are what
+        ``START_SIGMA`` stands for.  The period's samples are used again by the filter; beside their
+        information that of the start is nothing.
+
+        Args:
+            samples: as for :meth:`recording`.
+            period: length of the piece looked at, s; default one electrical period.
+            sigma: other standard deviations, by state.
+
+        Raises:
+            DataError: fewer than eight samples in the period, or no voltage.
+        """
+        names = ("t", "w_r", *VOLTAGES, *MEASURED)
+        a = {n: plain_numbers(samples[n], n, gaps=True) for n in names}
+        a = usable(a, ("w_r", *VOLTAGES))
+        start_at = a["t"][0]  # where the recording starts, complete or not
+        good = np.all([np.isfinite(v) for v in a.values()], axis=0)
+        a = {n: v[good] for n, v in a.items()}
+        if not a["t"].size:
+            raise DataError("no complete sample to start from")
+        w = float(np.median(a["w_r"][: max(1, a["t"].size // 50)]))
+        T = 2 * math.pi / abs(w) if period is None else period
+        first = a["t"] < start_at + T * (1 - 1e-6)
+        if first.sum() < 8:
+            raise DataError(f"the first {T:.3g} s hold {int(first.sum())} samples; 8 are needed")
+        a = {n: v[first] for n, v in a.items()}
+        tau = a["t"] - start_at
+        basis = np.column_stack([np.cos(w * tau), -np.sin(w * tau), np.ones_like(tau)])
+        turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+
+        def phasors(names: Sequence[str]) -> np.ndarray:
+            c = np.linalg.lstsq(basis, np.column_stack([a[n] for n in names]), rcond=None)[0]
+            return np.asarray(c[0] + 1j * c[1])
+
+        v_abc, i_abc = phasors(PHASES_V), phasors(PHASES_I)
+        v = complex(v_abc @ turn) / 3
+        if abs(v) < 0.05 * self.machine.V_rated_rms:
+            raise DataError(f"no voltage to start from: positive sequence {abs(v):.3g} V")
+        p, i_fd, e = self.machine, float(a["i_fd"].mean()), 1e-6
+
+        Y_0 = complex(LEAKY_START, -LEAKY_START)
+
+        def start(share: Mapping[str, float], h: float = 0.0, Y: complex = Y_0) -> dict[str, float]:
+            """Return the start with some readings taken for more by a share of them, a fault."""
+            by = [1 + share.get(n, 0.0) for n in (*PHASES_V, *PHASES_I, "i_fd")]
+            v, i = (complex(x * k @ turn) / 3 for x, k in ((v_abc, by[:3]), (i_abc, by[3:6])))
+            i_0 = float((i_abc * by[3:6]).sum().real) / 3
+            i += h * v / (3 * p.r_s)
+            if self.kappa is None:
+                return balanced_state(p, v=v, i=i, w_r=w, i_fd=i_fd * by[6], i_0=i_0)
+            k = PHASES.index(str(self.phase))
+            i_shunt = -Y / p.r_s * v_abc[k] * by[k]
+            i -= i_shunt * turn[k] / 3
+            i_0 -= i_shunt.real / 3
+            there = balanced_state(p, v=v, i=i, w_r=w, i_fd=i_fd * by[6], i_0=i_0)
+            return there | {"i_shunt": float(i_shunt.real)}
+
+        at = start({})
+        means = dict.fromkeys(self.model.x.names, 0.0) | at
+        means |= {n: LEAKY_START for n in ADMITTANCE.names if n in means}
+        spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
+        spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
+        spread |= {f"gain_{n}": self.sensors[n].gain for n in GAIN_SENSORS}
+        spread = {n: spread[n] for n in means}
+        for n, size in (sigma or {}).items():
+            self.model.x.index(n)
+            spread[n] = size
+        prior = Belief.of(self.model.x, means, spread)
+        moved = {n: start({}, e) for n in SHUNTS.names}
+        moved |= {"g_shunt": start({}, Y=Y_0 + e), "b_shunt": start({}, Y=Y_0 - 1j * e)}
+        moved |= {f"gain_{n}": start({n: -e}) for n in GAIN_SENSORS}
+        turned = np.eye(len(self.model.x))
+        for name, there in moved.items():
+            if name in self.model.x:
+                for n in at:
+                    change = there[n] - at[n]
+                    slope = (math.remainder(change, 2 * math.pi) if n == "theta_e" else change) / e
+                    turned[self.model.x.index(n), self.model.x.index(name)] += slope
+        return Belief(self.model.x, prior.mean, turned @ prior.cov @ turned.T)
+
+
+def _middles(t: np.ndarray, v: np.ndarray, w_r: np.ndarray, jumped: np.ndarray) -> np.ndarray:
+    """Return the voltages midway to the next samples, shape (3, K).
+
+    After a jump the load is another, and so are the harmonics: their average begins anew.
+    """
+    out = midpoints(t, v, w_r, periods=0)
+    ends = np.append(np.flatnonzero(jumped[:-1]), t.size - 1) + 1
+    for begin, end in zip(np.append(0, ends[:-1]), ends, strict=True):
+        part = slice(begin, end)
+        # the step over the jump itself is left as it is
+        piece = midpoints(t[part], v[:, part], w_r[part], periods=HARMONIC_PERIODS)
+        out[:, begin : end - 1] = piece[:, :-1]
+    return out
+
+
+def _window_starts(t: np.ndarray, window: float, start: float | None) -> np.ndarray:
+    """Return the indices of the first instants of the windows."""
+    if not window > 0:
+        raise DataError(f"window = {window!r} s must be > 0")
+    k = np.floor((t - (t[0] if start is None else start) + SAME_TIME) / window)
+    return np.flatnonzero(np.diff(k, prepend=-np.inf))
+
+
+@last(32)
+def electrical_filter(
+    machine: MachineParameters | None = None,
+    *,
+    sensors: SensorSet = ELECTRICAL,
+    h_walk: float | None = None,
+    flux_walk: float = FLUX_WALK,
+    gains: str = "none",
+    power: bool = False,
+    phases: tuple[str, ...] = PHASES,
+    kappa: float | None = None,
+    phase: str | None = None,
+) -> ElectricalFilter:
+    """Make the electrical filter.
+
+    Args:
+        machine: parameters; default Table 1.
+        sensors: 1-sigma table.
+        h_walk, flux_walk: random walks of h (1/sqrt(s); default ``H_WALK``, with gains
+            ``H_WALK_GAINS``; of a leaky fault's admittance ``LEAKY_WALK``) and of the fluxes
+            (Wb/sqrt(s)).
+        gains: ``"estimate"`` or ``"consider"`` the eight constant gain errors, or ``"none"``.
+            Estimated, they make h drift by a standard deviation in a second (the angle's error is
+            in the derivatives and in the innovations alike) and suit recordings of that length; a
+            second pass, :func:`estimators.batch.relinearised.relinearised_filter`, halves that, and
+            errors are then what is claimed. Considered, nothing drifts, and the NIS, which then
+            holds constant offsets, is no test; the angle then walks by ``ANGLE_WALK_CONSIDERED``.
+        power: add the state ``energy``, for :func:`~.tracking.window_power`.
+        phases: phases with an h; none of them makes the healthy machine's filter.
+        kappa: leakage partition; None is full coupling (kappa = mu).  With a number the states are
+            i_shunt, g_shunt and b_shunt of one ``phase`` instead of three h;
+            :func:`~.faults.leaky_fault` gives mu and k_rf.
+        phase: the faulty phase, with ``kappa`` only.
+
+    Raises:
+        ParameterError: unknown choice, kappa without phase or the other way round.
+    """
+    machine = MachineParameters() if machine is None else machine
+    if gains not in GAINS:
+        raise ParameterError(f"gains {gains!r} {nearest(str(gains), GAINS)}")
+    wrong = [k for k in (*phases, *([] if phase is None else [phase])) if k not in PHASES]
+    if wrong:
+        raise ParameterError(f"phase {wrong[0]!r} {nearest(str(wrong[0]), PHASES)}")
+    if (kappa is None) != (phase is None):
+        raise ParameterError(
+            "kappa and phase come together: with full coupling (kappa=None) the phase is found"
+        )
+    if kappa is not None and gains != "none":
+        raise ParameterError("gains are estimated with full coupling (kappa=None) only")
+    if kappa is not None and not 0 < kappa <= 1:
+        raise ParameterError(f"kappa = {kappa!r} must lie in (0, 1]")
+    model = electrical_model(machine, sensors, power, kappa, phase, gains != "none")
+    walks = dict.fromkeys((n for n in FLUXES.names), flux_walk)
+    if h_walk is None:
+        h_walk = LEAKY_WALK if kappa is not None else H_WALK
+        h_walk = h_walk if gains == "none" else H_WALK_GAINS
+    if kappa is None:
+        unknown = {f"h_{k}": Unknown(walk=h_walk) for k in phases}
+    else:
+        unknown = {
+            n: Unknown(walk=h_walk, lower=low)
+            for n, low in zip(ADMITTANCE.names, (-math.inf, LEAST_SUSCEPTANCE), strict=True)
+        }
+        walks["i_shunt"] = 0.0
+    if gains == "consider":
+        walks["theta_e"] = ANGLE_WALK_CONSIDERED
+    if gains != "none":
+        unknown |= {f"gain_{n}": Unknown(consider=gains == "consider") for n in GAIN_SENSORS}
+    model = augment(model, unknown).with_walk(walks).expanded()
+    return ElectricalFilter(model, machine, sensors, gains, kappa, phase, power)

@@ -1,0 +1,153 @@
+"""Runs in which faults come and go, and the mean power of windows as measurements of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core.errors import EstimationError
+from estimators.apu.electrical.electricalfilter import ElectricalFilter
+from estimators.apu.electrical.terminalsignals import MEASURED
+from estimators.apu.electrical.tuning import RESET_LEVEL, RESET_SIGMA, RESET_WINDOW
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
+from estimators.filters.filtering import FilterResult
+from estimators.models.recording import Recording
+
+__all__ = ["track", "window_power"]
+
+
+def track(
+    filt: ElectricalFilter,
+    prior: Belief,
+    data: Recording,
+    *,
+    backend: str | None = None,
+    max_resets: int = 20,
+    own_level: bool | None = None,
+) -> tuple[FilterResult, list[float]]:
+    """Filter a recording in which faults come and go: h follows steps at once.
+
+    The random walk of h is for slow changes; a step of 1e-3 would take it 0.2 s.  So the
+    innovations are watched: where their normalised square, averaged over ``RESET_WINDOW`` samples,
+    exceeds ``RESET_LEVEL``, h and fluxes become uncertain again at the window's start
+    (``RESET_SIGMA``), and the filter goes on from there.  The first two windows of a piece are not
+    judged, since a start needs them to settle.
+
+    Args:
+        filt, prior, data, backend: as of the filter.
+        max_resets: more than these, and the model is refused.
+        own_level: whether a window is compared with those before it (the first four are not judged)
+            instead of with what white innovations give: where gain errors are considered (the
+            default there), or taken as noise, each unit has a level of its own.
+
+    Returns:
+        result: as from one filter. resets : instants, s.
+
+    Raises:
+        EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
+    """
+    own_level = filt.gains == "consider" if own_level is None else own_level
+    begin = 0
+    pieces: list[FilterResult] = []
+    resets: list[float] = []
+    rest = data
+    mean_of = np.ones(RESET_WINDOW) / RESET_WINDOW
+    while True:
+        r = extended_kalman_filter(filt.model, prior, rest, backend=backend)
+        # judged window by window; the first two after a start are not
+        full = r.nis.size // RESET_WINDOW
+        share = r.nis[: full * RESET_WINDOW].reshape(full, RESET_WINDOW) @ mean_of
+        usual = _usual(share) if own_level else np.full(full, float(len(MEASURED)))
+        share[:2] = 0.0
+        bad = np.flatnonzero(share > usual + RESET_LEVEL - len(MEASURED))
+        if not bad.size:
+            pieces.append(_piece(r, r.nis.size))
+            return _joined(pieces), resets
+        if len(resets) == max_resets:
+            raise EstimationError(
+                f"{filt.model.name}: {max_resets} resets up to t = {resets[-1]:.6g} s and still "
+                f"the innovations are {share[bad[0]]:.3g} times what they should be: the model "
+                "does not fit these data: a fault branch with leakage of its own, which "
+                "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults"
+            )
+        cut = int(bad[0]) * RESET_WINDOW
+        # once more up to the cut, whose sample is left to the next piece: a belief of s(cut)
+        upto = rest.part(0, cut + 1)
+        y = upto.y.copy()
+        y[:, -1] = np.nan
+        r = extended_kalman_filter(
+            filt.model, prior, dataclasses.replace(upto, y=y), backend=backend
+        )
+        pieces.append(_piece(r, cut))
+        wide = np.zeros(len(filt.model.x))
+        for name, s in RESET_SIGMA.items():
+            if name in filt.model.x:
+                wide[filt.model.x.index(name)] = s**2
+        prior = Belief(filt.model.x, r.final.mean, r.final.cov + np.diag(wide))
+        begin += cut
+        resets.append(float(data.t[begin]))
+        rest = data.part(begin, data.size)
+
+
+def _usual(share: np.ndarray) -> np.ndarray:
+    """Return what each window's mean NIS is compared with where gains are considered.
+
+    Their offsets stay in the innovations, so a unit has its own level: the median of up to 20
+    windows before, four at least.
+    """
+    out = np.full(share.size, math.inf)
+    for k in range(4, share.size):
+        out[k] = max(float(len(MEASURED)), float(np.median(share[max(k - 20, 1) : k])))
+    return out
+
+
+def _piece(r: FilterResult, n: int) -> FilterResult:
+    """Return the first n instants."""
+    return dataclasses.replace(
+        r, t=r.t[:n], mean=r.mean[:, :n], variance=r.variance[:, :n],
+        innovation=r.innovation[:, :n], innovation_variance=r.innovation_variance[:, :n],
+        nis=r.nis[:n], measured=r.measured[:n],
+    )  # fmt: skip
+
+
+def _joined(pieces: list[FilterResult]) -> FilterResult:
+    names = ("t", "mean", "variance", "innovation", "innovation_variance", "nis", "measured")
+    joined: dict[str, Any] = {
+        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in names
+    }
+    joined["loglik"] = sum(p.loglik for p in pieces)
+    return dataclasses.replace(pieces[-1], **joined)
+
+
+def window_power(
+    filt: ElectricalFilter, result: FilterResult, data: Recording
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mean mechanical power of both generators, (8), over each window, and its variance.
+
+    The filter carries the energy since the window's start as a state, so the variance at the
+    window's end holds the correlation of all samples in it, and of h, fluxes and (where they are
+    states) gain errors with them: a window is one measurement for whoever takes it.  Without gains
+    among the states their share is missing; see ``gain_share`` in the studies.
+
+    Returns:
+        t: ends of the windows, s, shape (n,). P : mean power, W. var : its variance, W^2.
+
+    Raises:
+        EstimationError: a filter without ``power``, or no complete window.
+    """
+    if not filt.power:
+        raise EstimationError("window_power needs a filter made with power=True")
+    keep = data.u[filt.model.u.index("keep")]
+    starts = np.flatnonzero(keep == 0.0)
+    if starts.size < 2:
+        raise EstimationError(f"the recording of {data.t[-1] - data.t[0]:.4g} s holds no window")
+    length = np.diff(data.t[starts])
+    i = result.x.index("energy")
+    # at the first instant of the next window the energy is still that of the window before
+    P = result.mean[i, starts[1:]] / length
+    var = result.variance[i, starts[1:]] / length**2
+    return data.t[starts[1:]], P, var

@@ -1,0 +1,93 @@
+"""What the electrical filter is tuned by: random walks, starts, levels, each with its reason."""
+
+from __future__ import annotations
+
+from apu_casadi.machine.terminals import FLUXES, SHUNTS
+
+__all__ = [
+    "ANGLE_WALK_CONSIDERED",
+    "FAULT_LEVEL",
+    "FLUX_WALK",
+    "HARMONIC_PERIODS",
+    "H_SIGMA",
+    "H_WALK",
+    "H_WALK_GAINS",
+    "JUMP",
+    "JUMP_SHARE",
+    "LEAKY_START",
+    "LEAKY_WALK",
+    "LEAST_SUSCEPTANCE",
+    "RESET_LEVEL",
+    "RESET_SIGMA",
+    "RESET_WINDOW",
+    "SMOOTH_LIMIT",
+    "START_SIGMA",
+    "START_SIGMA_SHUNT",
+]
+
+#: Random walk of each h, 1/sqrt(s).  A sample tells h to some 3e-5 (225 kW), so the filter averages
+#: over about 25 ms and claims 3e-6.
+H_WALK = 2e-5
+#: The same with gain errors: they leave h uncertain by 4e-5 in any case, so h may as well move
+#: fast; with the slow walk a fault would be taken for a change of the gains found before it.
+H_WALK_GAINS = 2e-4
+#: Random walk of both parts of a leaky fault's admittance, 1/sqrt(s): slower than h, since what
+#: tells mu from k_rf is a small share of it; the filter averages over 60 ms.
+LEAKY_WALK = 5e-6
+#: Random walk of the flux linkages, Wb/sqrt(s): 1e-6 Wb in a step of 100 us, 0.03 A; stands for
+#: what the interpolation of the voltages leaves.
+FLUX_WALK = 1e-4
+#: Random walk of the rotor angle where gains are considered, rad/sqrt(s): as much as a speed that
+#: is 1 rad/s off for 10 ms.  A turned angle looks like gain errors, which that filter leaves alone,
+#: so it hardly corrects the angle: a speed 1 rad/s off (its noise is 1.25) for a tenth of a second
+#: after a load step turned it by 0.06 rad and moved all h by 7e-4, their statistics by three
+#: standard deviations; with the walk it is 3e-5 and 0.2.  The price is nil: one h with the others
+#: zero is known to 4.0e-5 at 225 kW and 2.4e-5 at 100 kW, as without it.
+ANGLE_WALK_CONSIDERED = 0.1
+#: Start of a leaky fault: mean of both parts of its admittance, and what its current (A, standard
+#: deviation) has beside that of the admittance.
+LEAKY_START = 3e-3
+START_SIGMA_SHUNT = 5.0
+#: Least susceptance of a leaky fault: without one it has no current of its own.
+LEAST_SUSCEPTANCE = 1e-6
+#: Electrical periods over which the harmonics of the voltages are averaged: their noise lasts as
+#: long in the middles of the steps, and over two periods it is 0.5 % of what the filter expects.
+HARMONIC_PERIODS = 10.0
+#: Jumps of the voltage within a step up to this, V, are taken for noise: five standard deviations.
+JUMP = 5.0
+#: Unknown mean voltage of a step with a jump, over the jump's size; the jump's instant alone gives
+#: 0.3, the overshoot of a resistive load that is dropped gives the rest.
+JUMP_SHARE = 1.0
+#: A reading further from its prediction than this many standard deviations is taken itself.
+SMOOTH_LIMIT = 6.0
+#: Standard deviations of the start: stator and rotor fluxes (Wb), angle (rad), of a healthy
+#: machine; what an h adds to them goes with h.  With 0.03 rad the linearisation shows in the NEES.
+START_SIGMA = {
+    "lam_sq": 1.5e-3,
+    "lam_sd": 1.5e-3,
+    "lam_s0": 5e-4,
+    "lam_fd": 1.5e-3,
+    "lam_kd": 1.5e-3,
+    "lam_kq": 1.5e-3,
+    "theta_e": 0.01,
+}
+#: Standard deviation of each h at the start.
+H_SIGMA = 1e-2
+#: A step of h is looked for in windows of this many samples (5 ms) ...
+RESET_WINDOW = 50
+#: ... whose mean NIS exceeds this; 4 is expected, 8 is ten standard deviations more.
+RESET_LEVEL = 8.0
+#: What is added to the standard deviations at a reset.
+RESET_SIGMA = {
+    **dict.fromkeys(SHUNTS.names, 1e-2),
+    **dict.fromkeys(FLUXES.names, 1e-3),
+    **dict.fromkeys(("g_shunt", "b_shunt"), 1e-2),
+    "i_shunt": 50.0,
+}
+#: Statistic (h/sigma)^2 of one phase above which a fault is reported: five standard deviations.
+#: The rule: by the tail of the tuning runs, continued as a Gaussian's, less than one false alarm an
+#: hour, and less than 1e-4 in a run of two load steps.  Noise passes it less than once in ten hours
+#: (Rice's formula through the counts at lower levels), constant gain errors in one steady unit of a
+#: million.  Load steps and gas faults, with and without gain errors, pass it in 1e-5 to 3e-5 of the
+#: runs (200 tuning seeds of each kind, largest statistic 4.1 standard deviations).
+FAULT_LEVEL = 25.0

@@ -1,0 +1,770 @@
+"""What can be known of the APU from its sensors, before anything is estimated.
+
+Gas path, at steady points: unknown are the four health factors, the true rotor speed and the true
+fuel flow; the shaft power follows from 0 = dN/dt.  Ambient conditions are taken as known.  White
+noise is that of the sensor table, averaged over ``samples`` of 20 ms; the noise of the shaft power
+is not averaged, since the electrical filter's errors last longer than a snapshot.  Efficiency of
+the generators (reading of PW over its true value) and gain errors of the sensors are considered:
+uncertain, not estimated.
+
+Generator: severity (mu, k_rf) of a turn-to-turn short circuit from the current of the faulty phase
+at given voltages, through the equivalent shunt of :mod:`apu_casadi.machine.faults.ttsc`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.stats
+
+from apu_casadi.core.errors import EstimationError, ParameterError, nearest
+from apu_casadi.core.sharing import kept, last
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.load import SeriesLoad
+from estimators.apu.sensors import ELECTRICAL, GAS_PATH, Sensor, SensorSet
+from estimators.filters.belief import Belief
+from estimators.information.identifiability import (
+    Identifiability,
+    Sensitivities,
+    identify,
+    recording_sensitivities,
+    steady_sensitivities,
+    together,
+)
+from estimators.models.filtermodel import Unknown, augment, discretise, measure, noisy_inputs
+from estimators.models.recording import Recording
+
+__all__ = [
+    "AIMS",
+    "BASE",
+    "CANDIDATES",
+    "POINTS",
+    "Severity",
+    "Trials",
+    "findings",
+    "gas_path",
+    "gas_path_transient",
+    "limiting_gains",
+    "limiting_noises",
+    "needed_samples",
+    "severity",
+    "severity_study",
+    "shaft_power_snapshot",
+    "snapshot_sweep",
+    "snapshot_trials",
+]
+
+#: Steady points by name: shaft power, W, and ambient conditions, those of the default day where
+#: none are named.  The first two are Tables 4 and 5.
+POINTS: dict[str, dict[str, float]] = {
+    "design": {"PW": 500e3},
+    "offdesign": {"PW": 222e3, "dT_isa": 5.0, "altitude": 8000.0, "Mach": 0.7},
+    "partload": {"PW": 222e3},
+    "idle": {"PW": 20e3},
+}
+
+#: What a gas-path filter has without the generators.
+BASE = ("N", "P3", "T3", "T5", "Wf")
+
+#: The sensors of the gas-path table, and some that could be added.
+CANDIDATES = SensorSet(
+    (
+        *GAS_PATH.sensors,
+        Sensor("W2", 0.01, True, 0.01, "kg/s", "assumed: bellmouth, 1 %"),
+        Sensor("P5", 0.005, True, 0.005, "Pa", "assumed: as P3"),
+        Sensor("T41", 0.01, True, 0.01, "K", "assumed: pyrometer, 1 %"),
+    )
+)
+
+SAMPLES = 50  # of 20 ms: a snapshot of 1 s
+PRIOR = 0.02  # standard deviation of each health factor before the snapshot
+ETA_BIAS = GAS_PATH["PW"].gain  # of the generators' efficiency: PW is read from the electrical side
+#: Least reduction of the health factors' rms standard deviation by shaft power, with a 2 % prior
+#: and 1 % power noise: without and with the efficiency bias.
+AIMS = {"exact efficiency": 0.50, "efficiency bias": 0.30}
+PRIORS = (0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1)
+POWER_NOISES = (0.0025, 0.005, 0.01, 0.02, 0.05)
+
+
+# ---------------------------------------------------------------------- gas path
+
+
+@last(16)
+def _steady(point: str, gg: GasGenerator) -> OperatingPoint:
+    if point not in POINTS:
+        raise ParameterError(f"unknown point {point!r} {nearest(point, POINTS)}")
+    conditions: dict[str, Any] = dict(POINTS[point])
+    return trim_gas_generator(gg, {"N": gg.parameters.N, "PW": conditions.pop("PW")}, **conditions)
+
+
+@last(16)
+def _derivatives(point: str, gg: GasGenerator) -> tuple[OperatingPoint, np.ndarray, np.ndarray]:
+    """Return the point, dy/d unknown of every output and dPW/d unknown, own units."""
+    at = _steady(point, gg)
+    _, y, xdot_w, y_w, _ = (a.full() for a in gg.cycle.sensitivities(at.x, at.z, at.u, at.theta))
+    off = float(np.abs(y[:, 0] - [at[n] for n in gg.Y.names]).max())
+    if not off < 1e-3:  # own units, mostly Pa and W: rounding of the root finder
+        raise EstimationError(
+            f"{point}: derivatives belong to another point, outputs {off:.1e} off"
+        )
+    w = gg.X + gg.U + gg.THETA
+    H, follow = steady_sensitivities(
+        xdot_w, y_w, w, unknown=["N", "Wf", *gg.THETA.names], solved=["PW"]
+    )
+    return at, H, follow
+
+
+_DEFAULT = GasGenerator()
+
+
+def gas_path(
+    point: str = "design",
+    *,
+    sensors: SensorSet = CANDIDATES,
+    samples: int = SAMPLES,
+    prior: float = PRIOR,
+    power_noise: float | None = None,
+    eta_bias: float = 0.0,
+    gain_errors: bool = False,
+    gas_generator: GasGenerator | None = None,
+) -> Sensitivities:
+    """Return the sensitivities of steady gas-path readings.
+
+    Args:
+        point: a name of :data:`POINTS`, or several, separated by commas, with the same faults.
+        sensors: table of sensors; each must be an output of the gas generator.
+        samples: of 20 ms that are averaged; white noise falls with its root, that of PW excepted.
+        prior: standard deviation of each health factor before; inf for none.
+        power_noise: standard deviation of PW's reading over its value; that of the table by
+            default.
+        eta_bias: standard deviation of the efficiency with which PW is computed, considered.
+        gain_errors: consider the gain errors of the table's other sensors.
+        gas_generator: the engine; the paper's by default.
+
+    Raises:
+        ParameterError: unknown point or sensor, numbers out of range.
+        OperatingPointError: the point does not exist for this engine.
+    """
+    if not (samples >= 1 and eta_bias >= 0 and prior > 0):
+        raise ParameterError(
+            f"samples >= 1, prior > 0 and eta_bias >= 0 expected, got {samples!r}, {prior!r}, "
+            f"{eta_bias!r}"
+        )
+    gg = _DEFAULT if gas_generator is None else gas_generator
+    names = [p.strip() for p in point.split(",")]
+    if len(set(names)) != len(names):
+        raise ParameterError(f"a point is given twice: {point}")
+    parts = {
+        name: _gas_path(name, gg, sensors, samples, prior, power_noise, eta_bias, gain_errors)
+        for name in names
+    }
+    if len(parts) == 1:
+        return parts[names[0]]
+    first = parts[names[0]]
+    constant = [n for n in first.theta.names if n.startswith("gain_")]
+    return together(parts, shared=constant)
+
+
+def _gas_path(
+    point: str,
+    gg: GasGenerator,
+    sensors: SensorSet,
+    samples: int,
+    prior: float,
+    power_noise: float | None,
+    eta_bias: float,
+    gain_errors: bool,
+) -> Sensitivities:
+    at, H, _ = _derivatives(point, gg)
+    unknown = [n for n in sensors.names if n not in gg.Y]
+    if unknown:
+        raise ParameterError(f"sensor {unknown[0]!r} measures no output of the gas generator")
+    y = np.array([at[n] for n in sensors.names])
+    sigma = np.array([sensors.sigma(n, v) for n, v in zip(sensors.names, y, strict=True)])
+    sigma /= math.sqrt(samples)
+    if "PW" in sensors.names:
+        i = sensors.names.index("PW")
+        sigma[i] = sensors.sigma("PW", y[i]) if power_noise is None else power_noise * abs(y[i])
+    signals = [
+        Signal("N", "rad/s", "true rotor speed", nominal=at["N"]),
+        Signal("Wf", "kg/s", "true fuel flow", nominal=at["Wf"]),
+        *(Signal(s.name, s.unit, s.doc) for s in gg.THETA),
+    ]
+    priors = dict.fromkeys(gg.THETA.names, prior)
+    columns = [H[gg.Y.indices(sensors.names)]]
+    gains = {
+        s.name: (eta_bias if s.name == "PW" else s.gain if gain_errors else 0.0)
+        for s in sensors.sensors
+    }
+    for i, (name, gain) in enumerate(gains.items()):
+        if gain > 0:
+            what = "efficiency of the generators" if name == "PW" else f"gain error of {name}"
+            signals.append(Signal(f"gain_{name}", "1", what))
+            priors[f"gain_{name}"] = gain
+            columns.append(np.eye(len(y))[:, [i]] * y[i])
+    return Sensitivities.of(
+        Signals(signals), sensors.names, np.hstack(columns), sigma,
+        faults=gg.THETA.names, prior=priors,
+    )  # fmt: skip
+
+
+#: Of the transient: s from the start of the ramp to its end, and proportional fuel control that
+#: keeps the speed near its reference, kg/s per rad/s.
+RAMP, FUEL_GAIN = 2.0, 2e-5
+UNKNOWN_PW = 1e8  # W; standard deviation of a shaft power that nobody measures, at every sample
+
+
+def gas_path_transient(
+    *,
+    power: bool,
+    seconds: float = 5.0,
+    from_power: float = 222e3,
+    to_power: float = 500e3,
+    power_noise: float = GAS_PATH["PW"].noise,
+    prior: float = PRIOR,
+    sensors: SensorSet = GAS_PATH,
+    backend: str | None = None,
+) -> Sensitivities:
+    """Return what a recording through a load ramp tells of the four health factors.
+
+    The truth is healthy and on the ground; samples every 20 ms of N, P3, T3, T5 and Wf; readings of
+    Wf and PW are inputs with white noise.  The rotor's acceleration is then a measurement of the
+    power balance.
+
+    Args:
+        power: whether PW is measured; otherwise it is unknown at every sample.
+        seconds, from_power, to_power: length, s; the shaft power ramps in :data:`RAMP` s, W.
+        power_noise: standard deviation of PW over its value, white from sample to sample.
+        prior: standard deviation of each health factor before.
+        sensors: the sensor table.
+        backend: see :func:`apu_casadi.core.backend.compiled`.
+
+    Raises:
+        OperatingPointError, EstimationError: the engine does not run, or is lost, on the way.
+    """
+    gg = _DEFAULT
+    ss = gg.state_space
+    dt, K = 0.02, round(seconds / 0.02)
+    t = dt * np.arange(K)
+    PW = from_power + (to_power - from_power) * np.clip((t - 0.5) / RAMP, 0, 1)
+    ends = [trim_gas_generator(gg, {"N": gg.parameters.N, "PW": P}) for P in (from_power, to_power)]
+    Wf = np.interp(PW, [from_power, to_power], [e["Wf"] for e in ends])
+    noise = {"Wf": sensors["Wf"].noise * ends[1]["Wf"]}
+    noise["PW"] = power_noise * to_power if power else UNKNOWN_PW
+    model = measure(discretise(ss), ["N", "P3", "T3", "T5"])
+    model = augment(noisy_inputs(model, noise), {n: Unknown() for n in gg.THETA.names})
+    x = np.ones((len(model.x), K))
+    x[0, 0] = ends[0]["N"]
+    u = np.empty((len(model.u), K))
+    at, z = ends[0].x, ends[0].z
+    theta = np.ones(len(gg.THETA))
+    for k in range(K):
+        fuel = float(Wf[k]) + FUEL_GAIN * (gg.parameters.N - float(at[0]))
+        u[:, k] = gg.U.pack({"Wf": fuel, "PW": float(PW[k])})
+        x[0, k] = at[0]
+        if k + 1 < K:
+            at, _, z = gg.advance(at, u[:, k], theta, z, dt)
+    names = model.y.names
+    sigma = np.array([sensors.sigma(n, ends[1][n]) for n in names])
+    data = Recording(
+        t, u, np.zeros((len(names), K)), np.repeat(sigma[:, None] ** 2, K, axis=1), np.zeros(0)
+    )
+    start = Belief(model.x, x[:, 0], np.diag([100.0**2, 0, 0, 0, 0]))
+    found = recording_sensitivities(model, gg.THETA.names, start, data, x, backend=backend)
+    return found.with_prior(dict.fromkeys(gg.THETA.names, prior))
+
+
+# ---------------------------------------------------------------------- shaft power
+
+
+def shaft_power_snapshot(
+    point: str = "design",
+    *,
+    prior: float = PRIOR,
+    power_noise: float = GAS_PATH["PW"].noise,
+    eta_bias: float = 0.0,
+    samples: int = SAMPLES,
+    gain_errors: bool = False,
+) -> dict[str, Any]:
+    """Return how much measured shaft power reduces the health factors' standard deviations.
+
+    Without PW the readings leave one combination of f_W_c, f_eta_t and f_W_t wholly to the prior,
+    the *null direction*.
+
+    Returns:
+        dict: the arguments; ``before`` and ``after``, standard deviations of the four factors by
+        name; ``reduction`` of their rms, ``reduction_of`` each; ``null`` the null direction by
+        name, of length 1, and ``null_before``, ``null_after`` the standard deviations along it.
+
+    Raises:
+        ParameterError: numbers out of range.
+    """
+    g = gas_path(
+        point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
+        eta_bias=eta_bias, gain_errors=gain_errors,
+    )  # fmt: skip
+    without = g.only(BASE)
+    C0, C1 = without.covariance(), g.covariance()
+    # with gain errors considered it is no longer exactly invisible: take it without them
+    plain = gas_path(point, sensors=GAS_PATH, samples=samples, prior=prior).only(BASE)
+    v = np.linalg.svd(plain.signatures())[2][-1]
+    v = v * np.sign(v[np.abs(v).argmax()])
+    s0, s1 = np.sqrt(np.diag(C0)), np.sqrt(np.diag(C1))
+    return {
+        "point": point,
+        "prior": prior,
+        "power_noise": power_noise,
+        "eta_bias": eta_bias,
+        "samples": samples,
+        "gain_errors": gain_errors,
+        "before": dict(zip(g.faults, s0.tolist(), strict=True)),
+        "after": dict(zip(g.faults, s1.tolist(), strict=True)),
+        "rms_before": float(np.sqrt(np.mean(s0**2))),
+        "rms_after": float(np.sqrt(np.mean(s1**2))),
+        "reduction": float(1 - np.sqrt((s1**2).sum() / (s0**2).sum())),
+        "reduction_of": dict(zip(g.faults, (1 - s1 / s0).tolist(), strict=True)),
+        "null": dict(zip(g.faults, v.tolist(), strict=True)),
+        "null_before": float(np.sqrt(v @ C0 @ v)),
+        "null_after": float(np.sqrt(v @ C1 @ v)),
+    }
+
+
+#: Curves of the sweep: what is changed against 1 s, 1 % power noise, exact efficiency.
+VARIANTS: dict[str, dict[str, Any]] = {
+    "exact efficiency": {},
+    "efficiency bias": {"eta_bias": ETA_BIAS},
+    "gain errors too": {"eta_bias": ETA_BIAS, "gain_errors": True},
+    "one 20 ms sample": {"samples": 1},
+}
+
+
+def snapshot_sweep(
+    point: str = "design",
+    *,
+    priors: Sequence[float] = PRIORS,
+    power_noises: Sequence[float] = POWER_NOISES,
+    variants: Mapping[str, Mapping[str, Any]] | None = None,
+) -> list[dict[str, Any]]:
+    """Return :func:`shaft_power_snapshot` over priors, power noises and variants, with a label.
+
+    Raises:
+        ParameterError: numbers out of range.
+    """
+    chosen = VARIANTS if variants is None else variants
+    return [
+        {
+            "variant": label,
+            **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options),
+        }
+        for label, options in chosen.items()
+        for noise in power_noises
+        for prior in priors
+    ]
+
+
+def limiting_gains(point: str = "design", **options: Any) -> dict[str, float]:
+    """Return the reduction when one sensor alone has a gain error, by that sensor's name.
+
+    ``options`` are those of :func:`shaft_power_snapshot`; the efficiency bias is as given there.
+    """
+    options = {"prior": PRIOR, "samples": SAMPLES, **options}
+    out = {}
+    for sensor in GAS_PATH.sensors:
+        if sensor.name == "PW" or not sensor.gain > 0:
+            continue
+        one = SensorSet(
+            tuple(
+                s if s.name == sensor.name else dataclasses.replace(s, gain=0.0)
+                for s in GAS_PATH.sensors
+            )
+        )
+        g = gas_path(point, sensors=one, gain_errors=True, **options)
+        before, after = np.trace(g.only(BASE).covariance()), np.trace(g.covariance())
+        out[sensor.name] = float(1 - math.sqrt(after / before))
+    return out
+
+
+def limiting_noises(point: str = "design", **options: Any) -> dict[str, float]:
+    """Return the reduction from one sample if one sensor had (almost) no noise, by its name.
+
+    ``options`` are those of :func:`gas_path`.
+    """
+    out = {}
+    for name in BASE:
+        sensors = GAS_PATH.change(**{name: 1e-6})
+        g = gas_path(point, sensors=sensors, samples=1, **options)
+        before, after = np.trace(g.only(BASE).covariance()), np.trace(g.covariance())
+        out[name] = float(1 - math.sqrt(after / before))
+    return out
+
+
+def needed_samples(aim: float, point: str = "design", **options: Any) -> int | None:
+    """Return the least number of averaged samples with which the reduction reaches an aim.
+
+    None if no averaging does: the limit is then not the white noise.  ``options`` are those of
+    :func:`shaft_power_snapshot`.
+
+    Raises:
+        ParameterError: numbers out of range.
+    """
+
+    def reached(samples: int) -> bool:
+        return bool(shaft_power_snapshot(point, samples=samples, **options)["reduction"] >= aim)
+
+    low, high = 1, 1_000_000
+    if not reached(high):
+        return None
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) else (middle + 1, high)
+    return low
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Maximum a posteriori estimates from random snapshots, without and with shaft power.
+
+    Args:
+        seeds: number of snapshots.
+        rms_before, rms_after: rms error of the four health factors, without and with PW.
+        bound_before, bound_after: what the bound says of them.
+        reduction: of the rms error by PW.
+        interval: 95 % interval of the reduction over the seeds (bootstrap of 2000).
+        nees: mean normalised estimation error squared of the four factors over 4, with PW; 1
+            ideally.
+        nees_band: its 95 % band if the claimed covariances are right.
+        null_before, null_after: rms error along the null direction.
+    """
+
+    seeds: int
+    rms_before: float
+    rms_after: float
+    bound_before: float
+    bound_after: float
+    reduction: float
+    interval: tuple[float, float]
+    nees: float
+    nees_band: tuple[float, float]
+    null_before: float
+    null_after: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    """The nonlinear steady readings of (N, Wf, health) about a point, with exact derivatives."""
+
+    gg: GasGenerator
+    at: OperatingPoint
+
+    def __call__(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return all outputs (ny,) and their derivatives (ny, 6) along steady states."""
+        gg, U = self.gg, self.gg.U
+        x, u, theta = v[:1], self.at.u.copy(), v[2:]
+        u[U.index("Wf")] = v[1]
+        z = gg.solve(self.at.z, x, u, theta)
+        # cycle equations do not contain PW: the balance gives it from the rate at any other
+        ode, alg, _ = gg.equations(x, z, u, theta)
+        u[U.index("PW")] += float(ode) * gg.parameters.J * float(v[0])
+        worst = float(ca.norm_inf(alg))
+        if not worst < RESIDUAL_TOL:
+            raise EstimationError(
+                f"no steady readings at health {np.round(theta, 4)}: cycle residual {worst:.1e}, "
+                f"{RESIDUAL_TOL:.0e} allowed; the draw left the maps"
+            )
+        _, y, xdot_w, y_w, _ = (a.full() for a in gg.cycle.sensitivities(x, z, u, theta))
+        w = gg.X + gg.U + gg.THETA
+        H, _ = steady_sensitivities(
+            xdot_w, y_w, w, unknown=["N", "Wf", *gg.THETA.names], solved=["PW"]
+        )
+        return y[:, 0], H
+
+
+def snapshot_trials(
+    point: str = "design",
+    *,
+    seeds: Sequence[int] = range(10_000, 10_500),
+    prior: float = PRIOR,
+    power_noise: float = GAS_PATH["PW"].noise,
+    eta_bias: float = 0.0,
+    samples: int = SAMPLES,
+) -> Trials:
+    """Estimate the health factors from random snapshots of the nonlinear engine.
+
+    Health drawn from the prior, noise and efficiency bias from their distributions; the estimate is
+    the most probable one (Gauss-Newton on the exact equations).  It shows whether the bounds of
+    :func:`shaft_power_snapshot`, which are first order, are what an estimator gets.
+
+    Raises:
+        EstimationError: a draw has no steady readings, or the iteration does not converge.
+    """
+    gg = _DEFAULT
+    at = _steady(point, gg)
+    read = _Reader(gg, at)
+    rows = gg.Y.indices(GAS_PATH.names)
+    g = gas_path(
+        point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
+        eta_bias=eta_bias,
+    )  # fmt: skip
+    nominal = np.array([at[n] for n in GAS_PATH.names])
+    sigma = np.array([GAS_PATH.sigma(n, v) for n, v in zip(GAS_PATH.names, nominal, strict=True)])
+    sigma /= math.sqrt(samples)
+    power = GAS_PATH.names.index("PW")
+    # considered: in the variance of the reading, where Schmidt's gain is the optimal one
+    bias = eta_bias * nominal[power]
+    sigma[power] = power_noise * nominal[power]
+    claimed = sigma.copy()
+    claimed[power] = math.hypot(sigma[power], bias)
+    start = np.array([at["N"], at["Wf"], 1.0, 1.0, 1.0, 1.0])
+    without = [i for i in range(len(rows)) if i != power]
+    errors: dict[str, list[np.ndarray]] = {"before": [], "after": []}
+    nees = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        true = start.copy()
+        true[2:] += prior * rng.standard_normal(4)
+        y = read(true)[0][rows] + sigma * rng.standard_normal(len(rows))
+        y[power] += bias * rng.standard_normal()
+        for label, use in (("before", without), ("after", list(range(len(rows))))):
+            found, cov = _most_probable(read, start, y[use], [rows[i] for i in use],
+                                        claimed[use], prior)  # fmt: skip
+            e = (found - true)[2:]
+            errors[label].append(e)
+        nees.append(float(e @ np.linalg.solve(cov[2:, 2:], e)) / 4)
+    before, after = np.array(errors["before"]), np.array(errors["after"])
+    null = np.array(
+        list(shaft_power_snapshot(point, samples=samples, prior=prior)["null"].values())
+    )
+
+    def rms(e: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(e**2)))
+
+    n = len(before)
+    pick = np.random.default_rng(0).integers(0, n, (2000, n))
+    square = np.array([(e**2).sum(1) for e in (before, after)])
+    drawn = 1 - np.sqrt(square[1][pick].sum(1) / square[0][pick].sum(1))
+    low, high = (float(q) for q in np.quantile(drawn, [0.025, 0.975]))
+    band = scipy.stats.chi2.ppf([0.025, 0.975], 4 * n) / (4 * n)
+    return Trials(
+        seeds=n,
+        rms_before=rms(before),
+        rms_after=rms(after),
+        bound_before=float(np.sqrt(np.trace(g.only(BASE).covariance()) / 4)),
+        bound_after=float(np.sqrt(np.trace(g.covariance()) / 4)),
+        reduction=1 - rms(after) / rms(before),
+        interval=(low, high),
+        nees=float(np.mean(nees)),
+        nees_band=(float(band[0]), float(band[1])),
+        null_before=rms(before @ null),
+        null_after=rms(after @ null),
+    )
+
+
+def _most_probable(
+    read: _Reader,
+    start: np.ndarray,
+    y: np.ndarray,
+    rows: Sequence[int],
+    sigma: np.ndarray,
+    prior: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the most probable (N, Wf, health) and its covariance, by Gauss-Newton."""
+    v = start.copy()
+    weights = np.array([0.0, 0.0, *[1 / prior] * 4])
+    for _ in range(20):
+        h, H = read(v)
+        A = np.vstack([H[rows] / sigma[:, None], np.diag(weights)]) * start
+        r = np.concatenate([(y - h[rows]) / sigma, weights * (start - v)])
+        step = start * np.linalg.lstsq(A, r, rcond=None)[0]
+        v = v + step
+        if np.abs(step / start).max() < 1e-8:
+            return v, np.asarray(np.linalg.inv(A.T @ A) * np.outer(start, start))
+    raise EstimationError(
+        f"the most probable health was not found in 20 steps; last step "
+        f"{np.abs(step / start).max():.1e} of the nominal values"
+    )
+
+
+# ---------------------------------------------------------------------- generator
+
+
+@dataclass(frozen=True)
+class Severity:
+    """What one fault's severity looks like from the terminals.
+
+    Args:
+        fault: the short circuit.
+        h: its severity h.
+        periods: electrical periods that were averaged.
+        sigma_mu, sigma_k_rf: bounds on the standard deviations of log mu and log k_rf, both
+            unknown; inf on the ridge.
+        sigma_h: bound on that of log h.
+        correlation: of the estimates of log mu and log k_rf; NaN on the ridge.
+        rank, rank_with_kappa: combinations of (mu, k_rf), and of (mu, k_rf, kappa), that show.
+        ratio: reactance over resistance of the equivalent shunt, w L/R: what tells mu from k_rf.
+    """
+
+    fault: Ttsc
+    h: float
+    periods: int
+    sigma_mu: float
+    sigma_k_rf: float
+    sigma_h: float
+    correlation: float
+    rank: int
+    rank_with_kappa: int
+    ratio: float
+
+
+@kept
+def _shunt(machine: Generator) -> ca.Function:
+    """Function (log mu, log k_rf, kappa, V, w, t) -> current of the shunt, A, steady state.
+
+    Terminal voltage sqrt(2) V cos(w t); current out of the terminal counts positive.
+    """
+    p = machine.machine
+    log_mu, log_k, kappa, V, w, t = (ca.SX.sym(n) for n in ("m", "k", "kappa", "V", "w", "t"))
+    mu, k_rf = ca.exp(log_mu), ca.exp(log_k)
+    R = p.r_s * (k_rf + 1 - mu) / mu
+    X = w * (kappa - mu) * p.L_ls / mu
+    i = -math.sqrt(2.0) * V * (R * ca.cos(w * t) + X * ca.sin(w * t)) / (R**2 + X**2)
+    args = [log_mu, log_k, kappa, V, w, t]
+    names = ["log_mu", "log_k_rf", "kappa", "V", "w", "t"]
+    along = ca.jacobian(i, ca.vertcat(log_mu, log_k, kappa))
+    return ca.Function("shunt", args, [i, along, X / R], names, ["i", "i_theta", "ratio"])
+
+
+def severity(
+    fault: Ttsc,
+    *,
+    periods: int = 8,
+    gain_error: bool = True,
+    kappa_known: bool = True,
+    generator: Generator | None = None,
+    load: float = 225e3,
+) -> tuple[Sensitivities, float]:
+    """Return the sensitivities of the faulty phase's current to the severity, and w L/R.
+
+    The generator is the healthy machine with a shunt from terminal to neutral, R = r_s/h,
+    L = (kappa - mu) L_ls/mu; at given voltages the healthy part does not depend on the fault.
+    Voltages are balanced, sinusoidal and taken as known, so that the bounds are optimistic:
+    voltage noise comes on top.  If kappa = mu it is tied to mu, the paper's own model.
+
+    Args:
+        fault: the short circuit.
+        periods: electrical periods, sampled at 10 kHz.
+        gain_error: consider the gain error of the current's sensor.
+        kappa_known: otherwise kappa is unknown as well, without a prior.
+        generator, load: the machine, and its load, W, balanced and resistive.
+
+    Raises:
+        ParameterError: periods not positive, or k_rf = 0, which has no logarithm.
+    """
+    if periods < 1 or not fault.k_rf > 0:
+        raise ParameterError(f"periods >= 1 and k_rf > 0 expected, got {periods!r}, {fault!r}")
+    gen = Generator() if generator is None else generator
+    at = gen.steady_state(SeriesLoad.from_power(load))
+    w, V = float(at.u[0]), at.V_t
+    n = round(periods * 2 * math.pi / w / 1e-4)
+    t = 1e-4 * np.arange(n)
+    tied = fault.kappa == fault.mu
+    args = (math.log(fault.mu), math.log(fault.k_rf), fault._kappa, V, w, t[None, :])
+    i, along, ratio = (a.full() for a in _shunt(gen)(*args))
+    J = along.reshape(3, n, order="F").T if along.shape[0] == 3 else along.reshape(n, 3)
+    if tied:  # kappa = mu moves with mu
+        J = np.column_stack([J[:, 0] + fault.mu * J[:, 2], J[:, 1]])
+    current = math.sqrt(2.0) * load / 3 / V * np.cos(w * t) + i[0]
+    signals = [
+        Signal("log_mu", "1", "logarithm of the shorted fraction of turns"),
+        Signal("log_k_rf", "1", "logarithm of fault over shorted-turn resistance"),
+    ]
+    if not tied and not kappa_known:
+        signals.append(Signal("kappa", "1", "leakage partition"))
+    faults = [s.name for s in signals]
+    J = J[:, : len(signals)]
+    prior = {}
+    sensor = ELECTRICAL["i_a"]
+    if gain_error:
+        signals.append(Signal("gain_i_a", "1", "gain error of the current sensor"))
+        J = np.column_stack([J, current])
+        prior["gain_i_a"] = sensor.gain
+    return (
+        Sensitivities.of(
+            Signals(signals), ["i_a"] * n, J, np.full(n, sensor.noise), faults=faults,
+            prior=prior, size=dict.fromkeys(faults, 0.1),
+        ),
+        float(ratio.ravel()[0]),
+    )  # fmt: skip
+
+
+#: Severities of the study: (mu, k_rf).
+SEVERITIES = ((0.05, 1.0), (0.02, 1.0), (0.01, 1.0), (0.01, 10.0), (0.002, 20.0))
+
+
+def severity_study(
+    severities: Sequence[tuple[float, float]] = SEVERITIES,
+    kappas: Sequence[float | None] = (None, 0.5, 1.0),
+    *,
+    periods: int = 8,
+    gain_error: bool = True,
+) -> list[Severity]:
+    """Return what is known of log mu and log k_rf, for every severity and kappa (None: mu).
+
+    Raises:
+        ParameterError: see :func:`severity`.
+    """
+    out = []
+    for mu, k_rf in severities:
+        for kappa in kappas:
+            fault = Ttsc(mu, k_rf, kappa)
+            options: dict[str, Any] = {"periods": periods, "gain_error": gain_error}
+            g, ratio = severity(fault, **options)
+            found = identify(g)
+            three = identify(severity(fault, kappa_known=False, **options)[0])
+            # log h = log mu - log(k_rf + 1 - mu)
+            a = np.array([1 + mu / (k_rf + 1 - mu), -k_rf / (k_rf + 1 - mu)])
+            out.append(
+                Severity(
+                    fault=fault,
+                    h=fault.h,
+                    periods=periods,
+                    sigma_mu=float(found.sigma_flat[0]),
+                    sigma_k_rf=float(found.sigma_flat[1]),
+                    sigma_h=_along(g, a),
+                    correlation=float(found.correlation[0, 1]) if found.rank == 2 else math.nan,
+                    rank=found.rank,
+                    rank_with_kappa=three.rank,
+                    ratio=ratio,
+                )
+            )
+    return out
+
+
+def _along(g: Sensitivities, a: np.ndarray) -> float:
+    """Return the bound on the standard deviation of a' theta without priors; inf if unseen."""
+    M = g.signatures()
+    _, s, Vt = np.linalg.svd(M, full_matrices=False)
+    seen = s > 1e-8 * s[0]
+    c = Vt @ a
+    if np.abs(a - Vt[seen].T @ c[seen]).max() > 1e-6 * np.abs(a).max():
+        return math.inf
+    return float(np.linalg.norm(c[seen] / s[seen]))
+
+
+def findings(point: str, sensors: Sequence[str], **options: Any) -> Identifiability:
+    """Return what some sensors can know at a point; options are those of :func:`gas_path`.
+
+    Raises:
+        ParameterError: unknown point. SignalError : unknown sensor.
+    """
+    return identify(gas_path(point, **options), sensors)

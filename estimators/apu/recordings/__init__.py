@@ -1,0 +1,1 @@
+"""Recorded data files: columns, time, units, and what a reading can be."""

@@ -1,0 +1,187 @@
+"""Columns of recorded data out of Parquet and netCDF, by pandas and xarray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core.errors import DataError
+from estimators.apu.recordings.columns import Column, cut, header, parsed
+
+__all__ = ["netcdf_columns", "parquet_columns"]
+
+Tell = Callable[[str], None]
+
+
+def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
+    """Make a column of an array, or of a pandas series, of any type.
+
+    Raises:
+        DataError: infinite values, or a word among numbers; names the row.
+    """
+
+    def place(k: int) -> str:
+        return f"{path}, data row {k + 1}, column {name}"
+
+    dtype = getattr(raw, "dtype", None)
+    if type(dtype).__name__ == "CategoricalDtype":
+        raw = raw.astype(raw.cat.categories.dtype if raw.cat.categories.dtype.kind in "ifuM"
+                         else object)  # fmt: skip
+        dtype = raw.dtype
+    if type(dtype).__name__ == "DatetimeTZDtype":
+        raw = raw.dt.tz_convert("UTC").dt.tz_localize(None)
+    if hasattr(raw, "to_numpy"):
+        kind = getattr(dtype, "kind", "O")
+        if kind in "iuf" and getattr(dtype, "na_value", None) is not None:  # nullable numbers
+            raw = raw.to_numpy(dtype=float, na_value=np.nan) if raw.isna().any() else raw.to_numpy()
+        else:
+            raw = raw.to_numpy()
+    a = np.ma.filled(raw.astype(float), np.nan) if isinstance(raw, np.ma.MaskedArray) else (
+        np.asarray(raw))  # fmt: skip
+    if a.dtype.kind in "iuf":
+        values = a.astype(float)
+        if np.isinf(values).any():
+            k = int(np.argmax(np.isinf(values)))
+            raise DataError(f"{place(k)}: infinite value")
+        return Column(name, unit, values, a)
+    nothing = np.full(a.shape[0], np.nan)
+    if a.dtype.kind in "mM":
+        return Column(name, unit, nothing, a, f"{place(0)}: {a[0] if a.size else ''} is no number")
+    if a.dtype.kind == "S":
+        a = np.char.decode(a, "utf-8", "replace")
+    cells = [c.decode("utf-8", "replace") if isinstance(c, bytes) else c for c in a.tolist()]
+    if a.dtype.kind == "b":
+        return Column(name, unit, nothing, a, f"{place(0)}: {cells[0]} is no number")
+    if a.dtype.kind == "c":
+        return Column(name, unit, nothing, a, f"{place(0)}: complex numbers")
+    column = parsed(name, unit, cells, place, tell)
+    texts = [c for c in cells if isinstance(c, str) and c.strip()]
+    if column.problem is None and texts and np.isfinite(column.values).any():
+        tell(f"{place(0)}: numbers written as text, such as {cut(texts[0])}, are read as numbers")
+    return column
+
+
+# ------------------------------------------------------------------------------ Parquet
+
+
+def parquet_columns(path: Path, tell: Tell) -> list[Column]:
+    """Read a Parquet file; what its index holds is a column like the others."""
+    engines = ("pyarrow", "fastparquet")
+    engine = next((e for e in engines if find_spec(e)), None)
+    if engine is None or find_spec("pandas") is None:
+        raise DataError(
+            f"{path}: reading Parquet needs pandas and pyarrow: pip install pandas pyarrow; or "
+            "export the data as CSV"
+        )
+    pd: Any = import_module("pandas")
+    try:
+        frame = pd.read_parquet(path, engine=engine)
+    except Exception as e:  # damaged files fail with any type
+        raise DataError(f"{path}: damaged Parquet file ({type(e).__name__}: {e})") from None
+    columns = []
+    for level in range(frame.index.nlevels):
+        values = frame.index.get_level_values(level)
+        name = frame.index.names[level]
+        if type(frame.index).__name__ == "RangeIndex" and name is None:
+            continue
+        if name is None:
+            name = "time" if getattr(values.dtype, "kind", "") in "mM" or (
+                type(values.dtype).__name__ == "DatetimeTZDtype") else f"index_{level}"  # fmt: skip
+        if name not in frame.columns:
+            columns.append(typed(path, *header(str(name)), values.to_series(), tell))
+    for i, label in enumerate(frame.columns):
+        name, unit = _label(path, label)
+        columns.append(typed(path, name, unit, frame.iloc[:, i], tell))
+    return columns
+
+
+def _label(path: Path, label: Any) -> tuple[str, Any]:
+    """Name and unit of a column; of several levels the first is the name, the second the unit."""
+    if not isinstance(label, tuple):
+        return header(str(label))
+    parts = [str(p).strip() for p in label if str(p).strip()]
+    if len(parts) == 2:
+        from estimators.apu.recordings.units import unit_of
+
+        unit = parts[1].strip("[]()")
+        if unit_of(unit) is not None:
+            return parts[0], unit
+    if len(parts) == 1:
+        return header(parts[0])
+    raise DataError(
+        f"{path}: column {label!r} has {len(label)} levels; write one level, NAME [UNIT]: "
+        "frame.columns = [...]"
+    )
+
+
+# ------------------------------------------------------------------------------ netCDF
+
+
+def netcdf_columns(path: Path, tell: Tell) -> tuple[list[Column], dict[str, str]]:
+    """Read a netCDF file; return its columns, and why other variables are none."""
+    import xarray as xr
+
+    from apu_casadi.core.results import load
+
+    with path.open("rb") as f:
+        start = f.read(4)
+    data = _netcdf4(path) if start == b"\x89HDF" else load(path)
+    sizes = {d: int(n) for d, n in data.sizes.items()}
+    if not sizes:
+        raise DataError(f"{path}: no data rows")
+    dim = "time" if "time" in sizes else max(sizes, key=lambda d: sizes[d])
+    out, others = [], {}
+    for name in [*data.coords, *data.data_vars]:
+        v = data[name].squeeze([d for d in data[name].dims if d != dim and sizes[d] == 1])
+        if v.dims != (dim,):
+            others[str(name)] = (
+                f"has the dimensions ({', '.join(map(str, v.dims))}); one value for each {dim} is "
+                "expected"
+            )
+            continue
+        try:  # missing_value and _FillValue, scale_factor and add_offset, as xarray knows them
+            v = xr.conventions.decode_cf_variable(
+                str(name), v.variable, decode_times=False, decode_timedelta=False
+            )
+            values = v.values
+        except Exception as e:  # attributes that are none, of any type
+            raise DataError(f"{path}, variable {name}: {type(e).__name__}: {e}") from None
+        unit = v.attrs.get("units")
+        out.append(typed(path, str(name), unit, values, tell))
+    return out, others
+
+
+def _netcdf4(path: Path) -> Any:
+    import xarray as xr
+
+    try:
+        with xr.open_dataset(path, decode_times=False) as ds:
+            data = ds.load()
+    except ValueError:
+        raise DataError(
+            f"{path}: a netCDF 4 file; reading it needs h5netcdf: pip install h5netcdf"
+        ) from None
+    except Exception as e:  # damaged files fail with any type
+        raise DataError(f"{path}: damaged netCDF file ({type(e).__name__}: {e})") from None
+    if not data.variables:
+        groups = _groups(path)
+        if groups:
+            raise DataError(
+                f"{path}: the variables are in groups ({', '.join(groups)}), which are not read: "
+                "save one of them as a file of its own, xarray.open_dataset(path, group=...)"
+            )
+    return data
+
+
+def _groups(path: Path) -> list[str]:
+    import xarray as xr
+
+    try:
+        return [g for g in xr.open_groups(path, decode_times=False) if g != "/"]
+    except Exception:  # only for the message
+        return []

@@ -1,0 +1,187 @@
+"""What a reading of each quantity can be: one table, and what to do with one that cannot.
+
+The ranges hold for a running engine of this class in the whole flight envelope, shut-down and
+start excluded: trims over 0 to 15 km, Mach 0 to 0.9, ISA -55 to +40 K, 75 to 105 % speed and all
+powers, widened by a fifth or so for faults and sensors.  They are there to find what is no reading
+at all (a sentinel, a missing unit, a zero of a dead channel), not to judge an engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.gaspath.conditions import RANGES
+from estimators.apu.recordings.units import UNITS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["PLAUSIBLE", "Limits", "parse_limits"]
+
+_COLD, _HOT = (150.0, 420.0), (300.0, 1200.0)
+_AMBIENT_P, _HIGH_P = (5e3, 2.5e5), (4e4, 2e6)
+_FLOW = (0.1, 10.0)
+#: Quantity -> (lowest, highest), SI.
+PLAUSIBLE: dict[str, tuple[float, float]] = {
+    "N": (1500.0, 4600.0),  # 40 to 122 %
+    **dict.fromkeys(("T0", "T1", "T2"), _COLD),
+    "T3": (300.0, 800.0),
+    **dict.fromkeys(("T4", "T41"), (400.0, 1900.0)),
+    **dict.fromkeys(("T50", "T5", "T8"), _HOT),
+    "P0": (5e3, 1.15e5),
+    **dict.fromkeys(("P1", "P2", "P5", "P8"), _AMBIENT_P),
+    **dict.fromkeys(("P3", "Ps3", "P4"), _HIGH_P),
+    **dict.fromkeys(("W2", "W3", "W31", "W4", "W41", "W5", "W8"), _FLOW),
+    "Wf": (5e-4, 0.12),
+    "PW": (-2e4, 9e5),
+    "PR_c": (1.0, 20.0), "PR_t": (1.0, 20.0), "eta_c": (0.2, 1.0), "eta_t": (0.2, 1.0),
+    "SM": (-0.5, 2.0), "Mach8": (0.0, 1.0), "V8": (0.0, 700.0),
+    **RANGES,  # of the ambient conditions: what the engine takes
+}  # fmt: skip
+#: Quantities whose range holds zero: without a unit, a largest reading below this is not in SI.
+_SMALL = {"PW": 2e3}
+_TEMPERATURES = ("degC", "degF", "degR")
+#: What loggers write for "no reading", where a range would let it pass.
+_SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The ranges of a file's readings, and whether what lies outside is left out.
+
+    Args:
+        ranges: quantity -> (lowest, highest), SI; what is not named is not judged.
+        exclude: make a gap of an impossible reading instead of refusing the file.
+    """
+
+    ranges: Mapping[str, tuple[float, float]]
+    exclude: bool = False
+
+    def apply(
+        self,
+        name: str,
+        si: str,
+        values: np.ndarray,
+        raw: np.ndarray,
+        unit: str | None,
+        where: Callable[[int], str],
+        tell: Callable[[str], None],
+        *,
+        mixed: bool = False,
+    ) -> np.ndarray:
+        """Return the values with what is excluded as NaN.
+
+        Args:
+            name, si: quantity and its unit.
+            values, raw, unit: readings in SI, as they stand in the file, and the file's unit.
+            where: says where reading k stands: file, column, row.
+            tell: takes one sentence on what was excluded.
+            mixed: other columns of the file have units, so that a bare name leaves a question.
+
+        Raises:
+            DataError: an impossible reading, with file, column, row and value.
+        """
+        if name not in self.ranges:
+            return values
+        low, high = self.ranges[name]
+        out = np.isfinite(values) & ((values < low) | (values > high) | np.isin(raw, _SENTINELS))
+        there = np.isfinite(values)
+        if not out.any():
+            if unit is None and there.any():
+                self._bare(name, si, values[there], where(int(np.argmax(there))), mixed)
+            return values
+        k = int(np.argmax(out))
+        shown = f"{raw[k]:.9g} {unit or si}"
+        if unit not in (None, si):
+            shown += f" = {values[k]:.6g} {si}"
+        count = f"{int(out.sum())} of {int(there.sum())} readings"
+        limits = f"{low:g} to {high:g}" + ("" if si == "1" else f" {si}")
+        others = _fits(si, raw[there], low, high)
+        if others and out.sum() * 2 >= there.sum() and self._many(values[there], low, high):
+            meant = " or ".join(others)
+            raise DataError(
+                f"{where(k)}: {'unit missing' if unit is None else 'wrong unit'}? {raw[k]:.9g} is "
+                f"plausible as {meant}, not as {unit or si} ({name} lies within {limits}): write "
+                f"the unit into the header, {name} [{others[0]}], or give --column "
+                f"{name}={name}:{others[0]}"
+            )
+        if not self.exclude:
+            raise DataError(
+                f"{where(k)}: {shown} is no possible {name} ({limits}; {count}): give --missing "
+                f"{raw[k]:.9g} if that stands for a gap, --exclude-implausible to leave such "
+                f"readings out, or --range {name}=LOW:HIGH in {si} if they are right"
+            )
+        if out.sum() == there.sum():
+            raise DataError(
+                f"{where(k)}: {shown} is no possible {name} ({limits}), nor is any other reading "
+                "of this column: nothing is left of it"
+            )
+        tell(f"{where(k)}: {shown} is no possible {name} ({limits}); {count} left out")
+        return np.where(out, np.nan, values)
+
+    @staticmethod
+    def _many(values: np.ndarray, low: float, high: float) -> bool:
+        """Whether the column as a whole is off, and not one reading of several."""
+        middle = float(np.median(values))
+        return not low <= middle <= high
+
+    def _bare(self, name: str, si: str, values: np.ndarray, where: str, mixed: bool) -> None:
+        """Refuse a column without unit whose readings may be in another one as well."""
+        low, high = self.ranges[name]
+        top = float(np.abs(values).max())
+        if 0 < top < _SMALL.get(name, 0.0):
+            raise DataError(
+                f"{where}: unit missing? the largest {name} is {top:.6g}, plausible as kW, hardly "
+                f"as {si}: give --column {name}={name}:kW, or --column {name}={name}:{si}"
+            )
+        if mixed and si == "K" and name != "dT_isa":
+            # a hot section in degC looks like a cool one in K
+            others = [u for u in ("degC",) if u in _fits(si, values, low, min(high, 950.0))]
+            if others:
+                raise DataError(
+                    f"{where}: unit missing? other columns of this file have one, and "
+                    f"{values[0]:.6g} is plausible as {others[0]} and as K: give --column "
+                    f"{name}={name}:{others[0]} or --column {name}={name}:K"
+                )
+
+
+def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
+    """Return the units in which all the readings would be plausible."""
+    order = {"K": _TEMPERATURES, "Pa": ("kPa", "bar", "psi", "hPa", "MPa"), "rad/s": ("rpm",),
+             "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"), "W": ("kW", "hp", "MW"),
+             "m": ("ft", "km")}.get(si, ())  # fmt: skip
+    found = []
+    for unit in order:
+        _, factor, offset = UNITS[unit]
+        v = raw * factor + offset
+        if ((v >= low) & (v <= high)).all():
+            found.append(unit)
+    return found[:2]
+
+
+def parse_limits(items: list[str]) -> dict[str, tuple[float, float]]:
+    """Read options like ``T5=250:1300``: ranges in SI that replace those of the table.
+
+    Raises:
+        DataError: not of that form, an unknown quantity, or no range.
+    """
+    out = {}
+    for item in items:
+        name, _, span = item.partition("=")
+        low, _, high = span.partition(":")
+        name = name.strip()
+        if name not in PLAUSIBLE:
+            raise DataError(f"range {item!r}: unknown quantity {nearest(name, PLAUSIBLE)}")
+        try:
+            pair = float(low), float(high)
+        except ValueError:
+            raise DataError(f"range {item!r}: NAME=LOW:HIGH is expected, in SI") from None
+        if not pair[0] < pair[1]:
+            raise DataError(f"range {item!r}: the first number must be below the second")
+        out[name] = pair
+    return out

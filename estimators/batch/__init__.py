@@ -1,0 +1,1 @@
+"""Estimates from whole recordings: smoothers, moving horizons, fits."""

@@ -1,0 +1,1 @@
+"""Recursive filters, one module each, and the belief that they carry."""

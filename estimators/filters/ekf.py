@@ -1,0 +1,207 @@
+"""The extended Kalman filter, plain and iterated, with exact Jacobians.
+
+Schmidt (1966) and Jazwinski (1970), Stochastic Processes and Filtering Theory, chapter 8; the
+update in Joseph's form, which is right for any gain and so also for considered parameters
+(Schmidt-Kalman).  The iterated update is Gauss-Newton on the *prior* and the sample (Bell and
+Cathey 1993): the prior is never replaced by the posterior, which would count the sample twice.
+
+State and noise w are corrected together, since w acts on the output and on the transition that
+follows; with w absent from the output this is the usual filter.
+
+What to linearise anew.  The score of a sample is unbiased where its derivative H does not hang on
+the error of the same sample.  A predicted state does not; the corrected one does, and iterating it
+leaves out the derivative of log det S that would make up for it: small, but the same in each
+sample, so that it adds up along a recording.  The error w of a *measured input* is the other way
+round: the prediction is made at the reading, error and all, and the corrected w takes a part of it
+out again.  Hence ``iterated="noise"``, which moves w alone; ``"all"`` is for states that are far
+from known, where one sample moves them further than the model is straight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import casadi as ca
+
+from apu_casadi.core.errors import ParameterError, nearest
+from apu_casadi.core.sharing import kept, once
+from estimators.filters.algebra import backward, cholesky, forward, symmetric
+from estimators.filters.belief import Belief
+from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
+from estimators.filters.rootfilter import ekf_root_step
+from estimators.filters.stepparts import kind_of, projected, step_symbols
+from estimators.models.filtermodel import FilterModel
+from estimators.models.recording import Recording
+
+__all__ = ["ITERATED", "Corrected", "correct", "ekf_step", "extended_kalman_filter"]
+
+ITERATED = ("all", "noise")
+
+
+class Corrected(NamedTuple):
+    """A Gaussian after a linear update.
+
+    Args:
+        d: change of the mean, (n,).
+        P: covariance, (n, n).
+        S: covariance of the innovation; 1 on the diagonal where nothing was measured.
+        nis, loglik: normalised innovation squared, log-likelihood.
+        measured: number of outputs measured.
+    """
+
+    d: Any
+    P: Any
+    S: Any
+    nis: Any
+    loglik: Any
+    measured: Any
+
+
+@once
+def _kernel(P_at: tuple[int, ...], H_at: tuple[int, ...], fixed: tuple[int, ...]) -> ca.Function:
+    """The update as an SX Function (P, H, nu, R) -> Corrected; ``fixed`` rows have no gain.
+
+    ``P_at``, ``H_at`` are the patterns of P and H, compressed: what is zero by structure is left
+    out.
+    """
+    P, H = (ca.SX.sym(n, ca.Sparsity.compressed(list(at))) for n, at in (("P", P_at), ("H", H_at)))
+    ny = H.shape[0]
+    nu, R = ca.SX.sym("nu", ny), ca.SX.sym("R", ny)
+    out = ca.cse(list(_corrected(P, H, nu, R, fixed)))
+    return ca.Function("correct", [P, H, nu, R], [ca.densify(o) for o in out])
+
+
+def _corrected(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) -> Corrected:
+    n, ny = P.shape[0], H.shape[0]
+    there = R >= 0
+    H = ca.diag(there) @ H
+    nu = there * nu
+    R = ca.if_else(there, R, 0)
+    PH = P @ H.T
+    S = symmetric(H @ PH + ca.diag(ca.if_else(there, R, 1)))
+    L = cholesky(S)
+    a = forward(L, nu)
+    K = backward(L, forward(L, PH.T)).T
+    if fixed:
+        keep = ca.SX.ones(n)
+        keep[list(fixed)] = 0
+        K = ca.diag(keep) @ K
+    A = ca.SX.eye(n) - K @ H
+    P1 = symmetric(A @ P @ A.T + K @ ca.diag(R) @ K.T)
+    nis = ca.dot(a, a)
+    measured = ca.sum1(there)
+    logdet = 2 * sum((ca.log(L[i, i]) for i in range(ny)), ca.SX(0))
+    loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
+    return Corrected(K @ nu, P1, S, nis, loglik, measured)
+
+
+def correct(P: Any, H: Any, nu: Any, R: Any, fixed: tuple[int, ...] = ()) -> Corrected:
+    """Update a covariance P (n, n) with a sample, Joseph's form.
+
+    Args:
+        P: covariance before.
+        H: output Jacobian, (ny, n).
+        nu: innovation, (ny,).
+        R: variances of the sample, (ny,); negative where nothing was measured.
+        fixed: rows of considered states, whose mean and variance stay.
+    """
+    if isinstance(P, ca.SX):
+        return _corrected(P, H, nu, R, fixed)
+    P_at, H_at = (tuple(M.sparsity().compress()) for M in (P, H))
+    return Corrected(*_kernel(P_at, H_at, fixed)(P, H, nu, R))
+
+
+@kept
+def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
+    """Build the filter's step for a model.
+
+    Args:
+        model: the model.
+        iterations: Gauss-Newton iterations of the update; 1 is the plain filter.
+        iterated: what the output is linearised anew at: ``"all"``, state and noise w as corrected,
+            or ``"noise"``, the corrected w and the predicted state; see the module's text.
+
+    Raises:
+        ParameterError: iterations not a whole number from 1 to 10; unknown ``iterated``; a model
+            without states.
+    """
+    if iterated not in ITERATED:
+        raise ParameterError(f"iterated {iterated!r} {nearest(iterated, ITERATED)}")
+    if not (isinstance(iterations, int) and 1 <= iterations <= 10):
+        raise ParameterError(f"iterations must be a whole number from 1 to 10, got {iterations!r}")
+    if not len(model.x):
+        raise ParameterError(f"{model.name} has no states to estimate")
+    model = model.expanded()
+    kind = kind_of(model)
+    nx, _, _, nw, _ = model.sizes
+    fixed = tuple(model.x.indices(model.consider))
+    m, P, u, p, y, R, dt = step_symbols(model, kind)
+    prior = ca.vertcat(m, kind.zeros(nw))
+    Pa = ca.diagcat(P, kind.eye(nw)) if nw else P
+
+    s = kind.sym("s", nx + nw)
+    h, check_h = model.output(s[:nx], u, p, s[nx:])
+    outputs = ca.Function("outputs", [s, u, p], [h, ca.jacobian(h, s), check_h])
+    x1, check_f = model.transition(s[:nx], u, p, s[nx:], dt)
+    forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_f])
+
+    at, check, first = prior, kind(0), None
+    done = moved = None
+    for _ in range(iterations):
+        h, H, c = outputs(at, u, p)
+        # linearised at the iterate, but always an update of the prior
+        done = correct(Pa, H, y - h + H @ (at - prior), R, fixed)
+        if first is None:
+            first = done, y - h
+        moved, check = prior + done.d, check + c
+        at = moved if iterated == "all" else ca.vertcat(m, moved[nx:])
+    assert done is not None and first is not None
+    at = projected(moved, done.P, model.lower, model.upper, fixed)
+    x1, F, c = forecast(at, u, p, dt)
+    C = done.P[:nx, :] @ F.T
+    P1 = ca.mtimes(F, done.P @ F.T) + ca.diag(ca.DM(model.walk**2)) * dt
+    P1 = ca.tril(P1) + ca.tril(P1, False).T  # half the work, exactly symmetric
+    nu = ca.if_else(R >= 0, first[1], 0)
+    stats = ca.vertcat(check + c, first[0].nis, first[0].loglik, first[0].measured)
+    out = [x1, P1, at[:nx], done.P[:nx, :nx], C, nu, first[0].S, stats]
+    out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
+    kept = "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"
+    name = f"ekf{kept}_{model.name}"
+    function = ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT)
+    return FilterStep(model, function, wide=partial(_with_roots, model, iterations, iterated))
+
+
+def _with_roots(model: FilterModel, iterations: int, iterated: str) -> FilterStep:
+    """The same filter in square-root form; made only where it is needed."""
+    return ekf_root_step(model, iterations, iterated)
+
+
+def extended_kalman_filter(
+    model: FilterModel,
+    prior: Belief,
+    data: Recording,
+    *,
+    iterations: int = 1,
+    iterated: str = "all",
+    full: bool = False,
+    backend: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> FilterResult:
+    """Filter a recording: p(x(k) | y(0..k)) as Gaussians.
+
+    Args:
+        model: the model.
+        prior: belief at the first instant, before its sample.
+        data: the recording.
+        iterations: Gauss-Newton iterations of each update; 1 is the plain filter.
+        iterated: ``"all"`` or ``"noise"``; see :func:`ekf_step`.
+        full, backend, progress: see :func:`estimators.filters.filtering.run`.
+
+    Raises:
+        DataError, SignalError, EstimationError: see :func:`estimators.filters.filtering.run`.
+    """
+    step = ekf_step(model, iterations, iterated)
+    return run(step, prior, data, full=full, backend=backend, progress=progress)

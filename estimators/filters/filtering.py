@@ -1,0 +1,495 @@
+"""What all recursive filters share: running a step over a recording, and what comes out.
+
+A filter is one CasADi function, a *step*: correct the belief with a sample, then carry it to the
+next sample.  :func:`run` folds it over a recording, ``BLOCK`` samples in one call, in generated C
+where there is a compiler; Python is not crossed for each sample.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.errors import EstimationError, SignalError
+from apu_casadi.core.results import dataset
+from apu_casadi.core.sharing import Parametric, derived, kept
+from apu_casadi.core.signals import Signal, Signals
+from estimators.filters.algebra import cholesky_semidefinite, root_of
+from estimators.filters.belief import Belief
+from estimators.models.filtermodel import CHECK_TOL, FilterModel
+from estimators.models.recording import Recording
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "BLOCK",
+    "STEP_IN",
+    "STEP_OUT",
+    "FilterResult",
+    "FilterStep",
+    "block_of",
+    "narrow",
+    "padded",
+    "run",
+]
+
+CHAIN = 10  # a block is this many chains of this many steps
+BLOCK = CHAIN**2  # samples in one call
+STEP_IN = ["m", "P", "u", "p", "y", "R", "dt"]
+STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
+"""Of a step: belief before the sample, inputs, parameters, sample, variances (< 0: not measured),
+step to the next sample; then the predicted belief at the next sample, the filtered belief, the
+cross-covariance of filtered state and next state, innovation, its covariance, and ``STATS``."""
+STATS = ("check", "nis", "loglik", "measured")
+ROOT_OUT = ["Y", "Z", "Lf"]
+"""What a step in square-root form may give beside: roots for the smoother, see
+:mod:`estimators.filters.rootfilter`."""
+WIDE = 1e7  # innovation over noise variance from which a covariance loses more than eight digits
+NARROW = 1e-9  # share of a variance that is left when the other states are known; below: the same
+
+
+@dataclass(frozen=True, eq=False)
+class FilterStep(Parametric):
+    """A filter for a model: one function, and its compiled forms.
+
+    Args:
+        model: the model.
+        function: Function ``STEP_IN`` -> ``STEP_OUT``.
+        root: the filter carries square roots: ``P`` and ``P1`` (and only these) are lower
+            triangular factors L of the covariance L L'.
+        wide: makes the same filter in square-root form, for beliefs whose covariance double
+            precision does not hold; None where there is none.
+    """
+
+    model: FilterModel
+    function: ca.Function
+    root: bool = False
+    wide: Callable[[], FilterStep] | None = None
+
+    @property
+    def gives_roots(self) -> bool:
+        """Whether the function gives ``ROOT_OUT`` too."""
+        return bool(self.function.n_out() > len(STEP_OUT))
+
+    @derived
+    def plain(self) -> FilterStep:
+        """The same filter with covariances in and out, for use inside other functions.
+
+        A filter that carries square roots then takes one root more at each step.
+        """
+        if not self.root:
+            return self
+        s = [ca.MX.sym(self.function.name_in(i), self.function.size1_in(i),
+                       self.function.size2_in(i)) for i in range(len(STEP_IN))]  # fmt: skip
+        P = ca.SX.sym("P", s[1].shape[0], s[1].shape[0])
+        root = ca.Function("root", [P], [ca.densify(cholesky_semidefinite(P))])
+        out = list(self.function(s[0], root(s[1]), *s[2:]))[: len(STEP_OUT)]
+        P1 = out[1] @ out[1].T
+        out[1] = ca.densify(ca.tril(P1) + ca.tril(P1, False).T)
+        name = f"{self.function.name()}_plain"
+        return FilterStep(self.model, ca.Function(name, s, out, STEP_IN, STEP_OUT))
+
+
+@dataclass(frozen=True, eq=False)
+class FilterResult:
+    """What a filter believed along a recording of K instants.
+
+    Args:
+        x, y: states and outputs.
+        t: instants, s, shape (K,).
+        mean, variance: filtered, shapes (nx, K).
+        innovation, innovation_variance: measured minus predicted and its variance, shapes (ny, K);
+            NaN where nothing was measured.
+        nis: normalised innovation squared of each sample, shape (K,); chi-squared with ``measured``
+            degrees of freedom if the filter is consistent.
+        measured: number of outputs measured at each instant, shape (K,).
+        loglik: log-likelihood of the recording.
+        final: belief at the last instant, after its sample.
+        cov: filtered covariances, shape (K, nx, nx); None unless kept.
+        mean_pred, cov_pred: belief before each sample, shapes (nx, K), (K, nx, nx); None unless
+            kept.
+        cross: covariance of the filtered state at k and the predicted one at k+1, (K, nx, nx).
+        innovation_cov: covariances of the innovations, (K, ny, ny), 1 on the diagonal where nothing
+            was measured; None unless kept.
+        roots: roots of the predicted covariance before each sample, and Y, Z and the root of the
+            filtered covariance, each (K, nx, nx); see :mod:`estimators.filters.rootfilter`.
+        again: runs the same filter in square-root form and keeps the roots; None where it cannot.
+    """
+
+    x: Signals
+    y: Signals
+    t: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+    innovation: np.ndarray
+    innovation_variance: np.ndarray
+    nis: np.ndarray
+    measured: np.ndarray
+    loglik: float
+    final: Belief
+    cov: np.ndarray | None = None
+    mean_pred: np.ndarray | None = None
+    cov_pred: np.ndarray | None = None
+    cross: np.ndarray | None = None
+    innovation_cov: np.ndarray | None = None
+    roots: tuple[np.ndarray, ...] | None = field(default=None, repr=False)
+    again: Callable[[], FilterResult] | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: numbers and names, not the filter behind ``again``."""
+        return {**self.__dict__, "again": None}
+
+    def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (mean, standard deviation) of one state, each of shape (K,)."""
+        i = self.x.index(name)
+        return self.mean[i], np.sqrt(self.variance[i])
+
+    def to_dataset(self) -> xr.Dataset:
+        """Return means, standard deviations (``<name>_sigma``), innovations and NIS, labelled."""
+        signals, values = [], {}
+        for i, s in enumerate(self.x):
+            signals += [s, Signal(f"{s.name}_sigma", s.unit, f"standard deviation of {s.name}")]
+            values[s.name] = self.mean[i]
+            values[f"{s.name}_sigma"] = np.sqrt(self.variance[i])
+        for i, s in enumerate(self.y):
+            name = f"innovation_{s.name}"
+            signals += [
+                Signal(name, s.unit, f"measured minus predicted {s.name}"),
+                Signal(f"{name}_sigma", s.unit, f"its standard deviation: {s.name}"),
+            ]
+            values[name] = self.innovation[i]
+            values[f"{name}_sigma"] = np.sqrt(self.innovation_variance[i])
+        signals += [
+            Signal("nis", "1", "normalised innovation squared"),
+            Signal("measured", "1", "number of outputs measured"),
+        ]
+        values |= {"nis": self.nis, "measured": self.measured}
+        return dataset(
+            {"time": self.t},
+            {"time": values},
+            signals=signals,
+            attrs={"loglik": float(self.loglik)},
+        )
+
+
+def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
+    """Call ``f`` n times, as one function.
+
+    The first ``carried`` outputs go to the inputs of the same place in the next call; the last
+    input is the same for all calls, the others stand side by side, as do the last ``kept`` outputs;
+    of the others only the last are returned.
+
+    The same as ``mapaccum``, which takes a hundred times as long to build in CasADi 3.8.
+    """
+    ins = [ca.MX.sym(f.name_in(i), f.size1_in(i), f.size2_in(i)) for i in range(f.n_in())]
+    # a symbol without elements has no name to ask for
+    wide = [
+        ca.MX.sym(f.name_in(carried + i), s.shape[0], s.shape[1] * n)
+        for i, s in enumerate(ins[carried:-1])
+    ]
+    split = [ca.horzsplit(w, s.shape[1]) for w, s in zip(wide, ins[carried:-1], strict=True)]
+    now, results = ins[:carried], []
+    for k in range(n):
+        out = f(*now, *(s[k] for s in split), ins[-1])
+        now = out[:carried]
+        results.append(out)
+    first = f.n_out() - kept
+    out = [*results[-1][:first], *(ca.horzcat(*(r[i] for r in results))
+                                   for i in range(first, f.n_out()))]  # fmt: skip
+    return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
+
+
+def block_of(one: ca.Function, name: str, carried: int) -> ca.Function:
+    """Return ``BLOCK`` calls of a step as one function.
+
+    Args:
+        one: step; its first ``carried`` outputs are those inputs of the next call, its last input
+            is the same in all calls.
+        name: of the result, which takes the other inputs and gives the other outputs side by side.
+        carried: number of inputs that are handed on; of these outputs the last is returned.
+    """
+    kept = one.n_out() - carried
+    chain = _chained(one, CHAIN, f"{name}_chain", carried, kept)
+    return _chained(chain, CHAIN, f"{name}_block", carried, kept)
+
+
+@kept
+def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> ca.Function:
+    """``BLOCK`` steps in one function; ``_in_use`` keeps the forms of each backend apart.
+
+    (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
+    before each sample and C, S; matrices as columns.
+    """
+    nx, nu, np_, _, ny = step.model.sizes
+    s = [ca.MX.sym(n, *shape) for n, shape in zip(
+        STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
+    )]  # fmt: skip
+    m, P, u, p, y, R, dt = s
+    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
+    kept = [o["m_f"], ca.vec(o["P_f"]), o["nu"], ca.diag(o["S"]), o["stats"]]
+    if full:
+        kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
+    if step.gives_roots:
+        kept += [ca.vec(o[n]) for n in (ROOT_OUT if full else ROOT_OUT[-1:])]
+    name = f"{step.function.name()}{'_full' if full else ''}"
+    out = [o["m1"], o["P1"], *(ca.densify(k) for k in kept)]
+    one = ca.Function(f"{name}_one", [m, P, u, y, R, dt, p], out)
+    return compiled(block_of(one, name, 2), backend=backend)
+
+
+def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:
+    """Return (y, R, u, dt) as a step takes them, ``pad`` samples longer, one column a sample.
+
+    A padded sample measures nothing and lasts no time; what comes out of it is dropped.
+    """
+    missing = np.isnan(data.y)
+    y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
+    R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
+    u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
+    dt = np.pad(data.dt, (0, pad))[None, :]
+    return y, R, u, dt
+
+
+def run(
+    step: FilterStep,
+    prior: Belief,
+    data: Recording,
+    *,
+    full: bool = False,
+    backend: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> FilterResult:
+    """Run a filter over a recording.
+
+    Args:
+        step: the filter.
+        prior: belief at the first instant, before its sample.
+        data: the recording.
+        full: keep the covariances and what smoothers need; 3 nx^2 numbers for each instant.
+        backend: see :func:`apu_casadi.core.backend.compiled`.
+        progress: called with (done, total) instants after every block.
+
+    Raises:
+        DataError: the recording does not fit the model.
+        SignalError: the prior is of other states.
+        EstimationError: the model could not be evaluated, or the belief is no longer finite; names
+            the instant and the state.
+    """
+    model = step.model
+    data.check(model)
+    if prior.x.names != model.x.names:
+        raise SignalError(
+            f"prior of {', '.join(prior.x.names)}; {model.name} has {', '.join(model.x.names)}"
+        )
+    passes = _Passes(step, prior, full, backend)
+    nx, _, _, _, ny = model.sizes
+    K = data.size
+    n_blocks = -(-K // BLOCK)
+    pad = n_blocks * BLOCK - K
+    missing = np.isnan(data.y)
+    y, R, u, dt = padded(data, pad)
+    mean, var = np.empty((nx, K)), np.empty((nx, K))
+    nu, S = np.empty((ny, K)), np.empty((ny, K))
+    stats = np.empty((len(STATS), K))
+    kept = _Kept.of(K, nx, ny, roots=step.gives_roots) if full else None
+    for b in range(n_blocks):
+        s = slice(b * BLOCK, (b + 1) * BLOCK)
+        n = min(BLOCK, K - b * BLOCK)
+        r = slice(b * BLOCK, b * BLOCK + n)
+        out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
+        for target, source in (
+            (mean, out[2]), (var, out[3][:: nx + 1]), (nu, out[4]), (S, out[5]), (stats, out[6])
+        ):  # fmt: skip
+            target[:, r] = source[:, :n]
+        _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
+        if kept is not None:
+            kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=passes.rooted)
+        if progress is not None:
+            progress(b * BLOCK + n, K)
+    last = out[3][:, n - 1].reshape(nx, nx)
+    last = (last + last.T) / 2
+    np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
+    root = None if not passes.now.gives_roots else out[-1][:, n - 1].reshape(nx, nx).T.copy()
+    np.maximum(var, 0.0, out=var)  # rounding, judged above
+    nu[missing], S[missing] = np.nan, np.nan
+    again = None
+    if full and step.wide is not None:
+        again = partial(_rooted, step, prior, data, backend)
+    return FilterResult(
+        model.x, model.y, data.t, mean, var, nu, S, stats[1], stats[3], float(stats[2].sum()),
+        Belief(model.x, mean[:, -1].copy(), last, root),
+        **({} if kept is None else kept.fields()), again=again,
+    )  # fmt: skip
+
+
+def _rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
+    """Run a filter in square-root form from the beginning."""
+    assert step.wide is not None
+    return run(step.wide(), prior, data, full=True, backend=backend)
+
+
+class _Passes:
+    """A filter's blocks one after the other, in square-root form where a covariance loses digits.
+
+    Args:
+        step: the filter. prior, full, backend : as of :func:`run`.
+    """
+
+    def __init__(self, step: FilterStep, prior: Belief, full: bool, backend: str | None) -> None:
+        self.step = self.now = step
+        self.full, self.backend = full, backend
+        self.m = prior.mean.copy()
+        self.P = prior.cov.copy()
+        # the buffers are this run's own: runs may be nested, or go on in several threads
+        self.calls: dict[bool, Caller] = {}
+        self.done = 0
+        root = prior.root
+        if step.root or (step.wide is not None and (root is not None or narrow(prior.cov))):
+            root = root_of(prior.cov) if root is None else root
+            if step.root or narrow(root, root=True):
+                self._root(root)
+
+    @property
+    def rooted(self) -> bool:
+        """Whether roots are carried now."""
+        return self.now.root
+
+    def _root(self, L: np.ndarray) -> None:
+        self.P = L
+        if not self.step.root:
+            assert self.step.wide is not None
+            self.now = self.step.wide()
+
+    def _call(self, *args: np.ndarray) -> tuple[np.ndarray, ...]:
+        if self.rooted not in self.calls:
+            block = _block(self.now, self.full, self.backend, backend_in_use())
+            self.calls[self.rooted] = Caller(block, copy=False)
+        return self.calls[self.rooted](self.m, self.P, *args)
+
+    def block(
+        self, u: np.ndarray, y: np.ndarray, R: np.ndarray, dt: np.ndarray, p: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Return the outputs of one block, and go on to the next."""
+        if self.rooted and not self.step.root and not narrow(self.P, root=True):
+            # well enough known in all directions: on with the covariance
+            self.P, self.now = self.P @ self.P.T, self.step
+        out = self._call(u, y, R, dt, p)
+        nx = self.m.size
+        self.done += 1
+        ends = self.done % 4 == 1
+        if self.step.wide is not None and not self.rooted and _lossy(out, R, nx, ends):
+            self._root(root_of(self.P))
+            out = self._call(u, y, R, dt, p)
+        self.m, self.P = out[0].ravel().copy(), out[1].reshape(nx, nx).copy()
+        return out
+
+
+def narrow(P: np.ndarray, *, root: bool = False) -> bool:
+    """Whether some combination of states is known far better than each of them, or not a number."""
+    if root:
+        size = np.sqrt((P**2).sum(1))
+        rows = size > 0
+        return bool((np.abs(np.diag(P))[rows] < math.sqrt(NARROW) * size[rows]).any())
+    d = P.diagonal()
+    if not (d > 0).all():
+        rows = np.flatnonzero(d > 0)
+        P, d = P[np.ix_(rows, rows)], d[rows]
+    s = 1 / np.sqrt(d)
+    try:
+        pivots = np.linalg.cholesky(P * s * s[:, None]).diagonal()
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((pivots**2 >= NARROW).all())
+
+
+def _lossy(out: Sequence[np.ndarray], R: np.ndarray, nx: int, ends: bool) -> bool:
+    """Whether a block of the covariance filter has lost digits; out as of :func:`_block`.
+
+    A sample far better than the belief makes a narrow direction at once, and shows in S.  What
+    makes one slowly shows at the ends of blocks.
+    """
+    # where nothing was measured S is 1 and R is -1
+    if not (out[5].reshape(R.shape) <= WIDE * np.abs(R)).all():
+        return True
+    return ends and narrow(out[1].reshape(nx, nx))
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """The matrices of a run with ``full``; see :class:`FilterResult`."""
+
+    cov: np.ndarray
+    mean_pred: np.ndarray
+    cov_pred: np.ndarray
+    cross: np.ndarray
+    S: np.ndarray
+    roots: tuple[np.ndarray, ...] | None
+
+    @classmethod
+    def of(cls, K: int, nx: int, ny: int, *, roots: bool) -> _Kept:
+        cov, cov_pred, cross, S = (np.empty((K, n, n)) for n in (nx, nx, nx, ny))
+        four = tuple(np.empty((K, nx, nx)) for _ in range(4)) if roots else None
+        return cls(cov, np.empty((nx, K)), cov_pred, cross, S, four)
+
+    def fields(self) -> dict[str, Any]:
+        """The fields of a result that hold them."""
+        return {
+            "cov": self.cov, "mean_pred": self.mean_pred, "cov_pred": self.cov_pred,
+            "cross": self.cross, "innovation_cov": self.S, "roots": self.roots,
+        }  # fmt: skip
+
+    def put(self, r: slice, columns: list[np.ndarray], *, root: bool) -> None:
+        """Take P_f, m, P, C, S of some instants; matrices are columns in column-major order."""
+        nx, ny = self.cov.shape[1], self.S.shape[1]
+        P_f, m, P, C, S = columns[:5]
+        n = m.shape[1]
+        self.cov[r] = P_f.T.reshape(n, nx, nx)
+        self.mean_pred[:, r] = m
+        before = P.T.reshape(n, nx, nx).transpose(0, 2, 1)
+        self.cov_pred[r] = before @ before.transpose(0, 2, 1) if root else before
+        self.cross[r] = C.T.reshape(n, nx, nx).transpose(0, 2, 1)
+        self.S[r] = S.T.reshape(n, ny, ny)
+        if self.roots is not None:
+            self.roots[0][r] = before
+            for target, source in zip(self.roots[1:], columns[5:], strict=True):
+                target[r] = source.T.reshape(n, nx, nx).transpose(0, 2, 1)
+
+
+def _believable(
+    model: FilterModel,
+    data: Recording,
+    stats: np.ndarray,
+    mean: np.ndarray,
+    var: np.ndarray,
+    start: int,
+) -> None:
+    """Refuse a block in which a check failed or a number is lost."""
+    failed = ~(stats[0] <= CHECK_TOL)
+    # rounding may leave a tiny negative variance of what is known exactly
+    size = np.where(np.isfinite(mean), mean, 0.0)
+    floor = -1e-12 * (np.square(model.x.nominals) + np.square(size).max(1, initial=0.0))
+    lost = ~np.isfinite(mean) | ~(var >= floor[:, None])
+    bad = failed | lost.any(0)
+    if not bad.any():
+        return
+    k = int(np.argmax(bad))
+    at = f"{model.name} at t = {data.t[start + k]:.9g} s (sample {start + k})"
+    if lost[:, k].any():
+        i = int(np.argmax(lost[:, k]))
+        raise EstimationError(
+            f"{at}: the belief of {model.x.names[i]} is lost (mean {mean[i, k]:.6g}, variance "
+            f"{var[i, k]:.3g}, model check {stats[0, k]:.1e}); the sample does not fit the model, "
+            "or noise and prior are far too small"
+        )
+    raise EstimationError(
+        f"{at}: the model's check is {stats[0, k]:.1e} > {CHECK_TOL:.0e}; the belief left the "
+        "region where the model can be solved: check prior, inputs and outliers"
+    )

@@ -1,0 +1,519 @@
+"""Several models at once: which of them holds, and what is the state then?
+
+:func:`interacting_multiple_models` follows a mode that may change from sample to sample as a
+Markov chain (Blom and Bar-Shalom 1988, IEEE Trans. Automatic Control 33, 780-783):
+mix the beliefs of all modes, let each mode's filter take the sample, weigh the modes anew.
+:func:`multiple_models` is the static case: one mode holds throughout, and the log-likelihoods of
+whole filters decide (Magill 1965, IEEE Trans. Automatic Control 10, 434-439).
+
+Probabilities are kept as logarithms: a mode that a thousand samples have spoken against may come
+back, and 1e-300 is a number like any other.
+
+A mode r(k) governs the output at sample k and the transition from k to k+1, as in
+:mod:`estimators.models.filtermodel`, where both share their noise; the chain moves between
+samples.  (Blom and Bar-Shalom let the mode at k govern the transition *to* k; for modes that
+differ in outputs, parameters or constants only, the two are the same.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import expm
+
+from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.core.sharing import kept
+from apu_casadi.core.signals import Signals
+from estimators.filters.algebra import root_of
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import ekf_step
+from estimators.filters.filtering import (
+    BLOCK,
+    NARROW,
+    WIDE,
+    FilterResult,
+    FilterStep,
+    block_of,
+    narrow,
+    padded,
+    run,
+)
+from estimators.filters.mixing import log_sum, plain_mixer, root_mixer
+from estimators.models.filtermodel import CHECK_TOL, FilterModel
+from estimators.models.recording import Recording
+
+__all__ = [
+    "ImmResult",
+    "ModelProbabilities",
+    "interacting_multiple_models",
+    "log_normalised",
+    "multiple_models",
+]
+
+IMPOSSIBLE = -1e30  # stands for the logarithm of 0: finite, so that differences are defined
+
+
+def log_normalised(logs: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Return logarithms of probabilities that sum to one along an axis.
+
+    Raises:
+        ParameterError: a NaN or +inf, or nothing possible at all.
+    """
+    a = np.asarray(logs, float)
+    top = a.max(axis=axis, keepdims=True)
+    if not np.isfinite(top).all():
+        raise ParameterError(f"logarithms of probabilities expected, the largest is {top.max()!r}")
+    return np.asarray(a - top - np.log(np.exp(a - top).sum(axis=axis, keepdims=True)))
+
+
+# ------------------------------------------------------------------------------ static
+
+
+@dataclass(frozen=True, eq=False)
+class ModelProbabilities:
+    """How well each of several models explains a whole recording.
+
+    Args:
+        names: of the models.
+        loglik: log-likelihoods of the recording, (M,).
+        log_probability: logarithms of the posterior probabilities, (M,).
+        results: each filter's result.
+    """
+
+    names: tuple[str, ...]
+    loglik: np.ndarray
+    log_probability: np.ndarray
+    results: tuple[FilterResult, ...]
+
+    @property
+    def best(self) -> str:
+        """The most probable model."""
+        return self.names[int(np.argmax(self.log_probability))]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return numbers that JSON can hold."""
+        return {
+            "best": self.best,
+            "loglik": dict(zip(self.names, self.loglik.tolist(), strict=True)),
+            "log_probability": dict(zip(self.names, self.log_probability.tolist(), strict=True)),
+        }
+
+
+def multiple_models(
+    models: Mapping[str, FilterModel | FilterStep],
+    prior: Belief | Mapping[str, Belief],
+    data: Recording | Mapping[str, Recording],
+    *,
+    prior_probability: Mapping[str, float] | None = None,
+    full: bool = False,
+    backend: str | None = None,
+) -> ModelProbabilities:
+    """Run one filter for each model, and compare their likelihoods by Bayes' rule.
+
+    A model with an unknown size is penalised for it by the spread of its own prior: the likelihood
+    is that of the samples with the size integrated out.
+
+    Args:
+        models: models (taken by extended Kalman filters) or filters, by name.
+        prior: belief at the first instant, one for all or one for each.
+        data: recording, one for all or one for each (of the same measurements).
+        prior_probability: of the models, equal by default.
+        full, backend: see :func:`estimators.filters.filtering.run`.
+
+    Raises:
+        ParameterError: no models, unknown names, probabilities that are none.
+    """
+    steps = _steps(models)
+    logp = _log_prior(tuple(steps), prior_probability)
+    results = [
+        run(
+            step,
+            prior if isinstance(prior, Belief) else prior[name],
+            data if isinstance(data, Recording) else data[name],
+            full=full,
+            backend=backend,
+        )
+        for name, step in steps.items()
+    ]
+    loglik = np.array([r.loglik for r in results])
+    return ModelProbabilities(tuple(steps), loglik, log_normalised(loglik + logp), tuple(results))
+
+
+def _steps(models: Mapping[str, FilterModel | FilterStep]) -> dict[str, FilterStep]:
+    if not models:
+        raise ParameterError("no models were given")
+    return {n: m if isinstance(m, FilterStep) else ekf_step(m) for n, m in models.items()}
+
+
+def _log_prior(names: tuple[str, ...], given: Mapping[str, float] | None) -> np.ndarray:
+    if given is None:
+        return np.full(len(names), -math.log(len(names)))
+    for n in given:
+        if n not in names:
+            raise ParameterError(f"unknown mode {n!r} {nearest(n, names)}")
+    p = np.array([given.get(n, math.nan) for n in names])
+    if not (np.isfinite(p).all() and (p >= 0).all() and p.sum() > 0):
+        raise ParameterError(
+            f"prior probabilities >= 0 are needed for all of {', '.join(names)}; got {dict(given)}"
+        )
+    return _logs(p / p.sum())
+
+
+def _logs(p: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(p > 0, np.log(p), IMPOSSIBLE))
+
+
+# ------------------------------------------------------------------------------ interacting
+
+
+@dataclass(frozen=True, eq=False)
+class ImmResult:
+    """What interacting filters believed along a recording of K instants.
+
+    Args:
+        names: of the M modes.
+        x: states that all modes have.
+        t: instants, s, (K,).
+        log_probability: logarithms of the modes' probabilities after each sample, (M, K).
+        mean, variance: of the mixture after each sample, (nx, K).
+        mode_mean: each mode's own filtered mean, all its states, (nx_j, K).
+        loglik: log-likelihood of the recording.
+        final: each mode's belief at the last instant, after its sample.
+    """
+
+    names: tuple[str, ...]
+    x: Signals
+    t: np.ndarray
+    log_probability: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+    mode_mean: tuple[np.ndarray, ...]
+    loglik: float
+    final: tuple[Belief, ...]
+
+    @property
+    def probability(self) -> np.ndarray:
+        """Probabilities of the modes after each sample, (M, K)."""
+        return np.exp(self.log_probability)
+
+    @property
+    def best(self) -> np.ndarray:
+        """Index of the most probable mode after each sample, (K,)."""
+        return np.asarray(np.argmax(self.log_probability, axis=0))
+
+    def __getitem__(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return (mean, standard deviation) of one state of the mixture, each of shape (K,)."""
+        i = self.x.index(name)
+        return self.mean[i], np.sqrt(self.variance[i])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return numbers that JSON can hold: the modes at the end, and when the best changed."""
+        change = np.flatnonzero(np.diff(self.best)) + 1
+        return {
+            "loglik": self.loglik,
+            "log_probability": dict(
+                zip(self.names, self.log_probability[:, -1].tolist(), strict=True)
+            ),
+            "path": [
+                {"t": float(self.t[k]), "mode": self.names[int(self.best[k])]}
+                for k in (0, *change.tolist())
+            ],
+        }
+
+
+def _weigher(x: Sequence[Signals], common: Signals) -> ca.Function:
+    """SX Function (logs, logliks, m_f, P_f) -> (logs, loglik, mean, variance) of the mixture."""
+    M, n = len(x), [len(s) for s in x]
+    logs, ll = ca.SX.sym("logs", M), ca.SX.sym("ll", M)
+    m_in, P_in = ca.SX.sym("m", sum(n)), ca.SX.sym("P", sum(k * k for k in n))
+    total = log_sum(logs + ll)
+    new = logs + ll - total
+    weights = ca.exp(new)
+    ms = ca.vertsplit(m_in, [0, *np.cumsum(n).tolist()])
+    Ps = ca.vertsplit(P_in, [0, *np.cumsum([k * k for k in n]).tolist()])
+    rows = [x[i].indices(common.names) for i in range(M)]
+    mean, var = ca.SX(len(common), 1), ca.SX(len(common), 1)
+    for i in range(M):
+        mean += weights[i] * ms[i][rows[i]]
+    for i in range(M):
+        own = ca.diag(ca.reshape(Ps[i], n[i], n[i]))[rows[i]]
+        var += weights[i] * (own + (ms[i][rows[i]] - mean) ** 2)
+    out = [new, total, ca.densify(mean), ca.densify(var)]
+    return ca.Function("weigh", [logs, ll, m_in, P_in], out)
+
+
+@kept
+def _block(
+    first: FilterStep,
+    others: tuple[FilterStep, ...],
+    common: Signals,
+    roots: bool,
+    backend: str | None,
+    _in_use: str,
+) -> ca.Function:
+    """``BLOCK`` cycles of mixing, filtering and weighing in one function.
+
+    (logs, m, P, logT, u, y, R, dt, p) -> (logs, m, P) for the next block, and for each sample logs,
+    the predicted m, P, the filtered m, P, mean and variance of the mixture, and log-likelihood with
+    checks; m, P of all modes stacked.
+    """
+    steps = (first, *others)
+    models = [s.model for s in steps]
+    x = [m.x for m in models]
+    n = [len(s) for s in x]
+    _, nu, np_, _, ny = models[0].sizes
+    shapes = {
+        "logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2, "u": nu,
+        "y": ny, "R": ny, "dt": 1, "p": np_,
+    }  # fmt: skip
+    s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
+    mixer = root_mixer if roots else plain_mixer
+    logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
+    ms = ca.vertsplit(m, [0, *np.cumsum(n).tolist()])
+    Ps = ca.vertsplit(P, [0, *np.cumsum([k * k for k in n]).tolist()])
+    # covariances are mixed, so filters that carry square roots hand them over as such
+    outs = [
+        (_with_roots(step) if roots else step.plain).function(
+            ms[i], ca.reshape(Ps[i], n[i], n[i]), s["u"], s["p"], s["y"], s["R"], s["dt"]
+        )
+        for i, step in enumerate(steps)
+    ]
+    m_f = ca.vertcat(*(o[2] for o in outs))
+    P_f = ca.vertcat(*(ca.vec(o[3]) for o in outs))
+    ll = ca.vertcat(*(o[7][2] for o in outs))
+    check = ca.vertcat(*(o[7][0] for o in outs))
+    new, total, mean, var = _weigher(x, common)(logs, ll, m_f, P_f)
+    carried = [
+        new,
+        ca.vertcat(*(o[0] for o in outs)),
+        ca.vertcat(*(ca.vec(o[1]) for o in outs)),
+    ]
+    S = ca.vertcat(*(ca.diag(o[6]) for o in outs))
+    kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check), S]
+    name = "imm_roots" if roots else "imm"
+    one = ca.Function(f"{name}_one", list(s.values()), [*carried, *kept])
+    return compiled(block_of(one, name, len(carried)), backend=backend)
+
+
+def _with_roots(step: FilterStep) -> FilterStep:
+    """The step in square-root form."""
+    return step if step.root or step.wide is None else step.wide()
+
+
+def _needs_roots(
+    n: list[int], P1: np.ndarray, P_f: np.ndarray, S: np.ndarray, R: np.ndarray
+) -> bool:
+    """Whether a block of covariances has lost digits, as in :mod:`estimators.filters.filtering`.
+
+    P1 (sum of squares,) at the end, P_f (sum of squares, samples), S (modes x ny, samples).
+    """
+    R = np.tile(R, (S.shape[0] // R.shape[0], 1))
+    if ((R > 0) & ~(S <= WIDE * R)).any():
+        return True
+    at = np.cumsum([0, *(k * k for k in n)])
+    some = np.column_stack([P_f[:, ::10], P1])
+    return any(
+        _any_narrow(some[i:j].T.reshape(-1, k, k))
+        for i, j, k in zip(at[:-1], at[1:], n, strict=True)
+    )
+
+
+def _any_narrow(P: np.ndarray) -> bool:
+    """:func:`~estimators.filters.filtering.narrow` for any of several covariances, (K, n, n)."""
+    d = np.diagonal(P, axis1=1, axis2=2)
+    if not (d > 0).all():
+        return any(narrow(one) for one in P)
+    s = 1 / np.sqrt(d)
+    try:
+        L = np.linalg.cholesky(P * s[:, :, None] * s[:, None, :])
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((np.diagonal(L, axis1=1, axis2=2) ** 2 >= NARROW).all())
+
+
+def _log_transitions(
+    M: int, data: Recording, transition: Any, rates: Any, names: tuple[str, ...]
+) -> np.ndarray:
+    """Logarithms of the transition probabilities into each sample, (M*M, K), column-major."""
+    if (transition is None) == (rates is None):
+        raise ParameterError("give either transition (for each sample) or rates (per second)")
+    T = np.asarray(transition if rates is None else rates, float)
+    if T.shape != (M, M) or not np.isfinite(T).all():
+        raise ParameterError(f"a finite matrix of {M} x {M} is needed for {', '.join(names)}")
+    off = T - np.diag(np.diag(T))
+    want = 1.0 if rates is None else 0.0
+    bad = np.abs(T.sum(1) - want) > 1e-9 * max(1.0, float(np.abs(T).max()))
+    bad |= (off < 0).any(1)
+    if rates is None:
+        bad |= np.diag(T) < 0
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ParameterError(
+            f"row {names[i]!r} of the transitions: entries >= 0 that sum to {want:g} expected "
+            f"(rates: except the diagonal), got {T[i].tolist()}"
+        )
+    out = np.empty((M * M, data.size))
+    out[:, 0] = _logs(np.eye(M)).ravel(order="F")  # the prior is of the first sample's mode
+    if rates is None:
+        out[:, 1:] = _logs(T).ravel(order="F")[:, None]
+        return out
+    # the same step returns again and again, up to rounding of the stamps
+    steps, back = np.unique(np.round(data.dt[:-1], 12), return_inverse=True)
+    logs = np.array([_logs(np.maximum(expm(T * d), 0.0)).ravel(order="F") for d in steps])
+    out[:, 1:] = logs[back].T if steps.size else 0.0
+    return out
+
+
+def interacting_multiple_models(
+    models: Mapping[str, FilterModel | FilterStep],
+    prior: Belief | Mapping[str, Belief],
+    data: Recording,
+    *,
+    transition: Any = None,
+    rates: Any = None,
+    prior_probability: Mapping[str, float] | None = None,
+    backend: str | None = None,
+) -> ImmResult:
+    """Filter a recording with a mode that may change.
+
+    Args:
+        models: models (taken by extended Kalman filters) or filters, by name; same inputs,
+            parameters and outputs.  States may differ: beliefs are exchanged by name.
+        prior: belief at the first instant, before its sample; one for all modes or one for each.
+        data: the recording.
+        transition: (M, M) probabilities of going from mode i (row) to j between two samples,
+            whatever the time between them; the identity makes the modes static.
+        rates: instead, (M, M) transition rates, 1/s, rows summing to zero: the matrix exponential
+            over each step, so that samples may come at any instants.
+        prior_probability: of the modes at the first sample, equal by default.
+        backend: see :func:`apu_casadi.core.backend.compiled`.
+
+    Raises:
+        ParameterError: transitions that are none, unknown or missing modes.
+        SignalError: models or priors that do not fit together.
+        EstimationError: a mode's belief was lost; names the mode and the instant.
+    """
+    steps = _steps(models)
+    names = tuple(steps)
+    M = len(names)
+    first = next(iter(steps.values())).model
+    for name, step in steps.items():
+        for kind in ("u", "p", "y"):
+            mine, want = getattr(step.model, kind).names, getattr(first, kind).names
+            if mine != want:
+                raise SignalError(
+                    f"modes {names[0]!r} and {name!r} differ in {kind}: {', '.join(want)} and "
+                    f"{', '.join(mine)}"
+                )
+    data.check(first)
+    priors = [prior if isinstance(prior, Belief) else prior[n] for n in names]
+    for name, b, step in zip(names, priors, steps.values(), strict=True):
+        if b.x.names != step.model.x.names:
+            raise SignalError(
+                f"mode {name!r}: prior of {', '.join(b.x.names)}; its model has "
+                f"{', '.join(step.model.x.names)}"
+            )
+    common = Signals([s for s in first.x if all(s.name in b.x for b in priors)])
+    logT = _log_transitions(M, data, transition, rates, names)
+    n = [len(b.x) for b in priors]
+    K = data.size
+    blocks = -(-K // BLOCK)
+    pad = blocks * BLOCK - K
+    y, R, u, dt = padded(data, pad)
+    # a padded sample changes no mode
+    logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
+
+    # the buffers are this run's own, as in estimators.filters.filtering
+    one, *others = steps.values()
+
+    def caller(roots: bool) -> Caller:
+        block = _block(one, tuple(others), common, roots, backend, backend_in_use())
+        return Caller(block, copy=False)
+
+    # what a filter without square-root form lacks, mixing cannot give back
+    able = all(step.root or step.wide is not None for step in steps.values())
+    rooted = able and any(narrow(b.cov) for b in priors)
+    call = caller(rooted)
+    logs = _log_prior(names, prior_probability)
+    m = np.concatenate([b.mean for b in priors])
+    roots = [root_of(b.cov) if b.root is None else b.root for b in priors]
+    P = np.concatenate([(L if rooted else b.cov).ravel(order="F")
+                        for b, L in zip(priors, roots, strict=True)])  # fmt: skip
+    kept: list[list[np.ndarray]] = [[], [], [], [], []]
+    for start in range(0, blocks * BLOCK, BLOCK):
+        s = slice(start, start + BLOCK)
+        data_of = logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p
+        out = call(logs, m, P, *data_of)
+        if (
+            able
+            and not rooted
+            and _needs_roots(
+                n,
+                out[2].ravel(),
+                out[7][:, : K - start],
+                out[11][:, : K - start],
+                R[:, s][:, : K - start],
+            )
+        ):
+            at = np.cumsum([0, *(k * k for k in n)])
+            P = np.concatenate([root_of(P[i:j].reshape(k, k)).ravel(order="F")
+                                for i, j, k in zip(at[:-1], at[1:], n, strict=True)])  # fmt: skip
+            rooted, call = True, caller(True)
+            out = call(logs, m, P, *data_of)
+        each = [o[:, : K - start] for o in out[3:]]
+        for target, i in zip(kept, (0, 3, 5, 6, 7), strict=True):
+            target.append(each[i].copy())
+        _believable(names, n, data, each[1], each[2], each[7], start)
+        logs, m, P = (o.ravel().copy() for o in out[:3])
+        last = each[4][:, -1].copy()  # not P: what is padded may be carried on
+    logp, m_f, mean, var, stats = (np.concatenate(k, axis=1) for k in kept)
+    edges = np.cumsum([0, *n])
+    squares = np.cumsum([0, *(k * k for k in n)])
+    final = []
+    for j, belief in enumerate(priors):
+        cov = last[squares[j] : squares[j + 1]].reshape(n[j], n[j])
+        final.append(Belief(belief.x, m_f[edges[j] : edges[j + 1], -1].copy(), (cov + cov.T) / 2))
+    return ImmResult(
+        names,
+        common,
+        data.t,
+        logp,
+        mean,
+        var,
+        tuple(m_f[edges[j] : edges[j + 1]] for j in range(M)),
+        float(stats[0].sum()),
+        tuple(final),
+    )
+
+
+def _believable(
+    names: tuple[str, ...],
+    n: list[int],
+    data: Recording,
+    m1: np.ndarray,
+    P1: np.ndarray,
+    stats: np.ndarray,
+    start: int,
+) -> None:
+    """Refuse a block in which a mode's filter failed, whose NaN would reach all others."""
+    ok = stats[1:] <= CHECK_TOL
+    edges, squares = np.cumsum([0, *n]), np.cumsum([0, *(k * k for k in n)])
+    for j in range(len(names)):
+        ok[j] &= np.isfinite(m1[edges[j] : edges[j + 1]]).all(0)
+        ok[j] &= np.isfinite(P1[squares[j] : squares[j + 1]]).all(0)
+    if (ok.all(0) & np.isfinite(stats[0])).all():
+        return
+    k = int(np.argmin(ok.all(0) & np.isfinite(stats[0])))
+    j = int(np.argmin(ok[:, k]))
+    raise EstimationError(
+        f"mode {names[j]!r} at t = {data.t[start + k]:.9g} s (sample {start + k}): its belief is "
+        f"lost (model check {stats[1 + j, k]:.1e}); a mode must be solvable wherever the others "
+        "may lead it"
+    )

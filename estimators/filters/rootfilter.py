@@ -1,0 +1,128 @@
+"""The extended Kalman filter in square-root form: for beliefs that are wide and narrow at once.
+
+A covariance in double precision holds a standard deviation of 1 beside one of 1e8 and nothing more:
+the sum of two states known to 1, with each of them known to 1e9, is lost when the matrix is stored.
+Its root holds twice as many digits.  So the filter here carries a lower triangular root; the update
+is Carlson's, the prediction a Gram-Schmidt orthogonalisation, neither of which mixes the wide with
+the narrow.  It costs two to three times the covariance filter's time, and is used where that one's
+digits run out, see :func:`estimators.filters.filtering.run`.
+
+For the smoother the filter gives, with the next root L1, the roots Y and Z of
+
+    cov(x(k), x(k+1)) = Y L1',   cov(x(k) | x(k+1)) = Z Z'
+
+from one orthogonalisation of next and present state together; Z Z' is never a difference.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import casadi as ca
+
+from apu_casadi.core.sharing import kept, once
+from estimators.filters.algebra import append_column, graded_lower, root_update
+from estimators.filters.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterStep
+from estimators.filters.stepparts import kind_of, projected, step_symbols
+from estimators.models.filtermodel import FilterModel
+
+__all__ = ["ekf_root_step", "root_functions"]
+
+
+@once
+def _update(nx: int, nw: int, ny: int, fixed: tuple[int, ...]) -> ca.Function:
+    """SX Function (L, H, nu, R) -> (d, La, S, nis, loglik, measured); ``fixed`` have no gain."""
+    n = nx + nw
+    L, H = ca.SX.sym("L", ca.Sparsity.lower(nx)), ca.SX.sym("H", ny, n)
+    nu, R = ca.SX.sym("nu", ny), ca.SX.sym("R", ny)
+    there = R >= 0
+    La = ca.diagcat(L, ca.SX.eye(nw))
+    per = ca.if_else(there, 1 / ca.sqrt(ca.if_else(there, R, 1)), 0)
+    # what is not measured: no innovation, no sensitivity, unit noise
+    D = ca.diag(ca.if_else(there, 1, 0)) @ (H @ La)
+    done = root_update(La, ca.sparsify(ca.diag(per) @ D), per * nu)
+    gain, L1 = done.gain, done.L
+    if fixed:
+        # each row of the optimal gain takes gain gain' off the variance; without gain it stays
+        kept = ca.SX(*gain.shape)
+        for i in fixed:
+            kept[i, :] = gain[i, :]
+            gain[i, :] = 0
+        for j in range(ny):
+            L1 = append_column(L1, ca.sparsify(kept[:, j]))
+    S = D @ D.T + ca.diag(ca.if_else(there, R, 1))
+    nis, measured = ca.dot(done.e, done.e), ca.sum1(there)
+    logdet = done.logdet + ca.sum1(ca.log(ca.if_else(there, R, 1)))
+    loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
+    out = [gain @ done.e, ca.project(L1, ca.Sparsity.lower(n)), S, nis, loglik, measured]
+    return ca.Function("root_update", [L, H, nu, R], [ca.densify(o) for o in ca.cse(out)])
+
+
+@once
+def _predict(nx: int, nw: int, walk: tuple[float, ...]) -> ca.Function:
+    """SX Function (La, F, dt) -> (L1, C, Y, Z)."""
+    n = nx + nw
+    La, F = ca.SX.sym("La", ca.Sparsity.lower(n)), ca.SX.sym("F", nx, n)
+    dt = ca.SX.sym("dt")
+    noise = ca.sparsify(ca.diag(ca.SX(ca.DM(list(walk))))) * ca.sqrt(dt)
+    D, own = F @ La, La[:nx, :]
+    both = ca.vertcat(ca.horzcat(D, noise), ca.horzcat(own, ca.SX(nx, nx)))
+    G = graded_lower(ca.sparsify(both))
+    out = [G[:nx, :nx], own @ D.T, G[nx:, :nx], G[nx:, nx:]]
+    return ca.Function("root_predict", [La, F, dt], [ca.densify(o) for o in ca.cse(out)])
+
+
+def root_functions(model: FilterModel, fixed: tuple[int, ...]) -> tuple[ca.Function, ca.Function]:
+    """Return update and prediction for a model; see :func:`_update` and :func:`_predict`."""
+    nx, _, _, nw, ny = model.sizes
+    walk: Any = tuple(float(v) for v in model.walk)
+    return _update(nx, nw, ny, fixed), _predict(nx, nw, walk)
+
+
+@kept
+def ekf_root_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
+    """Build the extended filter's step with roots; arguments of :func:`~.ekf.ekf_step`.
+
+    Its function gives ``STEP_OUT`` and, for the smoother, Y and Z as the module has them and the
+    root of the filtered covariance.
+    """
+    model = model.expanded()
+    kind = kind_of(model)
+    nx, _, _, nw, _ = model.sizes
+    fixed = tuple(model.x.indices(model.consider))
+    update, predict = root_functions(model, fixed)
+    m, L, u, p, y, R, dt = step_symbols(model, kind)
+    low = ca.tril(L)
+    prior = ca.vertcat(m, kind.zeros(nw))
+
+    s = kind.sym("s", nx + nw)
+    h, check_h = model.output(s[:nx], u, p, s[nx:])
+    outputs = ca.Function("outputs", [s, u, p], [h, ca.jacobian(h, s), check_h])
+    x1, check_f = model.transition(s[:nx], u, p, s[nx:], dt)
+    forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_f])
+
+    at, check, first, moved, La = prior, kind(0), None, prior, None
+    for _ in range(iterations):
+        h, H, c = outputs(at, u, p)
+        # linearised at the iterate, but always an update of the prior
+        d, La, S, nis, loglik, measured = update(low, H, y - h + H @ (at - prior), R)
+        if first is None:
+            first = S, nis, loglik, measured, ca.if_else(R >= 0, y - h, 0)
+        moved, check = prior + d, check + c
+        at = moved if iterated == "all" else ca.vertcat(m, moved[nx:])
+    assert first is not None and La is not None
+    own = La[:nx, :nx]
+    P_f = ca.mtimes(own, own.T)
+    at = projected(moved, ca.mtimes(La, La[:nx, :].T), model.lower, model.upper, fixed)
+    x1, F, c = forecast(at, u, p, dt)
+    L1, C, Y, Z = predict(La, F, dt)
+    S, nis, loglik, measured, nu = first
+    stats = ca.vertcat(check + c, nis, loglik, measured)
+    out = [x1, L1, at[:nx], P_f, C, nu, S, stats, Y, Z, own]
+    out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
+    kept = "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"
+    function = ca.Function(
+        f"ekf{kept}_root_{model.name}", [m, L, u, p, y, R, dt], out, STEP_IN, STEP_OUT + ROOT_OUT
+    )
+    return FilterStep(model, function, root=True)

@@ -1,0 +1,1 @@
+"""What can be known at best, and whether an estimate is as good as it says."""

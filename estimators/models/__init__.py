@@ -1,0 +1,1 @@
+"""What estimators need to know: a model with its noise, and recordings."""

@@ -1,0 +1,470 @@
+"""What a filter needs to know of a model: f, g, names, and where noise enters.
+
+A :class:`FilterModel` is a discrete-time model with named vectors.  At a sample the output is
+taken, then the state goes on to the next sample:
+
+    y(k)   = g(x(k), u(k), p, w(k)) + v(k)
+    x(k+1) = f(x(k), u(k), p, w(k), dt(k)) + sqrt(dt(k)) * walk * xi(k)
+
+with w(k), xi(k) white and of unit variance, and v(k) of the variances that come with the data.  The
+*same* w(k) enters output and transition: the error of a measured input does so too, and a filter
+that forgets it claims a wrong variance.
+
+:func:`discretise` makes a model from any :class:`~apu_casadi.core.statespace.StateSpace`; the other
+functions return changed models: :func:`measure` (which outputs there are), :func:`noisy_inputs`,
+:func:`gains` and :func:`biases` (sensor errors as parameters), :func:`augment` (parameters become
+states that are estimated, or *considered*: uncertain, but not estimated).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.checked import number
+from apu_casadi.core.discretisation import linearly_implicit_midpoint
+from apu_casadi.core.errors import ParameterError, SignalError, nearest
+from apu_casadi.core.sharing import Parametric, remade
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.statespace import StateSpace
+
+__all__ = [
+    "CHECK_TOL",
+    "FilterModel",
+    "Unknown",
+    "augment",
+    "biases",
+    "discretise",
+    "gains",
+    "measure",
+    "measured_inputs",
+    "noisy_inputs",
+]
+
+#: Largest residual of eliminated unknowns with which a result of f or g is used.
+CHECK_TOL = 1e-9
+METHODS = ("midpoint", "rk4", "implicit midpoint")
+_TRANSITION = ["x", "u", "p", "w", "dt"], ["x1", "check"]
+_OUTPUT = ["x", "u", "p", "w"], ["y", "check"]
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter that becomes a state.
+
+    Args:
+        walk: standard deviation of its random walk, own unit per sqrt(s); 0 for a constant.
+        lower, upper: bounds that a mean may not leave.
+        consider: uncertain but not estimated: its mean and variance never change (Schmidt's
+            filter), its correlation with the rest is carried.
+    """
+
+    walk: float = 0.0
+    lower: float = -math.inf
+    upper: float = math.inf
+    consider: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("walk", "lower", "upper"):
+            number(f"Unknown.{name}", getattr(self, name), error=ParameterError)
+        if not (math.isfinite(self.walk) and self.walk >= 0):
+            raise ParameterError(f"Unknown.walk must be finite and >= 0, got {self.walk!r}")
+        if not self.lower < self.upper:
+            raise ParameterError(
+                f"Unknown: lower = {self.lower!r} must be below upper = {self.upper!r}"
+            )
+        if self.consider and self.walk:
+            raise ParameterError("Unknown: a considered parameter is a constant, walk must be 0")
+
+
+@dataclass(frozen=True, eq=False)
+class FilterModel(Parametric):
+    """A discrete-time model with named vectors; see the module's text.
+
+    Args:
+        name: short identifier, used for functions and messages.
+        x, u, p, w, y: states, inputs of a sample, known parameters, noises, outputs.
+        transition: Function (x, u, p, w, dt) -> (x1, check).
+        output: Function (x, u, p, w) -> (y, check).  ``check`` is the residual of whatever was
+            solved for inside; results with ``check > CHECK_TOL`` are refused.
+        walk: random-walk standard deviations, unit of x per sqrt(s), shape (nx,).
+        lower, upper: bounds of x, shape (nx,).
+        consider: states whose mean and variance the measurements do not touch.
+
+    Raises:
+        SignalError: a function's or vector's shape does not match the declared signals; a walk, a
+            pair of bounds or a considered state is impossible.
+    """
+
+    name: str
+    x: Signals
+    u: Signals
+    p: Signals
+    w: Signals
+    y: Signals
+    transition: ca.Function = field(repr=False)
+    output: ca.Function = field(repr=False)
+    walk: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    consider: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        nx, nu, np_, nw, ny = (len(s) for s in (self.x, self.u, self.p, self.w, self.y))
+        for label, fun, n_in, n_out in (
+            ("transition", self.transition, [nx, nu, np_, nw, 1], [nx, 1]),
+            ("output", self.output, [nx, nu, np_, nw], [ny, 1]),
+        ):
+            got_in = [fun.size1_in(i) for i in range(fun.n_in())]
+            got_out = [fun.size1_out(i) for i in range(fun.n_out())]
+            if got_in != n_in or got_out != n_out:
+                raise SignalError(
+                    f"{self.name}.{label}: expected sizes {n_in} -> {n_out}, "
+                    f"got {got_in} -> {got_out}"
+                )
+        for label in ("walk", "lower", "upper"):
+            shape = np.shape(getattr(self, label))
+            if shape != (nx,):
+                raise SignalError(f"{self.name}.{label}: shape ({nx},) expected, got {shape}")
+        fixed = self.x.indices(self.consider)
+        for i, s in enumerate(self.x):
+            if not (math.isfinite(self.walk[i]) and self.walk[i] >= 0):
+                raise SignalError(
+                    f"{self.name}: walk of {s.name} must be finite and >= 0, got {self.walk[i]!r}"
+                )
+            if not self.lower[i] < self.upper[i]:
+                raise SignalError(
+                    f"{self.name}: bounds of {s.name}: {self.lower[i]!r} must be below "
+                    f"{self.upper[i]!r}"
+                )
+            if i in fixed and self.walk[i]:
+                raise SignalError(f"{self.name}: {s.name} is considered, its walk must be 0")
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int, int]:
+        """(nx, nu, np, nw, ny)."""
+        return len(self.x), len(self.u), len(self.p), len(self.w), len(self.y)
+
+    def symbols(self, kind: Any = ca.MX) -> tuple[Any, Any, Any, Any, Any]:
+        """Fresh symbols (x, u, p, w, dt) of CasADi type ``kind``."""
+        nx, nu, np_, nw, _ = self.sizes
+        names = zip("xupw", (nx, nu, np_, nw), strict=True)
+        return (*(kind.sym(n, m) for n, m in names), kind.sym("dt"))
+
+    @remade
+    def with_walk(self, walks: Mapping[str, float]) -> FilterModel:
+        """Return the model with other random-walk standard deviations, by state name.
+
+        Raises:
+            SignalError: unknown name, a walk that is negative or not finite, a considered state.
+        """
+        new = np.array(self.walk, dtype=float)
+        for name, value in walks.items():
+            new[self.x.index(name)] = value
+        return dataclasses.replace(self, walk=new)
+
+    @remade
+    def expanded(self) -> FilterModel:
+        """Return the same model in scalar operations, faster, where that is possible.
+
+        Functions that hold a root finder or a table cannot be expanded and stay as they are.
+        """
+
+        def scalar(fun: ca.Function) -> ca.Function:
+            try:
+                made = fun.expand()
+            except RuntimeError:
+                return fun
+            # CasADi may wrap what it cannot write out in calls; those are better left to MX
+            calls = any(made.instruction_id(k) == ca.OP_CALL for k in range(made.n_instructions()))
+            return fun if calls else made
+
+        return dataclasses.replace(
+            self, transition=scalar(self.transition), output=scalar(self.output)
+        )
+
+
+def _model(
+    name: str,
+    signals: tuple[Signals, Signals, Signals, Signals, Signals],
+    symbols: Sequence[Any],
+    transition: Sequence[Any],
+    output: Sequence[Any],
+    walk: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    consider: tuple[str, ...] = (),
+) -> FilterModel:
+    """Make the two functions from expressions in ``symbols`` = (x, u, p, w, dt)."""
+    return FilterModel(
+        name,
+        *signals,
+        transition=ca.Function(f"{name}_f", [*symbols], [*transition], *_TRANSITION),
+        output=ca.Function(f"{name}_g", [*symbols[:4]], [*output], *_OUTPUT),
+        walk=walk,
+        lower=lower,
+        upper=upper,
+        consider=consider,
+    )
+
+
+@remade
+def discretise(
+    ss: StateSpace,
+    *,
+    method: str = "midpoint",
+    walk: Mapping[str, float] | None = None,
+) -> FilterModel:
+    """Make a filter's model from a continuous one, inputs held over each step.
+
+    Args:
+        ss: the model; its parameters theta become ``p``, its outputs stay as they are.
+        method: ``"midpoint"`` (explicit, second order), ``"rk4"``, or ``"implicit midpoint"``
+            (linearly implicit, second order, A-stable; its Jacobian holds second derivatives of
+            ss).
+        walk: standard deviations of process noise, unit of x per sqrt(s), by state name.
+
+    Raises:
+        ParameterError: unknown method.
+        SignalError: unknown state in ``walk``.
+    """
+    if method not in METHODS:
+        raise ParameterError(f"method {method!r} {nearest(method, METHODS)}")
+    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
+    x, u, p = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", nt)
+    w, dt = ca.MX.sym("w", 0), ca.MX.sym("dt")
+
+    def rate(at: Any) -> tuple[Any, Any]:
+        # one elimination of z serves the rate and its check
+        xdot, alg = ss.residual(at, ss.z_of(at, u, p), u, p)
+        return xdot, ca.norm_1(alg) if len(ss.z) else ca.MX(0)
+
+    k1, check = rate(x)
+    if method == "midpoint":
+        k2, c2 = rate(x + dt / 2 * k1)
+        x1, check = x + dt * k2, check + c2
+    elif method == "rk4":
+        k2, c2 = rate(x + dt / 2 * k1)
+        k3, c3 = rate(x + dt / 2 * k2)
+        k4, c4 = rate(x + dt * k3)
+        x1, check = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), check + c2 + c3 + c4
+    else:
+        x1 = linearly_implicit_midpoint(x, k1, ca.jacobian(k1, x), dt)
+    alg = ss.residual(x, ss.z_of(x, u, p), u, p)[1]
+    at_output = ca.norm_1(alg) if len(ss.z) else ca.MX(0)
+    model = _model(
+        ss.name,
+        (ss.x, ss.u, ss.theta, Signals(), ss.y),
+        (x, u, p, w, dt),
+        (x1, check),
+        (ss.g(x, u, p), at_output),
+        np.zeros(nx),
+        np.full(nx, -np.inf),
+        np.full(nx, np.inf),
+    )
+    return model.with_walk(walk or {})
+
+
+@remade
+def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
+    """Return the model with only these outputs, in this order.
+
+    Raises:
+        SignalError: unknown name, or none at all.
+    """
+    rows = model.y.indices(names)
+    if not rows:
+        raise SignalError(f"{model.name}: at least one output is needed")
+    s = model.symbols()
+    y, check = model.output(*s[:4])
+    output = ca.Function(f"{model.name}_g", [*s[:4]], [y[rows], check], *_OUTPUT)
+    return dataclasses.replace(model, y=Signals([model.y[i] for i in rows]), output=output)
+
+
+@remade
+def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
+    """Return the model for inputs that are measured with white noise.
+
+    The true input is u - sigma w; w is appended to the model's noises as ``w_<name>`` and acts on
+    output and transition of the same sample.
+
+    Args:
+        sigma: standard deviations by input name, unit of the input.
+
+    Raises:
+        SignalError: unknown input. ParameterError : sigma not finite or negative.
+    """
+    cols = model.u.indices(list(sigma))
+    for name, value in sigma.items():
+        if (
+            not 0
+            <= number(f"noisy_inputs: sigma of {name}", value, error=ParameterError)
+            < math.inf
+        ):
+            raise ParameterError(
+                f"noisy_inputs: sigma of {name} must be finite and >= 0, got {value!r}"
+            )
+        if f"w_{name}" in model.w:
+            raise SignalError(f"{model.name}: input {name} is noisy already")
+    x, u, p, _, dt = model.symbols()
+    n = len(model.w)
+    w = ca.MX.sym("w", n + len(cols))
+    spread = ca.DM(len(model.u), len(cols))
+    for j, (i, s) in enumerate(zip(cols, sigma.values(), strict=True)):
+        spread[i, j] = s
+    true = u - ca.mtimes(spread, w[n:])
+    noises = model.w + Signals(
+        [Signal(f"w_{n}", "1", f"error of the measured {n} over its standard deviation")
+         for n in sigma]
+    )  # fmt: skip
+    return _model(
+        model.name,
+        (model.x, model.u, model.p, noises, model.y),
+        (x, u, p, w, dt),
+        model.transition(x, true, p, w[:n], dt),
+        model.output(x, true, p, w[:n]),
+        model.walk,
+        model.lower,
+        model.upper,
+        model.consider,
+    )
+
+
+def _sensor_errors(model: FilterModel, names: Sequence[str], kind: str) -> FilterModel:
+    rows = model.y.indices(names)
+    n = len(model.p)
+    extra = Signals(
+        [
+            Signal(
+                f"{kind}_{name}",
+                "1" if kind == "gain" else model.y[name].unit,
+                f"{'relative gain error' if kind == 'gain' else 'bias'} of the sensor of {name}",
+                default=0.0,
+                nominal=0.01 if kind == "gain" else 0.01 * model.y[name].nominal,
+            )
+            for name in names
+        ]
+    )
+    x, u, _, w, dt = model.symbols()
+    p = ca.MX.sym("p", n + len(extra))
+    y, check = model.output(x, u, p[:n], w)
+    spread = ca.DM(len(model.y), len(extra))
+    for j, i in enumerate(rows):
+        spread[i, j] = 1
+    error = ca.mtimes(spread, p[n:])
+    y = y * (1 + error) if kind == "gain" else y + error
+    return _model(
+        model.name,
+        (model.x, model.u, model.p + extra, model.w, model.y),
+        (x, u, p, w, dt),
+        model.transition(x, u, p[:n], w, dt),
+        (y, check),
+        model.walk,
+        model.lower,
+        model.upper,
+        model.consider,
+    )
+
+
+@remade
+def gains(model: FilterModel, names: Sequence[str]) -> FilterModel:
+    """Return the model with parameters ``gain_<name>``: that sensor reads (1 + gain) y.
+
+    Raises:
+        SignalError: unknown output.
+    """
+    return _sensor_errors(model, names, "gain")
+
+
+@remade
+def biases(model: FilterModel, names: Sequence[str]) -> FilterModel:
+    """Return the model with parameters ``bias_<name>``: that sensor reads y + bias.
+
+    Raises:
+        SignalError: unknown output.
+    """
+    return _sensor_errors(model, names, "bias")
+
+
+@remade
+def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
+    """Return the model in which these parameters are states, appended in the given order.
+
+    Raises:
+        SignalError: unknown parameter.
+    """
+    moved = model.p.indices(list(unknowns))
+    kept = [i for i in range(len(model.p)) if i not in moved]
+    nx, n = len(model.x), len(moved)
+    _, u, _, w, dt = model.symbols()
+    x, p = ca.MX.sym("x", nx + n), ca.MX.sym("p", len(kept))
+    place = {i: x[nx + j] for j, i in enumerate(moved)} | {i: p[j] for j, i in enumerate(kept)}
+    all_p = ca.vertcat(*(place[i] for i in range(len(model.p)))) if place else ca.MX(0, 1)
+    x1, check = model.transition(x[:nx], u, all_p, w, dt)
+    new = list(unknowns.values())
+    return _model(
+        model.name,
+        (
+            model.x + Signals([model.p[i] for i in moved]),
+            model.u,
+            Signals([model.p[i] for i in kept]),
+            model.w,
+            model.y,
+        ),
+        (x, u, p, w, dt),
+        (ca.vertcat(x1, x[nx:]), check),
+        model.output(x[:nx], u, all_p, w),
+        np.concatenate([model.walk, [k.walk for k in new]]),
+        np.concatenate([model.lower, [k.lower for k in new]]),
+        np.concatenate([model.upper, [k.upper for k in new]]),
+        (*model.consider, *(name for name, k in unknowns.items() if k.consider)),
+    )
+
+
+@remade
+def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
+    """Return the model for inputs whose white noise comes with the data.
+
+    As :func:`noisy_inputs`, but the standard deviations are inputs themselves, appended as
+    ``sigma_<name>``: they may change from sample to sample.
+
+    Raises:
+        SignalError: unknown input, or one that is noisy already.
+    """
+    cols = model.u.indices(names)
+    for name in names:
+        if f"w_{name}" in model.w:
+            raise SignalError(f"{model.name}: input {name} is noisy already")
+    nu, nw = len(model.u), len(model.w)
+    x, _, p, _, dt = model.symbols()
+    u, w = ca.MX.sym("u", nu + len(cols)), ca.MX.sym("w", nw + len(cols))
+    spread = ca.DM(nu, len(cols))
+    for j, i in enumerate(cols):
+        spread[i, j] = 1
+    true = u[:nu] - ca.mtimes(spread, u[nu:] * w[nw:])
+    sigmas = [
+        Signal(f"sigma_{n}", model.u[n].unit, f"standard deviation of the measured {n}", None,
+               model.u[n].nominal)
+        for n in names
+    ]  # fmt: skip
+    noises = [
+        Signal(f"w_{n}", "1", f"error of the measured {n} over its standard deviation")
+        for n in names
+    ]
+    return _model(
+        model.name,
+        (model.x, model.u + Signals(sigmas), model.p, model.w + Signals(noises), model.y),
+        (x, u, p, w, dt),
+        model.transition(x, true, p, w[:nw], dt),
+        model.output(x, true, p, w[:nw]),
+        model.walk,
+        model.lower,
+        model.upper,
+        model.consider,
+    )

@@ -1,0 +1,300 @@
+"""Models whose algebraic unknowns are left to the optimiser instead of a root finder.
+
+A fit that carries the unknowns z of a :class:`~apu_casadi.core.statespace.StateSpace` as
+variables, with 0 = alg(x, z, u, theta) as constraints, never solves them at a guess that is thrown
+away, and its derivatives are those of the plain equations; at the solution both are the same
+model.  So also a state at rest: x is a variable and 0 = dx/dt a constraint.
+
+:func:`lift` makes such a model from a state space and from the *same* chain of
+:mod:`estimators.models.filtermodel` functions that makes the filter's model, so that noise, gains
+and biases enter both alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.errors import ParameterError, SignalError
+from apu_casadi.core.sharing import Parametric, building, remade
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.statespace import StateSpace
+from estimators.models.filtermodel import FilterModel, discretise
+
+__all__ = ["Lifted", "lift", "plain"]
+
+TRANSITION = ["x", "u", "p", "w", "dt"], ["x1", "check"]
+OUTPUT = ["x", "u", "p", "w"], ["y", "check"]
+_STAGE = ["x", "s", "u", "p", "w", "dt", "k"], ["y", "x1", "c", "check"]
+
+
+@dataclass(frozen=True, eq=False)
+class Lifted(Parametric):
+    """A model as optimisers take it: one sample is a *stage*.
+
+    Args:
+        model: the same model with everything eliminated; for names, recordings and filters.
+        s: unknowns of a stage that are not eliminated.
+        stage: Function (x, s, u, p, w, dt, k) -> (y, x1, c, check): outputs, next state,
+            constraints 0 = c, and the residual of whatever is still solved for inside.
+        frozen: Function (x, s, u, p, w, dt) -> k, coefficients that change by jumps only (those of
+            the cell of a table), between which the model is one smooth expression.
+        start: Function (x, u, p) -> s, a guess.
+        steady: every sample is an equilibrium of its own (a constraint in ``c``); no sample follows
+            from the one before.
+    """
+
+    model: FilterModel
+    s: Signals
+    stage: ca.Function = field(repr=False)
+    frozen: ca.Function = field(repr=False)
+    start: ca.Function = field(repr=False)
+    steady: bool = False
+
+    def __post_init__(self) -> None:
+        nx, nu, np_, nw, ny = self.model.sizes
+        got = [self.stage.size1_in(i) for i in range(self.stage.n_in())]
+        want = [nx, len(self.s), nu, np_, nw, 1, self.frozen.size1_out(0)]
+        out = [self.stage.size1_out(i) for i in range(self.stage.n_out())]
+        if got != want or len(out) != 4 or out[:2] != [ny, nx] or out[3] != 1:
+            raise SignalError(
+                f"{self.model.name}: stage of sizes {want} -> [{ny}, {nx}, constraints, 1] "
+                f"expected, got {got} -> {out}"
+            )
+
+    @property
+    def n_c(self) -> int:
+        """Number of constraints of a stage."""
+        return int(self.stage.size1_out(2))
+
+
+@remade
+def plain(model: FilterModel) -> Lifted:
+    """Return a filter's model as it is, nothing lifted."""
+    model = model.expanded()
+    x, u, p, w, dt = model.symbols()
+    s, k = ca.MX.sym("s", 0), ca.MX.sym("k", 0)
+    y, c1 = model.output(x, u, p, w)
+    x1, c2 = model.transition(x, u, p, w, dt)
+    stage = ca.Function(
+        f"{model.name}_stage", [x, s, u, p, w, dt, k], [y, x1, ca.MX(0, 1), c1 + c2], *_STAGE
+    )
+    frozen = ca.Function("frozen", [x, s, u, p, w, dt], [ca.MX(0, 1)])
+    start = ca.Function(f"{model.name}_start", [x, u, p], [ca.MX(0, 1)])
+    return Lifted(model, Signals(), _scalar(stage), frozen, start)
+
+
+@building
+def lift(
+    ss: StateSpace,
+    build: Callable[[FilterModel], FilterModel] | None = None,
+    *,
+    equations: ca.Function | None = None,
+    steady: bool = False,
+    walk: Mapping[str, float] | None = None,
+) -> Lifted:
+    """Make a lifted model from a continuous one.
+
+    Args:
+        ss: the model.
+        build: turns ``discretise(ss)`` into the model wanted, by
+            :func:`~estimators.models.filtermodel.measure`,
+            :func:`~estimators.models.filtermodel.noisy_inputs`,
+            :func:`~estimators.models.filtermodel.gains`,
+            :func:`~estimators.models.filtermodel.biases`,
+            :func:`~estimators.models.filtermodel.augment`; applied to the eliminated and to the
+            lifted form.  It must not depend on anything but its argument.
+        equations: Function (x, z, u, theta) -> (ode, alg, y): ``ss.residual`` with the outputs.
+            Not needed where ss has no z.
+        steady: each sample is an equilibrium.  Otherwise the explicit midpoint rule leads from
+            sample to sample, as :func:`~estimators.models.filtermodel.discretise` does by default;
+            the state amid the step and its z are unknowns too.
+        walk: standard deviations of process noise, unit of x per sqrt(s), by state name.
+
+    Raises:
+        ParameterError: equations missing, or of other sizes; process noise or parameters as states
+            in a steady model.
+    """
+    build = build or (lambda m: m)
+    nx, nz, nt = len(ss.x), len(ss.z), len(ss.theta)
+    smooth, cells = _split(_equations(ss, equations))
+    n_k = cells.size1_out(0)
+    model = build(discretise(ss, walk=walk))
+    if steady and (model.x.names != ss.x.names or model.walk.any()):
+        raise ParameterError(
+            f"{ss.name}: a steady model has no process noise and no parameters as states; samples "
+            "do not follow from each other"
+        )
+    # unknowns at the sample (a) and amid the step (m)
+    s = [Signal(f"{q.name}_a", q.unit, q.doc, None, q.nominal) for q in ss.z]
+    held = [Signal(f"alg_{q.name}_a", "1", f"equation of {q.name}") for q in ss.z]
+    if steady:
+        held += [Signal(f"rate_{q.name}", q.unit, f"rate of {q.name}") for q in ss.x]
+    else:
+        amid = (*ss.x, *ss.z)
+        s += [Signal(f"{q.name}_m", q.unit, q.doc, None, q.nominal) for q in amid]
+        held += [Signal(f"alg_{q.name}_m", "1", f"equation of {q.name}") for q in amid]
+    n_s = len(s)
+    k = [Signal(f"k{i}", "1", "coefficient") for i in range(n_k if steady else 2 * n_k)]
+
+    def point(x: Any, p: Any) -> tuple[Any, ...]:
+        """State and unknowns at the sample, and amid the step."""
+        q = p[nt : nt + n_s]
+        return x[:nx], q[:nz], *((None, None) if steady else (q[nz : nz + nx], q[nz + nx :]))
+
+    def changed(
+        parameters: Sequence[Signal],
+        kept: Sequence[Signal],
+        rows: Callable[[Any, Any, Any, Any], tuple[Any, list[Any]]],
+        output: Callable[[Any, Any, Any], Any],
+    ) -> FilterModel:
+        """``build`` applied to a model with more parameters and more 'next states'.
+
+        Constraints travel as the next values of states that nothing reads, unknowns and
+        coefficients as parameters: so ``build`` does to them what it does to the model.
+        """
+        x, w = ca.MX.sym("x", nx + len(kept)), ca.MX.sym("w", 0)
+        u, p, dt = ca.MX.sym("u", len(ss.u)), ca.MX.sym("p", nt + len(parameters)), ca.MX.sym("dt")
+        x1, more = rows(x, u, p, dt)
+        n = nx + len(kept)
+        f = ca.Function("f", [x, u, p, w, dt], [ca.vertcat(x1, *more), ca.MX(0)], *TRANSITION)
+        g = ca.Function("g", [x, u, p, w], [output(x, u, p), ca.MX(0)], *OUTPUT)
+        return build(
+            FilterModel(
+                ss.name, ss.x + Signals(kept), ss.u, ss.theta + Signals(parameters), Signals(),
+                ss.y, f, g, np.zeros(n), np.full(n, -np.inf), np.full(n, np.inf),
+            ).with_walk(walk or {})
+        )  # fmt: skip
+
+    def equations_at(x: Any, u: Any, p: Any) -> tuple[Any, Any, Any]:
+        at, z, _, _ = point(x, p)
+        out: tuple[Any, Any, Any] = smooth(at, z, u, p[:nt], p[nt + n_s : nt + n_s + n_k])
+        return out
+
+    def constraints(x: Any, u: Any, p: Any, dt: Any) -> tuple[Any, list[Any]]:
+        at, _, x_m, z_m = point(x, p)
+        ode, alg, _ = equations_at(x, u, p)
+        if steady:
+            return at, [alg, ode / ss.x.nominals]
+        rate, alg_m, _ = smooth(x_m, z_m, u, p[:nt], p[nt + n_s + n_k :])
+        return at + dt * rate, [alg, (x_m - at - dt / 2 * ode) / ss.x.nominals, alg_m]
+
+    def coefficients(x: Any, u: Any, p: Any, _: Any) -> tuple[Any, list[Any]]:
+        at, z, x_m, z_m = point(x, p)
+        here = [cells(at, z, u, p[:nt])]
+        return at, here if steady else [*here, cells(x_m, z_m, u, p[:nt])]
+
+    big = changed([*s, *k], held, constraints, lambda x, u, p: equations_at(x, u, p)[2])
+    jumps = changed(s, k, coefficients, lambda x, u, p: ca.MX.zeros(len(ss.y)))
+    x, u, p, w, dt = model.symbols()
+    given = [x, ca.MX.sym("s", n_s), u, p, w, dt]
+    at_k = ca.MX.sym("k", len(k))
+    known = {q.name: given[1][i] for i, q in enumerate(s)}
+    known |= {q.name: at_k[i] for i, q in enumerate(k)}
+    y, x1, c = _sorted(model, big, held, given, known)
+    stage = ca.Function(f"{ss.name}_stage", [*given, at_k], [y, x1, c, ca.MX(0)], *_STAGE)
+    _, _, now = _sorted(model, jumps, k, given, known)
+    frozen = ca.Function(f"{ss.name}_frozen", given, [now])
+    start = _start(ss, model, steady)
+    return Lifted(model, Signals(s), _scalar(stage), frozen, start, steady)
+
+
+def _scalar(fun: ca.Function) -> ca.Function:
+    """The function in scalar operations where it has only such."""
+    try:
+        return fun.expand()
+    except RuntimeError:
+        return fun
+
+
+def _equations(ss: StateSpace, equations: ca.Function | None) -> ca.Function:
+    nx, nz, nu, nt = len(ss.x), len(ss.z), len(ss.u), len(ss.theta)
+    if equations is None:
+        if nz:
+            raise ParameterError(
+                f"{ss.name} has the algebraic unknowns {', '.join(ss.z.names)}: give equations, "
+                "the Function (x, z, u, theta) -> (ode, alg, y)"
+            )
+        x, z, u, theta = (ca.MX.sym(n, m) for n, m in zip("xzut", (nx, 0, nu, nt), strict=True))
+        return ca.Function(
+            "equations", [x, z, u, theta], [ss.f(x, u, theta), ca.MX(0, 1), ss.g(x, u, theta)]
+        )
+    got = [equations.size1_in(i) for i in range(equations.n_in())]
+    out = [equations.size1_out(i) for i in range(equations.n_out())]
+    want = [nx, nz, nu, nt], [nx, nz, len(ss.y)]
+    if (got, out) != want:
+        raise ParameterError(
+            f"{ss.name}: equations of sizes {want[0]} -> {want[1]} expected, got {got} -> {out}"
+        )
+    return equations
+
+
+def _split(equations: ca.Function) -> tuple[ca.Function, ca.Function]:
+    """Split equations into (x, z, u, theta, k) -> (ode, alg, y) and (x, z, u, theta) -> k.
+
+    k are the arguments of the inner function by which it is declared not to be differentiated.
+    Equations that are not one such call have no k; they stay whole.  In scalar operations second
+    derivatives cost a tenth.
+    """
+    args = [ca.MX.sym(equations.name_in(i), equations.size1_in(i)) for i in range(4)]
+    sizes = [a.shape[0] for a in args]
+    whole = (
+        ca.Function("smooth", [*args, ca.MX.sym("k", 0)], equations.call(args)),
+        ca.Function("cells", args, [ca.MX(0, 1)]),
+    )
+    if equations.is_a("SXFunction"):
+        return whole
+    out = equations.call(args, True, False)
+    calls = [o.dep(0) if o.is_output() else o for o in out]
+    call = calls[0]
+    if not all(c.is_call() and c.__hash__() == call.__hash__() for c in calls):
+        return whole
+    inner = call.which_function()
+    n = inner.n_in()
+    smooth = [inner.is_diff_in(i) for i in range(n)]
+    if (
+        smooth != [True] * 4 + [False] * (n - 4)
+        or not inner.is_a("SXFunction")
+        or not all(ca.is_equal(call.dep(i), args[i]) for i in range(4))
+        or not all(o.which_output() == i for i, o in enumerate(out) if o.is_output())
+    ):
+        return whole
+    parts = [inner.size1_in(i) for i in range(4, n)]
+    k = ca.SX.sym("k", sum(parts))
+    given = [ca.SX.sym("q", m) for m in sizes]
+    pieces = ca.vertsplit(k, [0, *np.cumsum(parts).tolist()])
+    return (
+        ca.Function("smooth", [*given, k], inner.call([*given, *pieces], True, False)),
+        ca.Function("cells", args, [ca.vertcat(*(call.dep(i) for i in range(4, n)))]),
+    )
+
+
+def _sorted(
+    model: FilterModel,
+    big: FilterModel,
+    held: Sequence[Signal],
+    given: Sequence[Any],
+    known: Mapping[str, Any],
+) -> tuple[Any, Any, Any]:
+    """Outputs, next state and held rows of a changed model, called with a stage's arguments."""
+    x, _, u, p, w, dt = given
+    X = ca.vertcat(*(x[model.x.index(n)] if n in model.x else 0 for n in big.x.names))
+    P = ca.vertcat(
+        ca.MX(0, 1), *(known[n] if n in known else p[model.p.index(n)] for n in big.p.names)
+    )
+    X1, _ = big.transition(X, u, P, w, dt)
+    rows = big.x.indices([q.name for q in held])
+    picked = X1[rows] if rows else ca.MX(0, 1)
+    return big.output(X, u, P, w)[0], X1[big.x.indices(model.x.names)], picked
+
+
+def _start(ss: StateSpace, model: FilterModel, steady: bool) -> ca.Function:
+    x, u, p, _, _ = model.symbols()
+    theta = [x[model.x.index(n)] if n in model.x else p[model.p.index(n)] for n in ss.theta.names]
+    at = x[: len(ss.x)]
+    z = ss.z_of(at, u[model.u.indices(ss.u.names)], ca.vertcat(ca.MX(0, 1), *theta))
+    return ca.Function(f"{ss.name}_start", [x, u, p], [z if steady else ca.vertcat(z, at, z)])

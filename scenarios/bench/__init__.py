@@ -1,0 +1,1 @@
+"""Times against their targets, with the accuracy of every answer."""

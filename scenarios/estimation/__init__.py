@@ -1,1 +1,0 @@
-"""The estimators at work on the APU: sensors, filters of both parts, the joint one, and studies."""

@@ -1,0 +1,92 @@
+"""Figures of the estimation studies, from plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apu_casadi.core.errors import SignalError
+from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_gain_of_a_sensor"]
+
+
+def plot_gain_of_a_sensor(
+    prior: Any,
+    curves: Mapping[str, Mapping[str, Any]],
+    *,
+    aims: Mapping[str, tuple[float, float]],
+    note: str,
+    sensor: str = "shaft power",
+) -> Figure:
+    """Draw how much one more sensor reduces the faults' error, and the null direction's with it.
+
+    Args:
+        prior: standard deviation of each fault before, fraction, shape (n,), increasing.
+        curves: at most four by label; of each ``reduction`` of the rms standard deviation
+            (fraction), ``null_before`` and ``null_after``, standard deviations along the null
+            direction, (n,).
+        aims: points (prior, reduction) to be reached, by the label of their curve.
+        note: the caption.
+        sensor: what was added, for the titles.
+
+    Raises:
+        SignalError: no curves, more than four, unknown labels, or arrays of other shapes.
+    """
+
+    prior = np.asarray(prior, float)
+    if not 1 <= len(curves) <= len(LINE_INK):
+        raise SignalError(f"one to {len(LINE_INK)} curves can be drawn, got {len(curves)}")
+    for label, c in curves.items():
+        shapes = [np.shape(c[k]) for k in ("reduction", "null_before", "null_after")]
+        if any(s != prior.shape for s in shapes):
+            raise SignalError(f"{label}: shapes {shapes}, {prior.shape} expected")
+    if set(aims) - set(curves):
+        raise SignalError(f"aims of unknown curves: {', '.join(sorted(set(aims) - set(curves)))}")
+    with drawing():
+        fig = new_figure(4.6)
+        left, right = fig.subplots(1, 2)
+        fig.subplots_adjust(left=0.065, right=0.985, top=0.90, bottom=0.255, wspace=0.2)
+        ticks = [p for p in (0.5, 1, 2, 5, 10, 20) if 99 * prior[0] <= p <= 101 * prior[-1]]
+        for ax in (left, right):
+            ax.set_xscale("log")
+            ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+            ax.minorticks_off()
+            ax.set_xlabel("prior of each factor, 1 sigma, %")
+        right.plot(100 * prior, 100 * prior, color=MUTED, lw=1.2, ls="--",
+                   label="before any reading")  # fmt: skip
+        for (label, c), ink in zip(curves.items(), LINE_INK, strict=False):
+            left.plot(100 * prior, 100 * np.asarray(c["reduction"]), color=ink, lw=1.8, label=label)
+            right.plot(100 * prior, 100 * np.asarray(c["null_after"]), color=ink, lw=1.8,
+                       label=label)  # fmt: skip
+            if label in aims:
+                at, goal = aims[label]
+                left.plot(100 * at, 100 * goal, marker="^", ms=9, mfc="white", mec=ink, mew=1.8)
+                left.annotate(
+                    f"aim {100 * goal:.0f} %", (100 * at, 100 * goal), (-9, -3), ha="right",
+                    textcoords="offset points", fontsize=8.2, color=INK,
+                    bbox={"fc": "white", "ec": "none", "pad": 0.8},
+                )  # fmt: skip
+        worst = max((c["null_before"] for c in curves.values()), key=lambda v: float(np.max(v)))
+        right.plot(100 * prior, 100 * np.asarray(worst), color=INK, lw=0, marker="o", ms=3.5,
+                   label=f"without {sensor}")  # fmt: skip
+        left.set_ylim(0, 100)
+        right.set_yscale("log")
+        seen = [np.min(c["null_after"]) for c in curves.values()]
+        levels = [t for t in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
+                  if 50 * min(seen) <= t <= 101 * prior[-1]]  # fmt: skip
+        right.set_yticks(levels, [f"{t:g}" for t in levels])
+        right.minorticks_off()
+        left.set_ylabel("reduction of the rms error, %")
+        right.set_ylabel("1 sigma along the null direction, %")
+        title(left, f"What {sensor} takes off the error of the health factors")
+        title(right, "What remains along the null direction")
+        left.legend(frameon=False, fontsize=8.5, loc="upper left")
+        right.legend(frameon=False, fontsize=8.5, loc="upper left")
+        caption(fig, note)
+    return fig

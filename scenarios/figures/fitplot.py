@@ -1,0 +1,93 @@
+"""Measured against fitted, sensor by sensor, with the residuals beside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apu_casadi.core.errors import SignalError
+from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SHOWN = {
+    "rad/s": ("r/min", 30 / np.pi), "Pa": ("kPa", 1e-3), "W": ("kW", 1e-3), "kg/s": ("g/s", 1e3),
+}  # fmt: skip
+Series = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def plot_fit(
+    t: np.ndarray,
+    series: Mapping[str, Series],
+    units: Mapping[str, str],
+    *,
+    steady: bool,
+    heading: str,
+    note: str = "",
+) -> Figure:
+    """Draw one data set: a row for each sensor, residuals in standard deviations at the right.
+
+    Args:
+        t: instants (s), or numbers of the points, shape (K,).
+        series: {name: (measured, fitted, residual in sigmas)}, each of shape (K,), NaN for gaps.
+        units: SI unit by name; shown in r/min, kPa, kW, g/s where these are usual.
+        steady: points instead of lines.
+        heading, note: title and caption.
+
+    Raises:
+        SignalError: nothing to draw, or arrays of another length.
+    """
+
+    wrong = [n for n, s in series.items() if any(np.shape(a) != np.shape(t) for a in s)]
+    if not series or wrong:
+        raise SignalError(
+            f"series of {np.size(t)} values expected; wrong: {', '.join(wrong) or 'none given'}"
+        )
+    n = len(series)
+    with drawing():
+        height = 1.25 * n + 1.3
+        fig = new_figure(height)
+        grid = fig.add_gridspec(
+            n, 2, width_ratios=(1.9, 1), left=0.085, right=0.985, bottom=0.85 / height,
+            top=1 - 0.55 / height, hspace=0.28, wspace=0.16,
+        )  # fmt: skip
+        fig.text(0.012, 1 - 0.22 / height, heading, fontsize=11, fontweight="bold", va="center")
+        for i, (name, (measured, fitted, error)) in enumerate(series.items()):
+            unit, scale = _SHOWN.get(units[name], (units[name], 1.0))
+            ax = fig.add_subplot(grid[i, 0])
+            ax.plot(t, scale * measured, ls="none", marker="o", ms=5 if steady else 2.6,
+                    mfc="none" if steady else MUTED, mec=MUTED, mew=1.0 if steady else 0.0,
+                    alpha=1.0 if steady else 0.6, label="measured")  # fmt: skip
+            ax.plot(t, scale * fitted, color=LINE_INK[0], lw=0 if steady else 1.4,
+                    marker="x" if steady else None, ms=5, mew=1.5, label="fitted")  # fmt: skip
+            ax.set_ylabel(f"{name} [{unit}]")
+            ax.margins(x=0.02, y=0.15)
+            side = fig.add_subplot(grid[i, 1], sharex=ax)
+            side.axhspan(-1.96, 1.96, color="#e8f0f7", lw=0, zorder=0)
+            side.axhline(0, color=INK, lw=0.8)
+            side.plot(t, error, ls="none", marker="o", ms=4 if steady else 2.2, color=LINE_INK[1],
+                      alpha=0.9 if steady else 0.6, mew=0)  # fmt: skip
+            largest = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
+            reach = max(3.2, 1.15 * largest)
+            side.set_ylim(-reach, reach)
+            if not np.isfinite(error).any():
+                side.text(0.5, 0.5, "not measured", transform=side.transAxes, ha="center",
+                          va="center", color=MUTED, fontsize=8.5)  # fmt: skip
+            for a in (ax, side):
+                a.tick_params(labelbottom=i == n - 1)
+            if i == 0:
+                ax.legend(loc="best", fontsize=8, frameon=True, framealpha=0.9, edgecolor="none")
+                title(side, "residual / standard deviation")
+            if i == n - 1:
+                for a in (ax, side):
+                    a.set_xlabel("point" if steady else "time [s]")
+                    if steady:
+                        a.xaxis.get_major_locator().set_params(integer=True)
+        caption(fig, f"Shaded: 95 % of the residuals should lie here. {note}".strip())
+        return fig
+
+
+__all__: Sequence[str] = ["plot_fit"]

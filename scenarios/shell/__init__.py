@@ -1,0 +1,1 @@
+"""What a command does about signals, streams, locks and worker processes."""

@@ -1,0 +1,130 @@
+"""Worker processes that end with their parent, however it ends, and stop when it is told to.
+
+Each worker holds the reading end of a pipe whose writing end only the parent has.  A thread of the
+worker waits for the end of that pipe, which comes when the parent closes it or is gone for whatever
+reason, and ends the process.  On Linux the kernel is asked for the same in addition.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.connection import Connection
+from types import FrameType
+from typing import Any
+
+THREADS = (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+)  # fmt: skip
+_PR_SET_PDEATHSIG = 1
+
+
+@contextlib.contextmanager
+def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of fresh processes; an exception ends them at once, whatever they are doing.
+
+    They use one thread each for linear algebra, and do not import the calling script.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    ours, theirs = spawn.Pipe(duplex=False)
+    with _plain_children():
+        executor = ProcessPoolExecutor(
+            workers, mp_context=spawn, initializer=begin, initargs=(ours, os.getpid())
+        )
+        try:
+            yield executor
+        except BaseException:
+            theirs.close()  # ends the workers; the pool then counts as broken
+            raise
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+            theirs.close()
+            ours.close()
+
+
+def begin(line: Connection, parent: int) -> None:
+    """Prepare a worker: Ctrl-C is the parent's to answer, and its end is ours.
+
+    Args:
+        line: reading end of the pipe that the parent holds open.
+        parent: its process id.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(line,), name="end with parent", daemon=True).start()
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:  # it ended before the kernel was asked
+            os._exit(1)
+
+
+def _end_with(line: Connection) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        line.recv_bytes()
+    os._exit(1)
+
+
+@contextlib.contextmanager
+def _plain_children() -> Iterator[None]:
+    """Let processes started inside the block use one thread each, and not run our main script.
+
+    The latter is what spawning does, for functions that the script may define; ours are here.
+    """
+    before = {k: os.environ.get(k) for k in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    main = sys.modules["__main__"]
+    held: dict[str, Any] = {
+        k: vars(main).pop(k) for k in ("__file__", "__spec__") if k in vars(main)
+    }
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        vars(main).update(held)
+        for k, v in before.items():
+            if v is None:
+                os.environ.pop(k, None)
+            else:
+                os.environ[k] = v
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[Callable[[], None]]:
+    """Let SIGTERM end the block as Ctrl-C does, with KeyboardInterrupt.
+
+    Yields a function that raises it if either has come: to be called where an integrator may have
+    turned the first one into an error of its own.  A signal that is ignored stays so, a handler
+    of the caller's own is called first, and outside the main thread nothing changes.
+    """
+    asked = threading.Event()
+    before: dict[int, Any] = {}
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        if callable(before[number]):
+            before[number](number, frame)
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            old = signal.getsignal(number)
+            if callable(old) or old == signal.SIG_DFL:
+                before[number] = old
+                signal.signal(number, handler)
+    try:
+        yield check
+    finally:
+        for n, handled in before.items():
+            signal.signal(n, handled)

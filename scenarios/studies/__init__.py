@@ -1,0 +1,1 @@
+"""Studies: the estimators and the exchange on trial over many random runs."""

@@ -1,0 +1,394 @@
+"""A scenario estimated: its truth, measurements and estimates, and what they say, in words.
+
+The truth is simulated by CVODES with exchange steps of 5 ms, corrected; the filters step with the
+terminal model's own integrator at 10 kHz and the midpoint rule at 20 ms.  Gain errors of all
+sensors and the error of the generators' efficiency are drawn for the seed, then noise is added.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apu_casadi.core import files
+from apu_casadi.core.errors import ScenarioError
+from apu_casadi.core.sharing import last
+from estimators.apu.electrical.faults import ridge
+from estimators.apu.electrical.terminalsignals import PHASES
+from estimators.apu.gaspath import DT, HEALTH
+from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
+from scenarios import registry
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import xarray as xr
+
+    from scenarios.schema import Scenario
+
+__all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
+
+FINE = 0.005  # s; exchange step of the truth
+WAVEFORM = 1e-4  # s; sampling of the electrical sensors
+Z95 = 1.96
+HEALTH_WORDS = {
+    "f_eta_c": "compressor efficiency", "f_W_c": "compressor flow",
+    "f_eta_t": "turbine efficiency", "f_W_t": "turbine flow",
+}  # fmt: skip
+SHOWN = ("N", *HEALTH, "h_a", "h_b", "h_c", "P_total")
+
+
+def truth(
+    scenario: Scenario | str, *, progress: Callable[[float, float], None] | None = None
+) -> xr.Dataset:
+    """Simulate what is true; a scenario of the library is kept for the next call.
+
+    Raises:
+        ScenarioError: unknown scenario, ambient conditions other than the filters', or an exchange
+            step that is no multiple of 5 ms.
+        SimulationError: as the simulation.
+    """
+    if isinstance(scenario, str) and progress is None:
+        return _kept(scenario)
+    s = registry.get(scenario) if isinstance(scenario, str) else scenario
+    return _simulated(s, progress)
+
+
+@last(1)
+def _kept(name: str) -> xr.Dataset:
+    return _simulated(registry.get(name), None)
+
+
+def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> xr.Dataset:
+    from apu_casadi.unit.events import Ambient
+    from apu_casadi.unit.multirate import simulate_joint
+
+    if s.ambient != Ambient():
+        raise ScenarioError(
+            f"{s.name}: the gas-path filter of the joint estimation knows the ambient conditions "
+            f"{dataclasses.asdict(Ambient())} only, the scenario has "
+            f"{dataclasses.asdict(s.ambient)}"
+        )
+    if s.duration < 3 * DT:
+        raise ScenarioError(f"{s.name}: {s.duration:g} s are too short to estimate anything in")
+    ds = simulate_joint(
+        registry.unit_of(json.dumps(dict(s.parameters), sort_keys=True)),
+        duration=s.duration, **s.start(), ambient=s.ambient, events=s.events(), dt=FINE,
+        exchange="corrected", waveform_dt=WAVEFORM, progress=progress,
+    )  # fmt: skip
+    ds.attrs["scenario"] = s.to_json()
+    ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
+    return ds
+
+
+def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
+    """Measure a truth with the errors of a seed and estimate along it; see :func:`estimate_joint`.
+
+    The result carries scenario, phases and seed as attributes.
+
+    Raises:
+        DataError, EstimationError: as :func:`estimate_joint`.
+    """
+    case = joint_case(seed)
+    s = json.loads(ds.attrs["scenario"])
+    unit = registry.unit_of(json.dumps(s.get("parameters", {}), sort_keys=True))
+    found = estimate_joint(
+        ds, seed, apu=unit, gas_gains=case.gas_gains, electrical_gains=case.electrical_gains,
+        **options,
+    )  # fmt: skip
+    found.attrs |= {
+        "scenario": ds.attrs["scenario"], "phases": ds.attrs["phases"], "seed": seed,
+        "gas_gains": json.dumps(case.gas_gains),
+        "electrical_gains": json.dumps(case.electrical_gains),
+    }  # fmt: skip
+    told = ("ambient", "loads", "faults", "solver", "apu_casadi_version", "exchange_error",
+            "validity", "warnings")  # fmt: skip
+    found.attrs |= {
+        f"truth_{n}" if n == "solver" else n: ds.attrs[n] for n in told if n in ds.attrs
+    }
+    return found
+
+
+# ------------------------------------------------------------------------------ what it says
+
+
+def _sigma(e: xr.Dataset, name: str) -> np.ndarray:
+    """Standard deviation of all that may be wrong.
+
+    The electrical filter's power comes with the variance of its windows; the gain errors of its
+    sensors, common to all windows, are added here.
+    """
+    s = np.asarray(e[f"{name}_sigma"].values, float)
+    return np.hypot(s, GAIN_SHARE * e[name].values) if name == "P_total" else s
+
+
+def _at(t: np.ndarray, when: float) -> int:
+    """Last sample at or before an instant."""
+    return int(np.searchsorted(t, when + 1e-9)) - 1
+
+
+def report(e: xr.Dataset) -> dict[str, Any]:
+    """Return what the estimate says, by phase, ready for JSON.
+
+    ``phases``: at the end of each, for the factors and severities truth, estimate, half width of
+    the 95 % band and whether it holds the truth.  ``short_circuit``: true phase, onset, when it was
+    found and in which phase, reports before it, the severity as a ridge of (mu, k_rf).  ``health``:
+    true changes with the delay of their report, and reports without one.  ``cross_talk``: what each
+    fault changed in the estimates of the other kind.
+    """
+    t = e["time"].values
+    phases = json.loads(e.attrs["phases"])
+    scenario = json.loads(e.attrs["scenario"])
+    rows = []
+    for p in phases:
+        k = _at(t, min(p["end"], t[-1]) - (0 if p is phases[-1] else 1e-6))
+        values = {}
+        for n in SHOWN:
+            x, true = (float(e[f"{n}{end}"].values[k]) for end in ("", "_true"))
+            s = float(_sigma(e, n)[k])
+            values[n] = {"true": true, "estimate": x, "half_width": Z95 * s,
+                         "inside": bool(abs(x - true) <= Z95 * s)}  # fmt: skip
+        found = int(e["faulty_phase"].values[k])
+        rows.append({
+            "name": p["name"], "start": p["start"], "end": p["end"], "values": values,
+            "faulty_phase": PHASES[found - 1] if found else None,
+        })  # fmt: skip
+    return {
+        "scenario": scenario["name"], "title": scenario.get("title", ""), "seed": e.attrs["seed"],
+        **made_with(e), "phases": rows, "short_circuit": _short_circuit(e), "health": _health(e),
+        "cross_talk": _cross_talk(e),
+    }  # fmt: skip
+
+
+def made_with(e: xr.Dataset) -> dict[str, Any]:
+    """Return what the truth was simulated with and what must be known of it, ready for JSON."""
+    told = {"ambient": "ambient", "loads": "loads", "validity": "validity", "warnings": "warnings",
+            "truth_solver": "truth_solver"}  # fmt: skip
+    out: dict[str, Any] = {k: json.loads(e.attrs.get(a, "null")) for k, a in told.items()}
+    return out | {"apu_casadi_version": e.attrs.get("apu_casadi_version", "")}
+
+
+def made_words(r: Mapping[str, Any]) -> str:
+    """Return what the truth of a report was simulated with, in words; "" if it is not recorded."""
+    from apu_casadi.gaspath.conditions import day_words
+
+    if not (r.get("ambient") and r.get("loads")):
+        return ""
+    loads = ", ".join(f"{x['load']} from {x['t']:g} s" for x in r["loads"])
+    made_by = r.get("truth_solver") or {}
+    return (
+        f"Ambient {day_words(r['ambient'])}; load of each generator {loads}; truth by "
+        f"{made_by.get('solver')}, exchange {made_by.get('exchange')} every "
+        f"{1e3 * made_by.get('dt', 0.0):g} ms; apu-casadi {r['apu_casadi_version']}."
+    )
+
+
+def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:
+    """First samples at which some true value differs from the one before."""
+    true = np.array([e[f"{n}_true"].values for n in names])
+    return [int(k) + 1 for k in np.flatnonzero(np.abs(np.diff(true, axis=1)).max(0) > 1e-9)]
+
+
+def _grouped(onsets: list[int]) -> list[int]:
+    """The first of each run of neighbouring samples."""
+    return [k for j, k in enumerate(onsets) if j == 0 or k > onsets[j - 1] + 1]
+
+
+def _short_circuit(e: xr.Dataset) -> dict[str, Any] | None:
+    t, said = e["time"].values, e["faulty_phase"].values.astype(int)
+    true = np.array([e[f"h_{p}_true"].values for p in PHASES])
+    out: dict[str, Any] = {"resets": json.loads(e.attrs["resets"])}
+    if not true.any():
+        return out | {"true_phase": None, "false_reports": int(np.count_nonzero(said))}
+    i = int(true.max(1).argmax())
+    first = int(np.flatnonzero(true[i] > 0)[0])
+    # a change at an instant shows in the sample after it
+    onset = float(t[max(first - 1, 0)]) if first else float(t[0])
+    right = np.flatnonzero(said[first:] == i + 1)
+    x, s = (float(e[f"h_{PHASES[i]}{end}"].values[-1]) for end in ("", "_sigma"))
+    return out | {
+        "true_phase": PHASES[i], "onset": onset,
+        "found_after": float(t[first + right[0]] - onset) if right.size else None,
+        "false_reports": int(np.count_nonzero(said[:first])),
+        "wrong_phase_samples": int(np.count_nonzero((said[first:] != i + 1) & (said[first:] > 0))),
+        "h": x, "half_width": Z95 * s, "h_true": float(true[i, -1]),
+        "ridge": ridge(x) if x > 0 else [],
+    }  # fmt: skip
+
+
+def _health(e: xr.Dataset) -> dict[str, Any]:
+    t = e["time"].values
+    alarms = json.loads(e.attrs["alarms"])
+    changes, matched = [], set()
+    for k in _grouped(_onsets(e, HEALTH)):
+        onset = float(t[k - 1])
+        # within a second, or before the next change
+        after = [a for a in alarms if onset < a <= onset + 1.0 and a not in matched]
+        if after:
+            matched.add(after[0])
+        changes.append({"onset": onset, "found_after": after[0] - onset if after else None})
+    return {"changes": changes, "other_alarms": [a for a in alarms if a not in matched]}
+
+
+def _cross_talk(e: xr.Dataset) -> dict[str, Any]:
+    """Change of the other kind's estimates over a fault, and their sigma.
+
+    From the sample before the fault to 1 s after it, or to what happens next.
+    """
+    t = e["time"].values
+    h_names = tuple(f"h_{p}" for p in PHASES)
+    out: dict[str, Any] = {"short_circuit_on_health": [], "health_on_h": []}
+    pairs = (("short_circuit_on_health", h_names, HEALTH), ("health_on_h", HEALTH, h_names))
+    for key, cause, effect in pairs:
+        own = set(_grouped(_onsets(e, effect)))
+        every = sorted(own | set(_grouped(_onsets(e, cause))))
+        for k in _grouped(_onsets(e, cause)):
+            if k in own:  # both at once: nothing can be told apart
+                continue
+            later = [j - 1 for j in every if j > k]
+            before, after = k - 1, min([_at(t, t[k] + 1.0), *later])
+            out[key].append({
+                "onset": float(t[before]), "seconds": float(t[after] - t[before]),
+                "change": {n: float(e[n].values[after] - e[n].values[before]) for n in effect},
+                "sigma": {n: float(e[f"{n}_sigma"].values[after]) for n in effect},
+            })  # fmt: skip
+    return out
+
+
+def table(r: Mapping[str, Any]) -> str:
+    """Return the phases side by side: truth, estimate with its 95 % half width."""
+    forms: dict[str, tuple[str, float, str]] = {
+        "N": ("shaft speed N [r/min]", 30 / math.pi, ".1f"),
+        "P_total": ("mechanical power [kW]", 1e-3, ".2f"),
+        **{n: (f"{HEALTH_WORDS[n]} {n}", 1.0, ".4f") for n in HEALTH},
+        **{f"h_{p}": (f"severity h_{p} [1e-3]", 1e3, ".4f") for p in PHASES},
+    }
+    head = ["at the end of", *(p["name"] for p in r["phases"])]
+    lines = [["  t [s]", *(f"{p['end']:g}" for p in r["phases"])]]
+    for n in SHOWN:
+        label, scale, form = forms[n]
+        cells, true = [], []
+        for p in r["phases"]:
+            v = p["values"][n]
+            mark = "" if v["inside"] else " *"
+            cells.append(
+                f"{scale * v['estimate']:{form}} +- {scale * v['half_width']:{form}}{mark}"
+            )
+            true.append(f"{scale * v['true']:{form}}")
+        lines += [[label, *cells], ["  true", *true]]
+    lines.append(["short circuit found in phase", *(p["faulty_phase"] or "-" for p in r["phases"])])
+    width = [max(len(x[i]) for x in (head, *lines)) for i in range(len(head))]
+
+    def row(cells: list[str]) -> str:
+        rest = (f"{c:>{w}}" for c, w in zip(cells[1:], width[1:], strict=True))
+        return f"{cells[0]:<{width[0]}}  " + "  ".join(rest)
+
+    text = [row(head), "-" * len(row(head)), *(row(x) for x in lines)]
+    if any(not v["inside"] for p in r["phases"] for v in p["values"].values()):
+        text.append("* the truth lies outside the 95 % band (one in twenty should)")
+    return "\n".join(x.rstrip() for x in text)
+
+
+def words(r: Mapping[str, Any]) -> list[str]:
+    """Return what was found, in sentences."""
+    out = []
+    s = r["short_circuit"]
+    if s["true_phase"] is None:
+        n = s["false_reports"]
+        out.append(
+            "No short circuit happened and none was reported." if not n else
+            f"No short circuit happened, but {n} samples of 20 ms report one."
+        )  # fmt: skip
+    else:
+        when = (
+            f"was reported {1e3 * s['found_after']:.0f} ms later, at the next sample of 20 ms"
+            if s["found_after"] is not None and s["found_after"] <= DT + 1e-9 else
+            f"was reported {1e3 * s['found_after']:.0f} ms later" if s["found_after"] is not None
+            else "was not found"
+        )  # fmt: skip
+        false = s["false_reports"]
+        out.append(
+            f"The short circuit in phase {s['true_phase']} at {s['onset']:g} s {when}; "
+            + ("none was reported before it." if not false else
+               f"before it {false} samples report one that is not there.")
+        )  # fmt: skip
+        if s["ridge"]:
+            pairs = ", ".join(f"({p['mu']:.3g}, {p['k_rf']:g})" for p in s["ridge"])
+            out.append(
+                f"Its severity is h = {s['h']:.4e} +- {s['half_width']:.1e} (true "
+                f"{s['h_true']:.4e}). More the terminals do not tell: with full coupling mu and "
+                "k_rf act through h alone, so every pair on the ridge mu = h (1 + k_rf)/(1 + h) "
+                f"fits equally well, such as (mu, k_rf) = {pairs}."
+            )
+    for c in r["health"]["changes"]:
+        late = c["found_after"]
+        out.append(
+            f"The change of gas-path health at {c['onset']:g} s "
+            + ("was not reported." if late is None else f"was reported {1e3 * late:.0f} ms later.")
+        )
+    other = r["health"]["other_alarms"]
+    if other:
+        out.append(
+            "A change of health that is not there was reported at "
+            + ", ".join(f"{a:g}" for a in other) + " s."
+        )  # fmt: skip
+    elif r["health"]["changes"]:
+        out.append("No other change of health was reported.")
+    for c in r["cross_talk"]["short_circuit_on_health"]:
+        n = max(HEALTH, key=lambda n: abs(c["change"][n]) / c["sigma"][n])
+        change, sigma = 100 * c["change"][n], 100 * c["sigma"][n]
+        within = f"within {c['seconds']:.2g} s"
+        out.append(
+            f"The short circuit moved no estimated health factor by more than 1 sigma {within} "
+            f"({HEALTH_WORDS[n]} most, {change:+.2f} % where 1 sigma is {sigma:.2f} %): its loss "
+            "is explained by h, not by the gas path."
+            if abs(change) < sigma else
+            f"The short circuit moved the estimated {HEALTH_WORDS[n]} by {change:+.2f} % {within}, "
+            f"more than its 1 sigma of {sigma:.2f} %."
+        )  # fmt: skip
+    for c in r["cross_talk"]["health_on_h"]:
+        n = max(c["change"], key=lambda n: abs(c["change"][n]))
+        out.append(
+            f"The change of health at {c['onset']:g} s moved {n} by {c['change'][n]:+.1e} within "
+            f"{c['seconds']:.2g} s (1 sigma is {c['sigma'][n]:.1e})."
+        )
+    return out
+
+
+def saved(e: xr.Dataset, every: int = 2) -> dict[str, Any]:
+    """Return an estimate for JSON: the report, and every second sample for the figure."""
+    keep = slice(None, None, every)
+    return {
+        "report": report(e),
+        "t": e["time"].values[keep],
+        "curves": {
+            key: values[keep] for n in SHOWN for key, values in (
+                (n, e[n].values), (f"{n}_sigma", _sigma(e, n)), (f"{n}_true", e[f"{n}_true"].values)
+            )
+        },
+        "alarms": json.loads(e.attrs["alarms"]),
+    }  # fmt: skip
+
+
+def draw(kept: Mapping[str, Any], path: Path, *, dpi: int | None = None) -> Path:
+    """Draw truth, estimate and band of :func:`saved` numbers into a PNG file."""
+    return files.save_figure(figure(kept), path, **({} if dpi is None else {"dpi": dpi}))
+
+
+def figure(kept: Mapping[str, Any]) -> Any:
+    """Return the matplotlib figure of :func:`saved` numbers: truth, estimate and band."""
+    from scenarios.figures.jointestimateplot import plot_joint_estimate
+
+    r = kept["report"]
+    return plot_joint_estimate(
+        kept["t"],
+        {n: np.array([np.nan if x is None else x for x in v]) for n, v in kept["curves"].items()},
+        phases=[(p["name"], p["start"]) for p in r["phases"]], alarms=kept["alarms"],
+        note=f"Scenario {r['scenario']}, seed {r['seed']}; gain errors drawn for all sensors. "
+        + made_words(r),
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""What the package says beside what somebody else says."""
