@@ -328,6 +328,7 @@ class Rebuilt:
     _built_by: tuple[tuple[Any, ...], dict[str, Any]]
 
     def __new__(cls, *args: Any, **more: Any) -> Any:
+        """Note the arguments of the constructor."""
         self = object.__new__(cls)
         self._built_by = args, more
         return self

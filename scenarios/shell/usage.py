@@ -70,6 +70,7 @@ class ShowVersion(argparse.Action):
     """Print the installed version; looked up only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Print it and end the command."""
         from importlib.metadata import version
 
         print(f"apu-casadi {version('apu-casadi')}")
