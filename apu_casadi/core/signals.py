@@ -25,7 +25,8 @@ class Signal:
     """One scalar of a model.
 
     Args:
-        name: the field's standard symbol (``T3``, ``lam_sq``); a valid Python identifier.
+        name: the field's standard symbol (``T3``, ``lam_sq``); a valid Python identifier, or
+            several joined by dots (``machine.r_s``).
         unit: SI unit as text (``"K"``, ``"rad/s"``); ``"1"`` for fractions.
         doc: one line of meaning, with the station or the equation it belongs to.
         default: value that :meth:`Signals.pack` takes when the name is absent; None means required.
@@ -40,7 +41,7 @@ class Signal:
 
     def __post_init__(self) -> None:
         """Refuse names that cannot be attributes and magnitudes that cannot scale."""
-        if not self.name.isidentifier():
+        if not all(part.isidentifier() for part in self.name.split(".")):
             raise SignalError(f"signal name {self.name!r} is not an identifier")
         if not (math.isfinite(self.nominal) and self.nominal > 0):
             raise SignalError(f"signal {self.name}: nominal must be > 0, got {self.nominal!r}")

@@ -3,14 +3,20 @@
 A :class:`StateSpace` holds named signals and CasADi functions made from one set of expressions:
 the semi-explicit DAE for IDAS, and the explicit right-hand side and output for everything else.
 Solvers and estimators see only this; they know nothing of turbines or windings.
+
+Units that differ in their numbers alone share one *family*: the same model, with the parameters
+of the unit as further entries of theta, behind those that are theta anyway.  Whatever takes time
+to make, compiled code above all, is made of the family, once, and takes the numbers as arguments.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from apu_casadi.core.errors import SignalError
 from apu_casadi.core.sharing import Parametric
@@ -29,6 +35,8 @@ class StateSpace(Parametric):
         f: Function (x, u, theta) -> xdot, with z eliminated.
         g: Function (x, u, theta) -> y, with z eliminated.
         z_of: Function (x, u, theta) -> z, the elimination itself (explicit, or a root finder).
+        family: the model that takes its parameters as theta, too; None if it has none.
+        numbers: what the family's theta has beyond this one's, in its order.
 
     Raises:
         SignalError: a function's shapes do not match the declared signals.
@@ -44,6 +52,8 @@ class StateSpace(Parametric):
     f: ca.Function = field(repr=False)
     g: ca.Function = field(repr=False)
     z_of: ca.Function = field(repr=False)
+    family: StateSpace | None = field(default=None, repr=False)
+    numbers: tuple[float, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         """Check every function's shapes against the signals."""
@@ -62,6 +72,47 @@ class StateSpace(Parametric):
                     f"{self.name}.{label}: expected sizes {n_in} -> {n_out}, "
                     f"got {got_in} -> {got_out}"
                 )
+        if len(self.shared.theta) != nt + len(self.numbers):
+            raise SignalError(
+                f"{self.name}: {len(self.numbers)} numbers for the "
+                f"{len(self.shared.theta) - nt} parameters of its family"
+            )
+
+    @property
+    def shared(self) -> StateSpace:
+        """The family, or the model itself if it has none: what to make functions of."""
+        return self if self.family is None else self.family
+
+    def full(self, theta: Any) -> np.ndarray:
+        """Return theta of :attr:`shared`: this model's, shape (ntheta,), and its numbers."""
+        return np.append(np.asarray(theta, dtype=float), self.numbers)
+
+    @classmethod
+    def member(
+        cls, name: str, family: StateSpace, theta: Signals, numbers: Sequence[float]
+    ) -> StateSpace:
+        """Make the model of one unit: the family's with its last parameters held.
+
+        Args:
+            name: of the model; its functions are named after it.
+            family: takes ``numbers`` as the last entries of its theta.
+            theta: the entries before them.
+            numbers: values of the others.
+        """
+        sizes = [len(s) for s in (family.x, family.z, family.u, theta)]
+        kind = ca.SX if family.f.is_a("SXFunction") else ca.MX
+        x, z, u, th = (kind.sym(n, k) for n, k in zip(("x", "z", "u", "t"), sizes, strict=True))
+        full = ca.vertcat(th, ca.DM(list(numbers)))
+        made = cls.of(
+            name,
+            (family.x, family.z, family.u, theta, family.y),
+            (x, z, u, th),
+            dae=family.residual(x, z, u, full),
+            f=family.f(x, u, full),
+            g=family.g(x, u, full),
+            z=family.z_of(x, u, full),
+        )
+        return replace(made, family=family, numbers=tuple(float(n) for n in numbers))
 
     @classmethod
     def of(
