@@ -188,6 +188,9 @@ class derived(Generic[T]):  # noqa: N801 - a decorator, like cached_property
     Equal models share the value; it is built under the lock.
     """
 
+    make: Callable[[Any], T]
+    name: str
+
     def __init__(self, make: Callable[[Any], T]) -> None:
         self.make, self.__doc__ = make, make.__doc__
 
