@@ -98,8 +98,8 @@ def read(
     """
     native = dtype.newbyteorder("=")
     if not shape:
-        one: np.ndarray = np.frombuffer(file.read(offset, dtype.itemsize), dtype).astype(native)[0]
-        return one
+        scalar = np.frombuffer(file.read(offset, dtype.itemsize), dtype)
+        return np.asarray(scalar.astype(native)[0])
     first, *rest = key
     n, row = shape[0], int(np.prod(shape[1:], dtype=np.int64))
     one = not isinstance(first, slice)
