@@ -50,7 +50,7 @@ def test_real_numbers_are_taken_in_every_dress(value):
     assert_array_equal(array("x", value).ravel(), [2.0])
 
 
-@pytest.mark.parametrize("value", NOT_NUMBERS, ids=lambda v: repr(v)[:30])
+@pytest.mark.parametrize("value", NOT_NUMBERS, ids=lambda v: repr(v)[:15])
 def test_what_is_no_number_is_refused_by_name(value):
     """NumPy and float() turn text, booleans, dates and masked values into numbers silently."""
     for f in (number, array):
