@@ -202,7 +202,9 @@ class LoadSpec:
 
     def build(self) -> Any:
         """Return the load of ``apu_casadi.machine.loads.load``, in SI units."""
-        from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+        from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+        from apu_casadi.machine.loads.open import OpenLoad
+        from apu_casadi.machine.loads.series import SeriesLoad
 
         if self.kind == "open":
             return OpenLoad()
@@ -334,7 +336,7 @@ class NoiseSpec:
 
     def build(self) -> Any:
         """Return the noise of ``apu_casadi.unit.multirate``."""
-        from apu_casadi.machine.generator import MeasurementNoise
+        from apu_casadi.machine.measurement import MeasurementNoise
         from apu_casadi.unit.multirate import Noise
 
         terminal = None if self.terminal is None else MeasurementNoise(**self.terminal)

@@ -7,7 +7,9 @@ import types
 import pytest
 
 from apu_casadi.core.errors import ApuError, ScenarioError
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
 from scenarios import registry
 from scenarios.schema import Change, FaultSpec, LoadSpec, Phase, Scenario

@@ -85,7 +85,9 @@ def _load(args: argparse.Namespace) -> str:
 
 def linear_model(args: argparse.Namespace) -> LinearModel:
     """Return the linear model that the options describe."""
-    from apu_casadi.machine.loads.load import ConstantPowerLoad, Load, SeriesLoad
+    from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+    from apu_casadi.machine.loads.load import Load
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.events import Ambient
     from apu_casadi.unit.linearisation import (

@@ -158,7 +158,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
     health, limits = _numbers("--health", args.health), _limits(args.limit)
     extra: dict[str, float] = {}
     if mode == "--load":
-        from apu_casadi.machine.loads.load import SeriesLoad
+        from apu_casadi.machine.loads.series import SeriesLoad
         from apu_casadi.unit.apu import Apu
         from apu_casadi.unit.events import Ambient
 
@@ -228,7 +228,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
 
 def _generator(args: argparse.Namespace) -> int:
     from apu_casadi.machine.generator import Generator
-    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
 
     gen = Generator()
     p = gen.machine
