@@ -16,7 +16,7 @@ apu_casadi.core         0.00 0 0.98 signals, state spaces, solvers, compiled cod
 apu_casadi.gaspath      0.00 1 0.30 gas, components, maps, cycle, steady points, engines
 apu_casadi.machine      0.34 1 0.30 machine, exciter, loads/, faults/, exact propagation
 estimators.models       0.70 1 0.28 what a filter must know; recordings
-apu_casadi.unit         0.00 2 0.64 governor, events, exchange (eqs. 1-3), one run loop, linear models
+apu_casadi.unit         0.00 2 0.64 governor, events, exchange (1)-(3), one run loop, linear models
 estimators.filters      0.70 2 0.28 EKF, UKF, IMM, square roots; belief
 estimators.batch        0.64 3 0.11 smoothers, MHE, fit
 estimators.information  0.76 3 0.11 bounds, NEES, NIS
