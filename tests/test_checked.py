@@ -15,7 +15,7 @@ from apu_casadi.core.checked import array, number
 from apu_casadi.core.errors import ApuError, SignalError
 from apu_casadi.core.simulation import simulate
 from apu_casadi.gaspath.calibration import CalibrationPoint
-from apu_casadi.gaspath.cycle import GasGeneratorParameters
+from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, LoadLaw
 from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch

@@ -151,7 +151,7 @@ def _fixed(texts: list[str], PW_design: float, N_design: float) -> dict[str, Any
 
 
 def _gas(args: argparse.Namespace, mode: str) -> int:
-    from apu_casadi.gaspath.cycle import Y
+    from apu_casadi.gaspath.stations import Y
     from apu_casadi.gaspath.steady.trimming import maximum_power, trim_gas_generator
 
     ambient = ambient_of(args)
@@ -279,7 +279,7 @@ def _scalars(y: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _table(values: Mapping[str, float], names: list[str]) -> str:
-    from apu_casadi.gaspath.cycle import Y
+    from apu_casadi.gaspath.stations import Y
 
     rows = []
     for n in names:
