@@ -32,6 +32,7 @@ import numpy as np
 from apu_casadi.core import simulation
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import OperatingPointError, ParameterError, SignalError, nearest
+from apu_casadi.core.measuring import measure
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
@@ -134,8 +135,7 @@ class MeasurementNoise:
         if missing:
             raise SignalError(f"to be measured but absent: {', '.join(missing)}")
         for n, sigma in sigmas.items():
-            v = np.asarray(y[n], dtype=float)
-            yield n, v + sigma * rng.standard_normal(v.shape)
+            yield n, measure(y[n], sigma, rng)
 
 
 @dataclass(frozen=True)

@@ -36,19 +36,12 @@ from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES, VOLTAGES
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, PHASES
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import FAULT_LEVEL
-from estimators.apu.gaspath import (
-    DT,
-    HEALTH,
-    GasPathFilter,
-    JumpTest,
-    gas_path_filter,
-    samples,
-    track_jumps,
-    window_means,
-)
+from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples, window_means
+from estimators.apu.gaspathmodel import DT, HEALTH
+from estimators.apu.healthjumps import JumpTest, track_jumps
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from estimators.filters.ekf import extended_kalman_filter
 from estimators.filters.filtering import FilterResult
@@ -103,14 +96,9 @@ def electrical_samples(
     if "time_w" not in ds:
         raise DataError("the run has no waveforms; simulate with waveform_dt=1e-4")
     t = np.asarray(ds["time_w"].values, float)
-    truth = {n: np.asarray(ds[n].values, float) for n in (*VOLTAGES, *MEASURED)}
+    truth = {n: np.asarray(ds[n].values, float) for n in GAIN_SENSORS}
     truth["w_r"] = np.asarray(apu.w_r(np.interp(t, ds["time"].values, ds["N"].values)))
-    out = {"t": t}
-    for n, clean in truth.items():
-        s = sensors[n].noise * (np.abs(clean) if sensors[n].relative else 1.0)
-        e = 0.0 if rng is None else s * rng.standard_normal(t.size)
-        out[n] = (1 + (gains or {}).get(n, 0.0)) * clean + e
-    return out
+    return {"t": t} | sensors.measure(truth, rng, gains=gains)
 
 
 def loosened(sensors: SensorSet) -> SensorSet:
@@ -394,9 +382,9 @@ class JointCase:
 def joint_case(seed: int, *, electrical: bool = True) -> JointCase:
     """Draw the gain errors of a seed from the sensor sets, and the error of efficiency."""
     rng = np.random.default_rng([seed, 0])
-    gas = {n: GAS_PATH[n].gain * float(rng.standard_normal()) for n in ("P3", "T3", "T5", "Wf")}
+    gas = GAS_PATH.draw_gains(rng, GAS_PATH.uncertain)
     gas["PW"] = ETA_SIGMA * float(rng.standard_normal())
-    gains = {n: ELECTRICAL[n].gain * float(rng.standard_normal()) for n in (*VOLTAGES, *MEASURED)}
+    gains = ELECTRICAL.draw_gains(rng, GAIN_SENSORS)
     return JointCase(gas, gains if electrical else {})
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from estimators.apu.gaspath import gas_path_model
+from estimators.apu.gaspathmodel import gas_path_model
 from estimators.apu.isolation.problem import (
     FAULTS,
     GAINS,
