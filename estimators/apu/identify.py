@@ -171,6 +171,20 @@ def gas_path(
     return together(parts, shared=constant)
 
 
+def _readings(
+    gg: GasGenerator, sensors: SensorSet, at: OperatingPoint
+) -> tuple[np.ndarray, np.ndarray]:
+    """Readings of sensors at a steady point, where no lag shows, and their derivatives by Y."""
+    for s in sensors.sensors:
+        if not set(s.reads) <= set(gg.Y.names):
+            raise ParameterError(f"sensor {s.name!r} measures no output of the gas generator")
+    y = ca.SX.sym("y", len(gg.Y))
+    seen = ca.vertcat(*(s.of(gg.Y.unpack(y)) for s in sensors.sensors))
+    values = np.array([at[n] for n in gg.Y.names])
+    read, along = ca.Function("readings", [y], [seen, ca.jacobian(seen, y)])(values)
+    return read.full().ravel(), along.full()
+
+
 def _gas_path(
     point: str,
     gg: GasGenerator,
@@ -182,10 +196,7 @@ def _gas_path(
     gain_errors: bool,
 ) -> Sensitivities:
     at, H, _ = _derivatives(point, gg)
-    unknown = [n for n in sensors.names if n not in gg.Y]
-    if unknown:
-        raise ParameterError(f"sensor {unknown[0]!r} measures no output of the gas generator")
-    y = np.array([at[n] for n in sensors.names])
+    y, along = _readings(gg, sensors, at)
     sigma = np.array([sensors.sigma(n, v) for n, v in zip(sensors.names, y, strict=True)])
     sigma /= math.sqrt(samples)
     if "PW" in sensors.names:
@@ -197,7 +208,7 @@ def _gas_path(
         *(Signal(s.name, s.unit, s.doc) for s in gg.THETA),
     ]
     priors = dict.fromkeys(gg.THETA.names, prior)
-    columns = [H[gg.Y.indices(sensors.names)]]
+    columns = [along @ H]
     gains = {
         s.name: (eta_bias if s.name == "PW" else s.gain if gain_errors else 0.0)
         for s in sensors.sensors

@@ -49,6 +49,7 @@ __all__ = [
     "load_sensors",
     "register",
     "respond",
+    "unregister",
 ]
 
 
@@ -338,6 +339,13 @@ def register(sensor: Sensor) -> Sensor:
     if sensor.plausible is not None:
         RANGES[sensor.name] = sensor.plausible
     return sensor
+
+
+def unregister(name: str) -> None:
+    """Forget a sensor that was registered; one of the tables stays."""
+    if _registered.pop(name, None) is not None:
+        del KNOWN[name]
+        RANGES.pop(name, None)
 
 
 def gas_path_table() -> SensorSet:

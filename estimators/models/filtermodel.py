@@ -159,6 +159,7 @@ class FilterModel(Parametric):
         like: FilterModel | None = None,
         more: Mapping[str, Unknown] | None = None,
         consider: tuple[str, ...] = (),
+        cse: bool = False,
     ) -> FilterModel:
         """Make a model from expressions in its symbols.
 
@@ -172,6 +173,7 @@ class FilterModel(Parametric):
                 none of them.
             more: the same of the last states, by name.
             consider: further considered states.
+            cse: look for common parts of the expressions.
         """
         more = more or {}
         n = len(signals[0]) - len(more)
@@ -180,8 +182,9 @@ class FilterModel(Parametric):
         last = zip(*((k.walk, k.lower, k.upper) for k in more.values()), strict=True)
         held = () if like is None else like.consider
         all_of = [np.append(a, b) for a, b in zip(first, last, strict=True)] if more else first
-        f = ca.Function(f"{name}_f", [*symbols], [*transition], *_TRANSITION)
-        g = ca.Function(f"{name}_g", [*symbols[:4]], [*output], *_OUTPUT)
+        how = [{"cse": True}] if cse else []
+        f = ca.Function(f"{name}_f", [*symbols], [*transition], *_TRANSITION, *how)
+        g = ca.Function(f"{name}_g", [*symbols[:4]], [*output], *_OUTPUT, *how)
         held = (*held, *consider, *(n for n, k in more.items() if k.consider))
         x, u, p, w, y = signals
         walk, lower, upper = all_of
