@@ -151,6 +151,14 @@ def _check_gains(
             raise ParameterError(f"gain of {n!r} {nearest(n, possible)} with power {power!r}")
 
 
+def _lagged(
+    sensors: Sequence[Sensor], y: dict[str, Any], at: dict[str, Any], dt: Any
+) -> dict[str, Any]:
+    """States of lagging sensors at the end of a step, of the outputs amid it."""
+    lag = {s.name: (s.of(y), s.tau) for s in sensors if s.tau}
+    return {n: v + ca.exp(-dt / tau) * (at[n] - v) for n, (v, tau) in lag.items()}
+
+
 @kept
 def gas_path_model(
     gg: GasGenerator,
@@ -197,11 +205,9 @@ def gas_path_model(
         dict(zip(s.names, ca.vertsplit(v), strict=True)) for s, v in ((X, x), (U, u), (W, w))
     )
 
-    def true(name: str) -> Any:
-        # reading = (1 + gain) true + sigma w
-        return (given[name] - given[f"sigma_{name}"] * noise[f"w_{name}"]) / (
-            1 + at.get(f"gain_{name}", 0.0)
-        )
+    def true(name: str) -> Any:  # reading = (1 + gain) true + sigma w
+        error = given[f"sigma_{name}"] * noise[f"w_{name}"]
+        return (given[name] - error) / (1 + at.get(f"gain_{name}", 0.0))
 
     reads = dict.fromkeys(n for s in sensors for n in s.reads if n not in gg.X.names)
     engine, N = engine_function(gg, tuple(reads)), at["N"]
@@ -228,9 +234,7 @@ def gas_path_model(
     k2, y_mid, check_mid, _ = engine(N + dt / 2 * k1, u_gg, health)
     x1 = at | {"N": N + dt * k2 / (1 + at.get("gain_J", 0.0))}
     amid = {"N": N + dt / 2 * k1} | {n: y_mid[i] for i, n in enumerate(reads)}
-    for s in sensors:
-        if s.tau:
-            x1[s.name] = s.of(amid) + ca.exp(-dt / s.tau) * (at[s.name] - s.of(amid))
+    x1 |= _lagged(sensors, amid, at, dt)
     return FilterModel.of(
         f"gas_path_{power}",
         (X, U, Signals(), W, Signals([s.signal for s in sensors])),

@@ -317,31 +317,49 @@ def estimate_joint(
         step=electrical_step,
         backend=backend,
     )
-    # gas path: one measurement of shaft power for each window, eq. (1)
-    common = math.hypot(eta, GAIN_SHARE if gain_errors else 0.0)
-    gas = gas_path_filter(
-        apu.gas_generator,
-        gas_sensors,
-        power="measured" if power else "unknown",
-        gains=gain_errors,
-        eta=common if power and common else None,
-        consider_eta=False,
-        power_jumps=bool(power and common),
-    )
-    error = 1 + (gas_gains or {}).get("PW", 0.0)
-    mean, sigma = apu.PW(side.P) * error, np.sqrt(side.variance) / apu.coupling.eta_gtSg
-    # the loss that belongs to the error of h, of both machines; the fault is a shunt r_s/h
-    machine = apu.generator.machine
-    ghost = 2 * machine.V_rated_rms**2 / machine.r_s / machine.eta_sg * H_GAIN
-    new = {float(t[k]): float(np.hypot(sigma[k], ghost) / mean[k]) for k in side.found_at}
-    jumps = new if "jump_PW" in gas.model.u.names else None
-    slow = gas.recording(ds, noise, gains=gas_gains, power=(mean, sigma), power_jumps=jumps)
+    gas = _gas_filter(apu, gas_sensors, power, gain_errors, eta)
+    slow = _gas_recording(gas, apu, ds, noise, t, side, gas_gains or {})
     if speed:
         w_sigma = electrical_sensors.sigma("w_r", float(np.median(measured["w_r"])))
         other = speed_from_generators(measured["t"], measured["w_r"], w_sigma, t, apu)
         slow = better_speed(gas, slow, *other)
     tracked = track_jumps(gas, slow, test=TEST, step=step, backend=backend)
     return _as_dataset(ds, t, rows, side, gas, tracked)
+
+
+def _gas_filter(
+    apu: Apu, sensors: SensorSet, power: bool, gain_errors: bool, eta: float
+) -> GasPathFilter:
+    common = math.hypot(eta, GAIN_SHARE if gain_errors else 0.0)
+    return gas_path_filter(
+        apu.gas_generator,
+        sensors,
+        power="measured" if power else "unknown",
+        gains=gain_errors,
+        eta=common if power and common else None,
+        consider_eta=False,
+        power_jumps=bool(power and common),
+    )
+
+
+def _gas_recording(
+    gas: GasPathFilter,
+    apu: Apu,
+    ds: xr.Dataset,
+    rng: np.random.Generator | None,
+    t: np.ndarray,
+    side: _Electrical,
+    gains: Mapping[str, float],
+) -> Recording:
+    """The gas path's recording, with one measurement of shaft power for each window, eq. (1)."""
+    mean = apu.PW(side.P) * (1 + gains.get("PW", 0.0))
+    sigma = np.sqrt(side.variance) / apu.coupling.eta_gtSg
+    # the loss that belongs to the error of h, of both machines; the fault is a shunt r_s/h
+    machine = apu.generator.machine
+    ghost = 2 * machine.V_rated_rms**2 / machine.r_s / machine.eta_sg * H_GAIN
+    new = {float(t[k]): float(np.hypot(sigma[k], ghost) / mean[k]) for k in side.found_at}
+    jumps = new if "jump_PW" in gas.model.u.names else None
+    return gas.recording(ds, rng, gains=gains, power=(mean, sigma), power_jumps=jumps)
 
 
 def _as_dataset(
