@@ -726,14 +726,14 @@ def estimation(size: Size) -> list[Row]:
     from estimators.apu.electrical.electricalfilter import electrical_filter
     from estimators.filters.ekf import extended_kalman_filter
     from estimators.filters.ukf import unscented_kalman_filter
-    from scenarios.studies import jointrun, timing
+    from scenarios.studies import jointrun
     from scenarios.studies.electrical.protocol import FULL
-    from scenarios.studies.electrical.speed import speed
+    from scenarios.studies.electrical.steptime import filterpy_step_us, speed
     from scenarios.studies.electrical.truth import generator_truth, samples_of
 
     steps = speed(repeat=size.repeats)
     name, fastest = next(iter(steps["rows"].items()))
-    peer = timing.filterpy_step_us(repeat=max(1, size.repeats // 2))
+    peer = filterpy_step_us(repeat=max(1, size.repeats // 2))
     samples = samples_of(generator_truth(FULL, 0.05), np.random.default_rng(0))
     filt = electrical_filter()
     data, prior = filt.recording(samples), filt.prior(samples)
@@ -749,7 +749,7 @@ def estimation(size: Size) -> list[Row]:
                 peer="filterpy's UKF, same functions" if other else "",
                 ratio=peer / fastest["ukf_us"] if other and peer is not None else None)
         )  # fmt: skip
-    joint = timing.joint_seconds(repeat=max(1, size.repeats // 2))
+    joint = jointrun.joint_seconds(repeat=max(1, size.repeats // 2))
     ends = jointrun.report(jointrun.estimate(jointrun.truth("joint"), 1))["phases"]
     error = max(
         abs(v["estimate"] - v["true"]) / (v["half_width"] / jointrun.Z95)
