@@ -1,4 +1,4 @@
-"""The estimation studies, one file each; :mod:`scenarios.studies.registration` tells what it has."""
+"""The estimation studies, one file each; ``registration`` tells what a file has."""
 
 from __future__ import annotations
 
