@@ -43,8 +43,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from apu_casadi.core import files
+from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
-from apu_casadi.unit.events import HEALTH_FACTORS, Ambient, health_factors, number
+from apu_casadi.unit.events import HEALTH_FACTORS, Ambient, health_factors
 
 if TYPE_CHECKING:
     from apu_casadi.machine.faults.ttsc import Ttsc

@@ -17,15 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from scenarios.shell import jsontext, usage
+from scenarios.studies.estimation import names
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
 KEPT = "docs/estimation"
-NAMES = (
-    "correctness", "electrical", "detection", "gaspath", "shaft-power", "isolation", "fitting",
-    "joint", "speed",
-)  # fmt: skip
-"""The studies; here as well, so that the help needs nothing heavy.  A test compares."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     p.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
 
     p = action("study", _study)
-    p.add_argument("study", metavar="NAME", help=f"all, or one of {', '.join(NAMES)}")
+    p.add_argument("study", metavar="NAME", help=f"all, or one of {', '.join(names())}")
     p.add_argument("--seeds", type=int, metavar="N", help="fresh seeds (default: the study's own)")
     p.add_argument("--out", metavar="DIR", default=KEPT, help="where results are kept "
                    "(default %(default)s)")  # fmt: skip
@@ -92,9 +88,9 @@ def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi.core import results
     from apu_casadi.core.errors import ScenarioError
+    from apu_casadi.core.files import write_text
     from scenarios import registry
     from scenarios.shell import notices
-    from scenarios.shell.markdown import write_text
     from scenarios.shell.progress import bar
     from scenarios.studies import jointrun
 
@@ -134,7 +130,6 @@ def _study(args: argparse.Namespace) -> int:
     """Run a study over fresh random seeds; parts that are kept are not run again."""
     from apu_casadi.core.errors import ParameterError, nearest
     from scenarios import registry
-    from scenarios.pages.reports import REPORTS
     from scenarios.studies import catalogue
     from scenarios.studies.kept import understood
 
@@ -149,18 +144,17 @@ def _study(args: argparse.Namespace) -> int:
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
     for name in names:
-        n = args.seeds or catalogue.get(name).seeds
-        todo = list(catalogue.get(name).parts) if args.again else catalogue.pending(
-            catalogue.get(name), folder, n
-        )  # fmt: skip
+        study = catalogue.get(name)
+        n = args.seeds or study.seeds
+        todo = list(study.parts) if args.again else catalogue.pending(study, folder, n)
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
             record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
         with understood(name):
-            found[name] = REPORTS[name].claims(catalogue.results(record))
+            found[name] = study.report.claims(catalogue.results(record))
         if not args.json:
-            remark = catalogue.other_code(catalogue.get(name), record)
+            remark = catalogue.other_code(study, record)
             if remark:
                 print(f"  {remark}", flush=True)
             for c in found[name]:
@@ -203,8 +197,8 @@ def _page(args: argparse.Namespace) -> int:
     """Write the page and its figures from the kept studies."""
     from apu_casadi.core import files
     from apu_casadi.core.errors import DataError
+    from apu_casadi.core.files import write_text
     from scenarios.pages import estimation_page
-    from scenarios.shell.markdown import write_text
     from scenarios.studies import catalogue
 
     try:

@@ -239,7 +239,7 @@ def _sensors(items: Sequence[str]) -> SensorSet:
     import numpy as np
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.recordings.recorded import UNITS, convert
+    from estimators.apu.recordings.units import UNITS, convert
     from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 
     known = {s.name: s for s in GAS_PATH.sensors}
@@ -279,8 +279,8 @@ def _sensors(items: Sequence[str]) -> SensorSet:
 
 
 def _known_targets(mapping: Mapping[str, Any]) -> None:
+    from apu_casadi.gaspath.conditions import AMBIENT
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import AMBIENT
 
     valid = [*GasGenerator.Y.names, *AMBIENT, "time"]
     for name in mapping:
@@ -297,8 +297,9 @@ def _data(
     """
     import numpy as np
 
+    from apu_casadi.gaspath.conditions import AMBIENT
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import AMBIENT, INPUTS, EngineData
+    from estimators.apu.fitting import INPUTS, EngineData
 
     Y, U = GasGenerator.Y, GasGenerator.U
     readings = {s: table.get(s, Y[s].unit) for s in sensors.names if s in table}
@@ -373,8 +374,8 @@ def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Name
 
 def _ignored(tables: Sequence[Table], sensors: SensorSet, time: str | None) -> list[str]:
     """Columns that the fit does not use, with a guess of what they may be."""
+    from apu_casadi.gaspath.conditions import AMBIENT
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import AMBIENT
     from estimators.apu.recordings.timestamps import is_time_name
 
     used = {*sensors.names, *AMBIENT, time}
