@@ -10,26 +10,16 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from apu_casadi.core.sharing import once
+from apu_casadi.core.version import installed
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.load import ConstantPowerLoad, Load, OpenLoad
 from apu_casadi.unit.events import Ambient, Event, FaultChange, LoadChange
 
-__all__ = ["asked", "installed", "load_words"]
+__all__ = ["asked", "load_words"]
 
 _V, _W = 230.0, 2 * math.pi * 400.0  # V rms and rad/s at which the power of a load is told
-
-
-@once
-def installed() -> str:
-    """Return the installed version; "unknown" in a checkout that is not installed."""
-    try:
-        return version("apu-casadi")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def load_words(load: Load) -> str:
