@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from apu_casadi.gaspath.steady.trimbatch import trim_batch
     from apu_casadi.machine.faults.ttsc import Ttsc
     from apu_casadi.machine.generator import Generator
-    from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+    from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+    from apu_casadi.machine.loads.open import OpenLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu, trim
     from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
     from apu_casadi.unit.multirate import Noise, simulate_joint
@@ -54,16 +56,16 @@ _HOME = {
     "Ambient": "apu_casadi.unit.events",
     "Apu": "apu_casadi.unit.apu",
     "ApuError": "apu_casadi.core.errors",
-    "ConstantPowerLoad": "apu_casadi.machine.loads.load",
+    "ConstantPowerLoad": "apu_casadi.machine.loads.constantpower",
     "FaultChange": "apu_casadi.unit.events",
     "GasGenerator": "apu_casadi.gaspath.gasgenerator",
     "Generator": "apu_casadi.machine.generator",
     "HealthChange": "apu_casadi.unit.events",
     "LoadChange": "apu_casadi.unit.events",
     "Noise": "apu_casadi.unit.multirate",
-    "OpenLoad": "apu_casadi.machine.loads.load",
+    "OpenLoad": "apu_casadi.machine.loads.open",
     "OperatingPoint": "apu_casadi.gaspath.steady.steadypoint",
-    "SeriesLoad": "apu_casadi.machine.loads.load",
+    "SeriesLoad": "apu_casadi.machine.loads.series",
     "Signal": "apu_casadi.core.signals",
     "Signals": "apu_casadi.core.signals",
     "StateSpace": "apu_casadi.core.statespace",

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from apu_casadi.core.register import Key
-from apu_casadi.machine.faults.fault import FAULTS
-
 from apu_casadi.gaspath.conditions import CONDITIONS
+from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.events import HEALTH_FACTORS, HEALTH_HI, HEALTH_LO
 from scenarios.reading import DEFAULT_FAULT, names_of
@@ -102,7 +101,7 @@ def _numbers(cls: type) -> Table:
     """Return the fields of a class that are numbers in a range."""
     docs = docs_of(cls)
     made = {}
-    for f in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for f in dataclasses.fields(cls):
         if "unit" in f.metadata:
             made[f.name] = _number(**f.metadata, doc=docs.get(f.name, ""))
     return made
@@ -110,7 +109,7 @@ def _numbers(cls: type) -> Table:
 
 def _row(cls: type) -> Table:
     """Return phases or events."""
-    own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]  # type: ignore[arg-type]
+    own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]
     text = {n: {"type": "string", "minLength": 1} for n in own if n == "name"}
     changes = {n: {"$ref": f"#/definitions/{n}"} for n in ("load", "health", "fault")}
     item = _object(text | _numbers(cls) | changes, own)
@@ -119,7 +118,6 @@ def _row(cls: type) -> Table:
 
 def _noise() -> Table:
     from apu_casadi.machine.measurement import MeasurementNoise
-
     from apu_casadi.unit.multirate import Noise
 
     def deviations(cls: type, names: Sequence[str]) -> Table:

@@ -9,13 +9,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, field
 from typing import TYPE_CHECKING, Any
-
-from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table
 
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
+from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table
 from apu_casadi.machine.loads.load import LOADS, Load, load_from_table
 
 if TYPE_CHECKING:
@@ -70,13 +68,13 @@ def table_of(value: Any, place: str, keys: Sequence[str]) -> dict[str, Any]:
     return dict(value)
 
 
-def number_field(default: Any = MISSING, **limits: Any) -> Any:
-    """Declare a field that is a number; its limits are those of :func:`bounded`."""
-    return field(default=default, metadata={"unit": "", **limits})
+def limits(**how: Any) -> dict[str, Any]:
+    """Return the metadata of a field that is a number, from the limits of :func:`bounded`."""
+    return {"unit": "", **how}
 
 
 def check_numbers(checked: Any) -> None:
-    """Check the fields made by :func:`number_field`; one whose type says so may be None."""
+    """Check the fields that have :func:`limits`; one whose type says so may be None."""
     for f in dataclasses.fields(checked):
         value = getattr(checked, f.name)
         if "unit" in f.metadata and not (value is None and "None" in f.type):
@@ -115,8 +113,8 @@ def read_fault(data: Any, place: str = "fault") -> Fault:
     if isinstance(data, Fault):
         return data
     if not isinstance(data, Mapping):
-        takes = ", ".join(k.name for k in FAULTS[DEFAULT_FAULT].keys)
-        text = f'a table with {takes}, or "none", is expected, got {data!r}'
+        names = ", ".join(k.name for k in FAULTS[DEFAULT_FAULT].keys)
+        text = f'a table with {names}, or "none", is expected, got {data!r}'
         raise PlacedError(place, text)
     with inside(place):
         keys = FAULTS[_kind(data, FAULTS, DEFAULT_FAULT)].keys
@@ -145,7 +143,6 @@ def read_noise(data: Any) -> Noise:
         ScenarioError: an unknown name, or a value that is negative or not finite.
     """
     from apu_casadi.machine.measurement import MeasurementNoise
-
     from apu_casadi.unit.multirate import Noise
 
     if isinstance(data, Noise):

@@ -11,6 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,9 +122,8 @@ def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
 
     if path is None:
         return GasGenerator()
-    from apu_casadi.gaspath.engines import read_engine
-
-    return read_engine(path)
+    made: GasGenerator = import_module("apu_casadi.gaspath.engines").read_engine(path)
+    return made
 
 
 @last(4)

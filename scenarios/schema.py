@@ -41,11 +41,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from apu_casadi.machine.faults.fault import Fault
-
 from apu_casadi.core import files
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
+from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.events import (
     HEALTH_FACTORS,
@@ -61,8 +60,8 @@ from scenarios.reading import (
     PlacedError,
     check_numbers,
     inside,
+    limits,
     names_of,
-    number_field,
     read_fault,
     read_load,
     read_noise,
@@ -171,7 +170,7 @@ class Phase(_Change):
     """
 
     name: str
-    start: float = number_field(lo=0.0, unit="s")
+    start: float = field(metadata=limits(lo=0.0, unit="s"))
 
     def __post_init__(self) -> None:
         text_of(self.name, "name")
@@ -190,7 +189,7 @@ class Change(_Change):
         ScenarioError: a time that is not positive, no change at all, or a wrong change.
     """
 
-    time: float = number_field(lo=0.0, open_lo=True, unit="s")
+    time: float = field(metadata=limits(lo=0.0, open_lo=True, unit="s"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -228,14 +227,14 @@ class Scenario(_Plain):
     """
 
     name: str
-    duration: float = number_field(lo=0.0, hi=3600.0, open_lo=True, unit="s")
+    duration: float = field(metadata=limits(lo=0.0, hi=3600.0, open_lo=True, unit="s"))
     phases: tuple[Phase, ...]
     title: str = ""
     doc: str = ""
     ambient: Ambient = field(default_factory=Ambient)
     changes: tuple[Change, ...] = ()
-    dt: float = number_field(0.02, lo=1e-4, hi=0.2, unit="s")
-    waveform_dt: float | None = number_field(50e-6, lo=1e-6, unit="s")
+    dt: float = field(default=0.02, metadata=limits(lo=1e-4, hi=0.2, unit="s"))
+    waveform_dt: float | None = field(default=50e-6, metadata=limits(lo=1e-6, unit="s"))
     exchange: str = "paper"
     noise: Noise | None = field(default=None, hash=False)
     seed: int | None = None
@@ -315,7 +314,7 @@ class Scenario(_Plain):
     def _beyond(self, t: float) -> str:
         return f"{t:g} s is not before the end of the run at {self.duration:g} s"
 
-    # -- reading ----------------------------------------------------------------------------------
+    # -- reading ---------------------------------------------------------------------------------
 
     @classmethod
     def from_dict(
@@ -391,7 +390,7 @@ class Scenario(_Plain):
         what = "defines no 'scenario'" if found is None else f"'scenario' is {found!r}"
         raise ScenarioError(f"{path}: {what}; a Scenario or a dictionary is expected")
 
-    # -- writing ----------------------------------------------------------------------------------
+    # -- writing ---------------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
         """Return the tables that :meth:`from_dict` reads; only JSON and TOML types."""
@@ -430,7 +429,7 @@ class Scenario(_Plain):
             values["parameters"] = {**self.parameters, **values["parameters"]}
         return dataclasses.replace(self, **values)
 
-    # -- what a run takes ---------------------------------------------------------------------------
+    # -- what a run takes --------------------------------------------------------------------------
 
     def phase_table(self) -> list[dict[str, Any]]:
         """Return the phases as name, start [s], end [s]: the ``phases`` of a dataset."""
@@ -457,7 +456,7 @@ class Scenario(_Plain):
         events: list[Event] = []
         for t, c in sorted(steps, key=lambda s: s[0]):
             if c.health is not None:
-                health = {**health, **(healthy if c.health == "none" else c.health)}  # type: ignore[dict-item]
+                health = {**health, **(healthy if c.health == "none" else c.health)}
             if t == 0.0:
                 continue
             if c.load is not None:

@@ -21,8 +21,11 @@ from apu_casadi.gaspath.steady.steadypoint import Limits, LoadLaw
 from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
 from apu_casadi.gaspath.steady.trimming import maximum_power, trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.generator import Generator, MeasurementNoise
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange

@@ -24,7 +24,7 @@ from apu_casadi.gaspath.conditions import (
 from apu_casadi.gaspath.cycle import GasGeneratorParameters
 from apu_casadi.gaspath.steady.steadypoint import Limits, Status
 from apu_casadi.gaspath.steady.trimbatch import performance_deck
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.recordings.runfiles import recorded_ambient
 from scenarios import cli

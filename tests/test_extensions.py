@@ -5,9 +5,9 @@ import pickle
 import sys
 
 import pytest
-from apu_casadi.machine.faults.fault import FAULTS
 
 from apu_casadi.core.errors import ScenarioError
+from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.loads.load import LOADS
 from scenarios import campaigns, extensions, registry
 from scenarios.cli import main

@@ -12,7 +12,7 @@ import pytest
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.simulation import stepper
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.monolithic import joint_state_space, simulate_monolithic

@@ -8,8 +8,9 @@ import pytest
 
 from apu_casadi.core.errors import OperatingPointError, ParameterError, ScenarioError, SignalError
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.generator import MeasurementNoise
-from apu_casadi.machine.loads.load import ConstantPowerLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.multirate import Noise, exchange_grid, simulate_joint

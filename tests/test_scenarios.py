@@ -5,12 +5,12 @@ import sys
 import types
 
 import pytest
-from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
-from apu_casadi.machine.loads.open import OpenLoad
-from apu_casadi.machine.loads.series import SeriesLoad
 
 from apu_casadi.core.errors import ApuError, ParameterError, ScenarioError
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
 from scenarios import registry
 from scenarios.reading import read_fault, read_load

@@ -17,7 +17,7 @@ from apu_casadi import Apu, FaultChange, HealthChange, SeriesLoad, Ttsc, simulat
 from apu_casadi.core import netcdf3, results, runstorage
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.filearrays import File, RowFile, lazy
-from apu_casadi.machine.generator import MeasurementNoise
+from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit import multirate
 from apu_casadi.unit.multirate import Noise
 

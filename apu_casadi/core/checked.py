@@ -8,12 +8,13 @@ are taken.
 
 from __future__ import annotations
 
+import math
 import numbers
 from typing import Any
 
 import numpy as np
 
-from apu_casadi.core.errors import ApuError, SignalError
+from apu_casadi.core.errors import ApuError, ScenarioError, SignalError
 
 
 def number(name: str, value: Any, *, error: type[ApuError] = SignalError) -> float:
@@ -30,6 +31,36 @@ def number(name: str, value: Any, *, error: type[ApuError] = SignalError) -> flo
     if a.size != 1:
         raise error(f"{name} must be one number, got {a.size} values of shape {a.shape}")
     return float(a.reshape(()))
+
+
+def bounded(
+    value: Any,
+    what: str,
+    *,
+    lo: float = -math.inf,
+    hi: float = math.inf,
+    open_lo: bool = False,
+    unit: str = "",
+) -> float:
+    """Return ``value`` as a float when it is a finite number in [lo, hi], or in (lo, hi].
+
+    Raises:
+        ScenarioError: not a number (booleans are none), not finite, or outside the interval.
+    """
+    u = f" {unit}" if unit else ""
+    try:
+        x = number(what, value, error=ScenarioError)
+    except ScenarioError:
+        raise ScenarioError(f"{what}: a number is expected, got {value!r}") from None
+    if not math.isfinite(x):
+        raise ScenarioError(f"{what}: must be finite, got {x!r}")
+    if x < lo or x > hi or (open_lo and x <= lo):
+        if math.isinf(hi):
+            must = f"must be {'>' if open_lo else '>='} {lo:g}{u}"
+        else:
+            must = f"must lie in {'(' if open_lo else '['}{lo:g}, {hi:g}]{u}"
+        raise ScenarioError(f"{what}: {must}, got {x:g}")
+    return x
 
 
 def array(

@@ -24,14 +24,13 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine.generator import GeneratorPoint
-from apu_casadi.machine.loads.load import fineness
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import SPEED_RANGE, Propagator
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
 
 if TYPE_CHECKING:
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 WAVEFORMS = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_total")
@@ -147,7 +146,7 @@ class MachineStep:
         self.ss, self.x = point.ss, np.asarray(point.x, float)
         self.u, self.theta = np.array(point.u, float), np.zeros(0)
         self.load: Load = load
-        self.fault: Ttsc | None = None
+        self.fault: Fault | None = None
         self.dt, self.waveform_dt = dt, waveform_dt
         self.solver, self.rtol, self.atol = solver, rtol, atol
         self.phasors = phasors
@@ -256,7 +255,7 @@ class MachineStep:
         """Whether the phases differ by rotation only."""
         return self.fault is None and self.load.balanced and not self._noisy
 
-    def switch(self, load: Load, fault: Ttsc | None, t: float = 0.0) -> None:
+    def switch(self, load: Load, fault: Fault | None, t: float = 0.0) -> None:
         """Change load and fault at the instant t, s; the flux linkages stay."""
         target, theta = self.gen.variant(load, fault), self.gen.fault_vector(load, fault)
         u_new = self.gen.inputs(load, w_r=self.w_r, V_ref=self.V_ref)
@@ -320,7 +319,7 @@ class MachineStep:
 
         h is the first ``share`` of the step.
         """
-        model, fine = ramped(self.ss) if self.way.ramp else self.ss, fineness(self.load)
+        model, fine = ramped(self.ss) if self.way.ramp else self.ss, self.load.fineness
         within = (0.0, share)
         run = stepper(
             model,

@@ -27,7 +27,7 @@ from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
-from apu_casadi.machine.loads.load import fineness
+from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import governor
@@ -45,7 +45,7 @@ from apu_casadi.unit.multirate import MEANS, exchange_grid
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 _GRID_TOL = 1e-9  # s; instants closer than this are one
@@ -54,8 +54,8 @@ _GRID_TOL = 1e-9  # s; instants closer than this are one
 @kept
 def joint_state_space(
     apu: Apu,
-    load_kind: str = "resistive",
-    faulted: str | None = None,
+    load: Load | str = "resistive",
+    fault: Fault | str | None = None,
     integrals: tuple[str, ...] = (),
 ) -> StateSpace:
     """Return the unit as one :class:`StateSpace`.
@@ -67,14 +67,14 @@ def joint_state_space(
 
     Args:
         apu: the unit.
-        load_kind, faulted: variant of the generator, see :mod:`apu_casadi.machine.generator`.
+        load, fault: variant of the generator, see :meth:`Generator.state_space`.
         integrals: what of the generator is to be averaged, see :mod:`apu_casadi.core.means`: the
             time integrals are carried as further states ``int_P_total``, ``int_v_a^2``, and with
             them the time ``t_step`` since the step's start; the step's length ``h_step`` is then an
             input.  As states they cost IDAS nothing; as quadratures every step would solve the gas
             path once more.
     """
-    gg, gen = apu.gas_generator, apu.generator.state_space(load_kind, faulted)
+    gg, gen = apu.gas_generator, apu.generator.state_space(load, fault)
     own_u = Signals([s for s in gen.u if s.name != "w_r"])
     clock_signal = Signal("t_step", "s", "time since the step's start", nominal=0.02)
     X = Signals([
@@ -90,11 +90,11 @@ def joint_state_space(
     u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
     N, Wf_I, x_sg = x[0], x[1], x[2 : 2 + len(gen.x)]
     n_health = len(gg.THETA)
-    health, fault = theta[:n_health], theta[n_health:]
+    health, severity = theta[:n_health], theta[n_health:]
     own = u[len(AMBIENT) : len(AMBIENT) + len(own_u)]
     inputs = dict(zip(own_u.names, ca.vertsplit(own), strict=True))
     u_sg = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
-    y_sg = gen.g(x_sg, u_sg, fault)
+    y_sg = gen.g(x_sg, u_sg, severity)
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
     PW = apu.PW(y_sg[gen.y.index("P_total")])
     u_gg = ca.vertcat(fuel.Wf, PW, u[: len(AMBIENT)])
@@ -105,7 +105,7 @@ def joint_state_space(
     def model(z: Any) -> tuple[Any, Any, Any]:
         N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
         rates = [Term.of(name).expression(gen, x_sg, y_sg, share) for name in integrals]
-        ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_sg, u_sg, fault), *clock, *rates)
+        ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_sg, u_sg, severity), *clock, *rates)
         return ode, alg, ca.vertcat(y_gg, y_sg)
 
     z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
@@ -171,7 +171,7 @@ def simulate_monolithic(
     point = apu.steady_state(load, ambient=ambient, health=factors)
     V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
     amb = dataclasses.astuple(ambient)
-    fault: Ttsc | None = None
+    fault: Fault | None = None
 
     def symmetric() -> bool:
         return fault is None and load.balanced
@@ -180,7 +180,7 @@ def simulate_monolithic(
         """Return the means that this load and fault need."""
         return (*MEANS, *wanted(phasors=False, short=True, symmetric=symmetric()))
 
-    def variant() -> tuple[StateSpace, StateSpace, np.ndarray, np.ndarray]:
+    def variant() -> tuple[StateSpace, GeneratorModel, np.ndarray, np.ndarray]:
         """Return joint model, generator model, inputs and parameters of load and fault now."""
         ss = joint_state_space(apu, load.kind, gen.fault_kind(load, fault), asked())
         u_sg = gen.inputs(load, w_r=w_r, V_ref=V_ref)
@@ -224,7 +224,7 @@ def simulate_monolithic(
             x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(1 + len(quad))]), len(sg.x)
         x[2 + n_sg :], u[-1] = 0.0, h
         angle = float(x[ss.x.index("theta_e")])
-        fine = fineness(load)
+        fine = load.fineness
         run = stepper(ss, 1, solver=solver, rtol=fine * rtol, atol=fine * atol)
         try:
             r = run(x, u, theta, h, t0=t0)

@@ -23,7 +23,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -41,10 +41,10 @@ from apu_casadi.core.errors import (
 from apu_casadi.core.means import PARTS, PHASORS, RMS
 from apu_casadi.core.results import dataset
 from apu_casadi.core.runstorage import PIECE, RowFile, place, row_file
-from apu_casadi.core.signals import Signal
+from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.machine.generator import MeasurementNoise
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import governor
@@ -71,7 +71,7 @@ from apu_casadi.unit.machinestep import (
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 __all__ = [
@@ -87,8 +87,8 @@ __all__ = [
 ]
 
 SOLVERS = ("cvodes", "idas", "propagator")
+_STORED = Signals(Ttsc.severities)  # severities that every run stores
 _TOGETHER = 512  # entries of means whose rms values are made at once
-_HEALTHY = (0.0, math.nan, math.nan)
 _WAVE_ROWS = ("time_w", *(f"{n} waveform" for n in WAVEFORMS))  # P_total is a mean as well
 
 
@@ -145,7 +145,7 @@ def simulate_joint(
     load: Load,
     ambient: Ambient | None = None,
     health: Mapping[str, float] | None = None,
-    fault: Ttsc | None = None,
+    fault: Fault | None = None,
     events: Sequence[Event] = (),
     dt: float = 0.02,
     exchange: str = "paper",
@@ -241,7 +241,7 @@ def simulate_joint(
     grid = exchange_grid(duration, dt, events)
     factors = {**dict.fromkeys(GasGenerator.THETA.names, 1.0), **health_factors(health or {})}
 
-    start_load = _balanced_part(load)
+    start_load = load.balanced_part
     point = apu.steady_state(start_load, ambient=ambient, health=factors)
     machine = MachineStep(
         apu, point.generator, start_load, way, dt, waveform_dt, solver, rtol, atol, phasors
@@ -251,7 +251,10 @@ def simulate_joint(
     y, z = gg.output(x, u, theta, z0=point.gas.z)
     Wf_I, N_ref = float(point.gas["Wf"]), apu.N_ref
     hot = gg.stepper if solver == "propagator" else None
-    book = _Book(gg, grid, machine.samples(grid), len(machine.kept), storage, machine.settle)
+    severities = _severities(events, fault)
+    book = _Book(
+        gg, grid, machine.samples(grid), len(machine.kept), storage, machine.settle, severities
+    )
     book.put(0, y, machine.means_at_rest(point.generator), factors, None)
     book.wave(np.zeros(1), np.array([[point.generator.y[n]] for n in WAVEFORMS]))
     pending = list(events)
@@ -363,10 +366,11 @@ class _Book:
         means: int,
         storage: str | os.PathLike[str] = "memory",
         settle: Callable[[Sequence[RawMeans]], np.ndarray] | None = None,
+        severities: Signals = _STORED,
     ) -> None:
         self._settle, self._raw, self._raw_at = settle, list[RawMeans](), 0
-        self.gg, self.grid = gg, grid
-        n_slow = len(gg.Y) + means + len(gg.THETA) + 3
+        self.gg, self.grid, self.severities = gg, grid, severities
+        n_slow = len(gg.Y) + means + len(gg.THETA) + len(severities)
         size = 8 * (n_slow * grid.size + (1 + len(WAVEFORMS)) * samples)
         self._first = self._end = 0  # instants in the arrays
         self._first_w = self._n = 0  # samples before those in the arrays, and in them
@@ -388,7 +392,7 @@ class _Book:
         self.Y = np.zeros((len(self.gg.Y), steps))
         self.means = np.zeros((means, steps))
         self.factors = np.empty((len(self.gg.THETA), steps))
-        self.severity = np.empty((3, steps))
+        self.severity = np.empty((len(self.severities), steps))
         self.t_w = np.empty(samples)
         self.waves = np.empty((len(WAVEFORMS), samples))
 
@@ -398,7 +402,7 @@ class _Book:
         y: np.ndarray,
         means: np.ndarray | RawMeans,
         factors: Mapping[str, float],
-        fault: Ttsc | None,
+        fault: Fault | None,
     ) -> None:
         """Enter exchange instant k."""
         at = self._columns(k, 1).start
@@ -408,7 +412,7 @@ class _Book:
         else:
             self.means[:, at] = means
         self.factors[:, at] = tuple(factors.values())
-        self.severity[:, at] = _severity(fault)
+        self.severity[:, at] = _now(self.severities, fault)
 
     def put_block(
         self,
@@ -416,14 +420,14 @@ class _Book:
         y: np.ndarray,
         means: RawMeans,
         factors: Mapping[str, float],
-        fault: Ttsc | None,
+        fault: Fault | None,
     ) -> None:
         """Enter a block of exchange instants, the first of which is k."""
         at = self._columns(k, BLOCK)
         self.Y[:, at] = y
         self._later(at.start, means)
         self.factors[:, at] = np.array(tuple(factors.values()))[:, None]
-        self.severity[:, at] = np.array(_severity(fault))[:, None]
+        self.severity[:, at] = np.array(_now(self.severities, fault))[:, None]
 
     def _later(self, at: int, means: RawMeans) -> None:
         """Take means whose rms values are made together with those of their neighbours."""
@@ -517,13 +521,20 @@ class _Book:
         if self.means.shape[0] > n:
             d |= dict(zip(PARTS, self.means[n:], strict=True))
         d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
-        return d | dict(zip(("mu", "k_rf", "kappa"), self.severity, strict=True))
+        return d | dict(zip(self.severities.names, self.severity, strict=True))
 
 
-def _severity(fault: Ttsc | None) -> tuple[float, float, float]:
-    if fault is None:
-        return _HEALTHY
-    return fault.mu, fault.k_rf, math.nan if fault.kappa is None else fault.kappa
+def _severities(events: Iterable[Event], *others: Fault | None) -> Signals:
+    """Return what a run stores of the severity of its faults, the TTSC's always."""
+    faults = (*(e.fault for e in events if isinstance(e, FaultChange)), *others)
+    stored = [*_STORED, *(s for f in faults if f is not None for s in f.severities)]
+    return Signals(list({s.name: s for s in stored}.values()))
+
+
+def _now(severities: Signals, fault: Fault | None) -> list[float]:
+    """Return their values under a fault or without one."""
+    values = {} if fault is None else fault.severity
+    return [values.get(s.name, s.default or 0.0) for s in severities]
 
 
 def _phasor_signals() -> list[Signal]:
@@ -535,16 +546,6 @@ def _phasor_signals() -> list[Signal]:
         for unit, what in (kinds[name[0]],)
         for part, where in parts.items()
     ]
-
-
-def _balanced_part(load: Load) -> Load:
-    """Return the load itself when balanced, else the balanced load of equal mean admittance."""
-    if not isinstance(load, SeriesLoad) or load.balanced:
-        return load
-    w = 2 * math.pi * 400.0
-    Y = sum(1 / complex(R, w * L) for R, L in zip(load.R, load.L, strict=True)) / 3
-    Z = 1 / Y
-    return SeriesLoad(R=(Z.real,) * 3, L=(max(Z.imag, 0.0) / w,) * 3)
 
 
 def _collect(
@@ -562,7 +563,7 @@ def _collect(
         f"{n}_meas": book.keep(f"{n}_meas", np.asarray(run[n]) + s * rng.standard_normal(grid.size))
         for n, s in noise.gas.items()
     }
-    signals = [*gg.Y, *_phasor_signals()]
+    signals = [*gg.Y, *_phasor_signals(), *book.severities]
     signals += [
         dataclasses.replace(gg.Y[n], name=f"{n}_meas", doc=f"measured: {gg.Y[n].doc}")
         for n in noise.gas

@@ -31,7 +31,7 @@ from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, Sensor, SensorSet
 from estimators.filters.belief import Belief
 from estimators.information.identifiability import (

@@ -318,7 +318,7 @@ def _central(
 
 def linearisation(size: Size) -> list[Row]:
     """The joint model's linearisation at a trim."""
-    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.averaged import joint_vectors
     from apu_casadi.unit.linearisation import linearise_joint
 

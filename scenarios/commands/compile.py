@@ -90,7 +90,7 @@ def joint_functions() -> list[str]:
     """Compile what joint runs by exact propagation use, with a healthy and a faulted machine."""
     from apu_casadi.core.backend import loaded_functions
     from apu_casadi.machine.faults.ttsc import Ttsc
-    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.events import FaultChange
     from apu_casadi.unit.multirate import simulate_joint

@@ -172,8 +172,8 @@ def _sensors(items: Sequence[str], gg: GasGenerator) -> SensorSet:
         unit = gg.Y[p.name].unit
         noise, relative = _deviation(p, unit)
         if p.name in known:
-            given_ = {"noise": noise, "relative": relative, "source": "changed by the user"}
-            known[p.name] = dataclasses.replace(known[p.name], **given_)
+            new = dataclasses.replace(known[p.name], noise=noise, relative=relative)
+            known[p.name] = dataclasses.replace(new, source="changed by the user")
         else:
             known[p.name] = Sensor(p.name, noise, relative, 0.0, unit, "given by the user")
     return SensorSet(tuple(known.values()))

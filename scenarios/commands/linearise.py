@@ -79,7 +79,8 @@ def _asked(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _load(args: argparse.Namespace) -> Load:
-    from apu_casadi.machine.loads.load import ConstantPowerLoad, SeriesLoad
+    from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
 
     if args.load is not None:
         return given.load(args)

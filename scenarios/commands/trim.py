@@ -140,7 +140,8 @@ def _alone(
         wrong = [n for n in values if n not in ("T4", "T5")]
         if wrong:
             raise SignalError(f"--max-power: T4 or T5 is expected, got {wrong[0]!r}")
-        return maximum_power(gg, N=N, **{f"{n}_max": v for n, v in values.items()}, **how)
+        how |= {f"{n}_max": v for n, v in values.items()}
+        return maximum_power(gg, N=N, **how)
     fixed = {"N": N, "PW": args.power} if mode == "--power" else _fixed(args.fix, gg)
     return trim_gas_generator(gg, fixed, **how)
 
@@ -206,7 +207,7 @@ def _generator(args: argparse.Namespace) -> int:
 
 
 def _load(args: argparse.Namespace) -> Load:
-    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
 
     if isinstance(args.load, Mapping):
         return given.load(args)

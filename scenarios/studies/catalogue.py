@@ -340,7 +340,7 @@ def _joint_cross_talk(n: int, seed0: int, tell: Tell) -> Any:
 
 
 def _joint_monolithic(n: int, seed0: int, tell: Tell) -> Any:
-    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.events import LoadChange
     from apu_casadi.unit.multirate import simulate_joint

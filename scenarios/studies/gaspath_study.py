@@ -34,7 +34,7 @@ from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import GovernorParameters, governor
 from apu_casadi.unit.events import LoadChange

@@ -33,7 +33,7 @@ from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Event, FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.monolithic import simulate_monolithic
@@ -329,7 +329,7 @@ def regulator_mode(generator: Generator | None = None) -> Mode:
 def fault_words() -> str:
     """Tell the severity of the study's stator fault in words."""
     event = CASES["TTSC fault"].event
-    assert isinstance(event, FaultChange) and event.fault is not None
+    assert isinstance(event, FaultChange) and isinstance(event.fault, Ttsc)
     f = event.fault
     return f"mu = {100 * f.mu:g} %, k_rf = {f.k_rf:g} (assumed), kappa = {f.kappa:g} = mu"
 

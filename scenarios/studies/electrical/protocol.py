@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 
 __all__ = [
     "ATOL",
