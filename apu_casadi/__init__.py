@@ -76,20 +76,10 @@ _HOME = {
 }
 
 
-def _version() -> str:
-    """Return the installed version; "unknown" in a checkout that is not installed."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("apu-casadi")
-    except PackageNotFoundError:
-        return "unknown"
-
-
 def __getattr__(name: str) -> Any:
     """Load a public name from its module, once."""
     if name == "__version__":
-        value: Any = _version()
+        value: Any = import_module("apu_casadi.core.version").installed()
     elif name in _HOME:
         value = getattr(import_module(_HOME[name]), name)
     else:

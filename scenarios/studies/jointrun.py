@@ -24,13 +24,12 @@ from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
 from scenarios import registry
+from scenarios.schema import Scenario
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import xarray as xr
-
-    from scenarios.schema import Scenario
 
 __all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
 
@@ -78,7 +77,7 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
     if s.duration < 3 * DT:
         raise ScenarioError(f"{s.name}: {s.duration:g} s are too short to estimate anything in")
     ds = simulate_joint(
-        registry.unit_of(json.dumps(dict(s.parameters), sort_keys=True)),
+        registry.unit_for(s),
         duration=s.duration, **s.start(), ambient=s.ambient, events=s.events(), dt=FINE,
         exchange="corrected", waveform_dt=WAVEFORM, progress=progress,
     )  # fmt: skip
@@ -97,7 +96,7 @@ def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
     """
     case = joint_case(seed)
     s = json.loads(ds.attrs["scenario"])
-    unit = registry.unit_of(json.dumps(s.get("parameters", {}), sort_keys=True))
+    unit = registry.unit_for(Scenario.from_dict(s))
     found = estimate_joint(
         ds, seed, apu=unit, gas_gains=case.gas_gains, electrical_gains=case.electrical_gains,
         **options,
