@@ -26,7 +26,7 @@ def run():
         HealthChange(0.2, {"f_eta_c": 0.99}),
         FaultChange(0.3137, Ttsc(0.05, 20.0)),
     ]
-    return simulate_joint(APU, duration=0.5, load=KW225, events=events)
+    return simulate_joint(APU, duration=0.5, load=KW225, events=events, solver="cvodes")
 
 
 def test_nothing_moves_before_the_first_event(run):

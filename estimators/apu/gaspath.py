@@ -36,7 +36,7 @@ from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.sensors import GAS_PATH, SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
@@ -141,7 +141,7 @@ def gas_path_model(
     gains: tuple[str, ...] = GAINED,
     consider: tuple[str, ...] = (),
     walks: tuple[tuple[str, float], ...] = (),
-    governed: GovernorParameters | None = None,
+    governed: Governor | None = None,
     power_jumps: bool = False,
 ) -> FilterModel:
     """Make the filter's model; :func:`gas_path_filter` is the convenient form.
@@ -222,8 +222,7 @@ def gas_path_model(
     k1, _, check, _ = engine(N, u_gg, health)
     k1 = k1 / (1 + at.get("gain_J", 0.0))
     if governed is not None:
-        N_ref = gg.parameters.N
-        slope = (governed.Ki * (N_ref - N) - governed.Kp * k1) / N_ref
+        slope = governed.slope(N, k1, gg.parameters.N)
         u_gg = gg.U.stack(inputs | {"Wf": inputs["Wf"] + dt / 2 * slope})
     k2, _, check_mid, _ = engine(N + dt / 2 * k1, u_gg, health)
     x1 = at | {"N": N + dt * k2 / (1 + at.get("gain_J", 0.0))}
@@ -395,7 +394,7 @@ def gas_path_filter(
     consider_eta: bool = True,
     health_sigma: float = HEALTH_SIGMA,
     walk: Mapping[str, float] | None = None,
-    governed: GovernorParameters | None = GOVERNOR,
+    governed: Governor | None = GOVERNOR,
     power_jumps: bool = False,
 ) -> GasPathFilter:
     """Make a gas-path filter.

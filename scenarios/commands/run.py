@@ -33,9 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="keep the fundamental phasors of voltages and currents of every exchange step",
     )
     parser.add_argument(
-        "--solver", default="cvodes", metavar="NAME",
-        help="cvodes (default), idas, or propagator: exact and fast where the load is linear",
-    )  # fmt: skip
+        "--solver",
+        default="auto",
+        metavar="NAME",
+        help="auto (default): exact and fast where the load is linear, elsewhere CVODES; "
+        "cvodes, idas, or propagator, another name of auto",
+    )
     parser.add_argument(
         "--exchange", metavar="NAME",
         help="of speed and fuel between the parts: paper, predicted (errs less at the same price), "

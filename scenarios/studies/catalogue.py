@@ -349,7 +349,7 @@ def _joint_monolithic(n: int, seed0: int, tell: Tell) -> Any:
     full, part = (SeriesLoad.from_power(P) for P in (225e3, 100e3))
     ds = simulate_joint(
         Apu(), duration=MONOLITHIC, load=full, events=[LoadChange(MONOLITHIC / 2, part)], dt=0.005,
-        exchange="corrected", waveform_dt=1e-4,
+        exchange="corrected", waveform_dt=1e-4, solver="cvodes",
     )  # fmt: skip
     return {"duration": MONOLITHIC, "seed": seed0, "compared": compare_monolithic(ds, seed0)}
 

@@ -36,8 +36,9 @@ from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.loads.load import SeriesLoad
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.control import GovernorParameters, governor
+from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import LoadChange
+from apu_casadi.unit.exchange import EXCHANGES, Link, governed_step
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.gaspath import (
     DT,
@@ -211,25 +212,27 @@ class MatchedTruth(Parametric):
     @derived
     def _call(self) -> Caller:
         model = self._model
-        gov, N_ref, nx = GovernorParameters(), self.gg.parameters.N, len(model.x)
+        link, nx = Link(GovernorParameters(), self.gg.parameters.N), len(model.x)
         carry, given = ca.MX.sym("carry", nx + 1), ca.MX.sym("given", 5 + nx)  # gain_J is last
         x, Wf_I, PW, jump, xi = carry[:nx], carry[nx], given[0], given[1:5], given[5:]
-        fuel = governor(N=x[0], N_ref=N_ref, Wf_I=Wf_I, par=gov)
-        u = model.u.stack(
-            {n: ca.MX(v) for n, v in DEFAULT_DAY.items()}
-            | {"Wf": fuel.Wf, "PW": PW, "sigma_Wf": ca.MX(0),
-               "sigma_PW": ca.MX(0), "jump": ca.MX(1)}
-        )  # fmt: skip
         w, p = ca.MX.zeros(len(model.w)), ca.MX(0, 1)
         w[len(model.w) - 4 :] = jump
-        y, check = model.output(x, u, p, w)
-        x1, check1 = model.transition(x, u, p, w, DT)
-        x1 += math.sqrt(DT) * ca.DM(model.walk) * xi
-        step = ca.Function(
-            "matched_truth", [carry, given],
-            [ca.vertcat(x1, Wf_I + DT * fuel.Wf_I_dot),
-             ca.vertcat(y, fuel.Wf, PW, x[1:5], check + check1)],
-        )  # fmt: skip
+        still = dict.fromkeys(("sigma_Wf", "sigma_PW"), ca.MX(0))
+        day = {n: ca.MX(v) for n, v in DEFAULT_DAY.items()}
+
+        def engine(Wf: ca.MX, PW: ca.MX) -> tuple[ca.MX, tuple[ca.MX, ca.MX]]:
+            u = model.u.stack(day | still | {"Wf": Wf, "PW": PW, "jump": ca.MX(1)})
+            y, check = model.output(x, u, p, w)
+            x1, check1 = model.transition(x, u, p, w, DT)
+            x1 += math.sqrt(DT) * ca.DM(model.walk) * xi
+            return x1[0], (x1, ca.vertcat(y, Wf, PW, x[1:5], check + check1))
+
+        made = governed_step(
+            link, EXCHANGES["paper"], lambda *_: (PW, None), engine, N=x[0], x=[Wf_I], h=DT
+        )
+        x1, out = made.engine
+        end = ca.vertcat(x1, *made.governor)
+        step = ca.Function("matched_truth", [carry, given], [end, out])
         return _folded("matched_truths", step)
 
     def __call__(self, case: Case, power: np.ndarray, rng: np.random.Generator | None) -> Truth:
@@ -259,30 +262,29 @@ class EngineTruth(Parametric):
 
     @derived
     def _call(self) -> Caller:
-        gg, gov, dt = self.gg, GovernorParameters(), DT / FINE
+        gg, dt = self.gg, DT / FINE
+        link = Link(GovernorParameters(), gg.parameters.N)
         nz = len(gg.z)
         carry, given = ca.MX.sym("carry", 3 + nz), ca.MX.sym("given", 5)
         N, Wf_I, N_dot, z = carry[0], carry[1], carry[2], carry[3:]
+        day = {n: ca.MX(v) for n, v in DEFAULT_DAY.items()}
+
+        def engine(Wf: ca.MX, PW: ca.MX) -> tuple[ca.MX, list[ca.MX]]:
+            N1, *more = gg.step(N, gg.U.stack(day | {"Wf": Wf, "PW": PW}), given[1:], dt, z)
+            return N1, [N1, *more]
+
         # fuel of the middle of the step, with the last slope of speed
-        now = governor(N=N, N_ref=gg.parameters.N, Wf_I=Wf_I, par=gov)
-        mid = governor(
-            N=N + dt / 2 * N_dot, N_ref=gg.parameters.N, Wf_I=Wf_I + dt / 2 * now.Wf_I_dot, par=gov
+        way, PW = EXCHANGES["predicted fuel"], given[0]
+        made = governed_step(
+            link, way, lambda *_: (PW, None), engine, N=N, x=[Wf_I], h=dt, slope=N_dot
         )
-        u = gg.U.stack(
-            {n: ca.MX(v) for n, v in DEFAULT_DAY.items()} | {"Wf": mid.Wf, "PW": given[0]}
-        )
-        N1, _, z1, residual = gg.step(N, u, given[1:], dt, z)
-        Wf_I1 = Wf_I + dt * mid.Wf_I_dot
+        N1, _, z1, residual = made.engine
         # a meter reads the fuel of the instant
-        end = governor(N=N1, N_ref=gg.parameters.N, Wf_I=Wf_I1, par=gov)
-        y_end, _ = gg.g(N1, gg.U.stack(
-            {n: ca.MX(v) for n, v in DEFAULT_DAY.items()} | {"Wf": end.Wf, "PW": given[0]}
-        ), given[1:], z1)  # fmt: skip
-        step = ca.Function(
-            "engine_truth", [carry, given],
-            [ca.vertcat(N1, Wf_I1, (N1 - N) / dt, z1),
-             ca.vertcat(y_end[gg.Y.indices(OUTPUTS)], end.Wf, given, residual)],
-        )  # fmt: skip
+        Wf, _ = link.fuel(N1, made.governor)
+        y_end, _ = gg.g(N1, gg.U.stack(day | {"Wf": Wf, "PW": PW}), given[1:], z1)
+        end = ca.vertcat(N1, *made.governor, made.slope, z1)
+        out = ca.vertcat(y_end[gg.Y.indices(OUTPUTS)], Wf, given, residual)
+        step = ca.Function("engine_truth", [carry, given], [end, out])
         return _folded("engine_truths", step)
 
     def __call__(self, case: Case, power: np.ndarray, rng: np.random.Generator) -> Truth:

@@ -15,7 +15,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.trimming import Limits, trim_gas_generator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.isolation.problem import (
     CLASSES,
     DEFAULT,
@@ -69,7 +69,7 @@ def simulate_windows(
     seeds: Sequence[int],
     protocol: Protocol = DEFAULT,
     gg: GasGenerator | None = None,
-    governor: GovernorParameters | None = None,
+    governor: Governor | None = None,
 ) -> Windows:
     """Simulate windows of the governed unit, one for each label and seed.
 
@@ -129,17 +129,17 @@ def simulate_windows(
         u0[:, i], z0[:, i] = point.u, point.z
     engine = _engine(gg, backend_in_use())
     i_Wf, i_PW = gg.U.index("Wf"), gg.U.index("PW")
-    N, I, z, u = x0.copy(), u0[i_Wf].copy(), z0, u0.copy()
+    N, z, u = x0.copy(), z0, u0.copy()
+    I = np.array([np.broadcast_to(x, n) for x in gov.start(u0[i_Wf])])  # governor's states
     reading = np.empty((7, n, K))
     worst = 0.0
 
     def rates(N: np.ndarray, I: np.ndarray, th: np.ndarray) -> tuple[np.ndarray, ...]:
         nonlocal z, worst
-        e = (N_ref - N[0]) / N_ref
-        u[i_Wf] = np.clip(gov.Kp * e + I, gov.Wf_min, gov.Wf_max)
+        u[i_Wf], moves = gov.law(N[0], N_ref, [*I])
         ode, y, z, check = engine(z, N, u, th)
         worst = max(worst, float(np.nan_to_num(check, nan=np.inf).max()))
-        return ode, gov.Ki * e + (u[i_Wf] - gov.Kp * e - I) / gov.T_aw, y
+        return ode, np.array(moves), y
 
     h = DT / SUBSTEPS
     for k in range(K):
