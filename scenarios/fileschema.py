@@ -118,7 +118,7 @@ def _row(cls: type) -> Table:
 
 def _noise() -> Table:
     from apu_casadi.machine.measurement import MeasurementNoise
-    from apu_casadi.unit.multirate import Noise
+    from apu_casadi.unit.noise import Noise
 
     def deviations(cls: type, names: Sequence[str]) -> Table:
         docs = docs_of(cls)

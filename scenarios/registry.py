@@ -79,7 +79,7 @@ def run(
     *,
     out: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
-    solver: str = "cvodes",
+    solver: str = "auto",
     phasors: bool = False,
     **overrides: Any,
 ) -> xr.Dataset:
@@ -89,7 +89,7 @@ def run(
         scenario: a description, a name of the library, or a file.
         out: folder for the netCDF file, the figures and the summary; None writes nothing.
         progress: called with the simulated and the total time [s].
-        solver: ``"cvodes"``, ``"idas"`` or the fast ``"propagator"``: see
+        solver: ``"auto"``, ``"cvodes"``, ``"idas"`` or ``"propagator"``: see
             :func:`apu_casadi.unit.multirate.simulate_joint`.
         phasors: keep the fundamental phasors of voltages and currents of each exchange step.
         overrides: attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,

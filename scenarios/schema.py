@@ -71,7 +71,7 @@ from scenarios.reading import (
 )
 
 if TYPE_CHECKING:
-    from apu_casadi.unit.multirate import Noise
+    from apu_casadi.unit.noise import Noise
 
 LARGEST_FILE = 1 << 24
 """Largest scenario file, bytes."""

@@ -26,8 +26,8 @@ scenario SCENARIO      | a name, a .toml or a .py file
 --no-waveforms         | keep no waveforms: a small file, rms figures
 --phasors              | keep the fundamental phasors of voltages and currents of every exchange
                        | step
---solver NAME =cvodes  | cvodes (default), idas, or propagator: exact and fast where the load is
-                       | linear
+--solver NAME =auto    | auto (default): exact and fast where the load is linear, elsewhere CVODES;
+                       | cvodes, idas, or propagator, another name of auto
 --exchange NAME        | of speed and fuel between the parts: paper, predicted (errs less at the
                        | same price), or corrected; default: the scenario's
 --quiet                | no progress bar, no list of files
