@@ -86,9 +86,7 @@ def test_derivatives_by_every_parameter_are_those_of_replaced_units(gg, state):
         s = changed(gg, name, value)
         full = s.full(theta)
         family = s.family.state_space
-        return np.concatenate(
-            [flat(family.f(x, u, full)), flat(family.g(x, u, full))[SMOOTH]]
-        )
+        return np.concatenate([flat(family.f(x, u, full)), flat(family.g(x, u, full))[SMOOTH]])
 
     np.testing.assert_allclose(values.ravel(), unit("gas_generator.J", given[23]), rtol=1e-11)
     assert GIVEN.names[23] == "gas_generator.J"

@@ -32,11 +32,9 @@ law.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -434,34 +432,13 @@ class ScaledMap(Parametric):
     @derived
     def function(self) -> ca.Function:
         """(n, beta, RNI) -> W, PR, eta, for a compressor SM, and off."""
-        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
-        out = self._bent(n, beta, RNI, self.cal)
-        names = ["n", "beta", "RNI"]
-        return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
-
-    @derived
-    def calibrated(self) -> ca.Function:
-        """As ``function`` with the numbers of the calibration as fourth argument.
-
-        (n, beta, RNI, cal) with cal of shape (6,) in the order of :class:`MapCalibration`'s fields,
-        for derivatives by them.
-        """
-        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
-        fields = [f.name for f in dataclasses.fields(MapCalibration)]
-        cal = ca.MX.sym("cal", len(fields))
-        numbers = SimpleNamespace(**dict(zip(fields, ca.vertsplit(cal), strict=True)))
-        out = self._bent(n, beta, RNI, numbers)
-        args, names = [n, beta, RNI, cal], ["n", "beta", "RNI", "cal"]
-        return ca.Function("calibrated_map", args, list(out.values()), names, list(out))
-
-    def _bent(self, n: ca.MX, beta: ca.MX, RNI: ca.MX, cal: Any) -> dict[str, ca.MX]:
-        """Return the outputs by name, with the numbers of ``cal`` floats or symbols."""
-        t = self.table
+        n, beta, RNI, t = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI"), self.table
         N_held, y = table_logs(t)(self.N_map_des * n, beta)
         surge = surge_function(t) if t.kind == "compressor" else None
-        out = self._scaled(N_held, ca.vertsplit(y), RNI, cal, surge)
+        out = self._scaled(N_held, ca.vertsplit(y), RNI, surge)
         out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
-        return {k: out[k] for k in MapPoint._fields if k in out}
+        names = ["n", "beta", "RNI"]
+        return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
 
     @derived
     def design_logs(self) -> tuple[float, float, float]:
@@ -471,13 +448,13 @@ class ScaledMap(Parametric):
         return W, PR, eta
 
     def _scaled(
-        self, N_held: Any, y: list[Any], RNI: Any, cal: Any, surge: Callable[[Any], Any] | None
+        self, N_held: Any, y: list[Any], RNI: Any, surge: Callable[[Any], Any] | None
     ) -> dict[str, Any]:
         """Scale and bend what the table says: W, PR, eta, and SM if there is a surge line.
 
         ``surge`` gives the unscaled line's pressure ratio by the unscaled flow.
         """
-        des = self.design_logs
+        des, cal = self.design_logs, self.cal
         held = per(N_held, self.N_map_des)  # > 0, so that powers of it exist
         # powers are written as exponentials, which are cheaper when differentiated
         W = self.W_des * ca.exp(y[0] - des[0] + cal.a_W * ca.log(held))
@@ -514,7 +491,7 @@ class ScaledMap(Parametric):
         t = self.table
         N_held, y = surface_logs(t, self.N_map_des * n, beta, cell)
         line = None if surge is None else lambda W: surge_PR(t, W, surge)
-        out = self._scaled(N_held, y, RNI, self.cal, line)
+        out = self._scaled(N_held, y, RNI, line)
         off = off_function(t)(self.N_map_des * n, beta)[0]
         return MapPoint(out["W"], out["PR"], out["eta"], out.get("SM"), off), self._table_flow(
             out["W"]
