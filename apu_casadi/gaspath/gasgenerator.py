@@ -29,7 +29,8 @@ from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.design import DesignPoint, solve_design
 from apu_casadi.gaspath.designdata import RPM, GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas
-from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.gaspath.maps.mapfiles import shipped
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration, ScaledMap
 
 __all__ = [

@@ -44,7 +44,7 @@ from scipy.interpolate import BSpline
 from apu_casadi.core.errors import MapError
 from apu_casadi.core.parameters import Parameters, par
 from apu_casadi.core.sharing import Parametric, derived, kept
-from apu_casadi.gaspath.maps.mapfiles import MapTable
+from apu_casadi.gaspath.maps.maptable import MapTable
 
 REACH = 2.0  # table spans from the table's edge to where everything is held
 LOWEST = 0.05  # held below this fraction of the table's lowest speed
@@ -315,6 +315,10 @@ def off_function(table: MapTable) -> ca.Function:
     )
 
 
+def _bend(default: float, doc: str, lo: float, hi: float) -> Any:
+    return par(default, unit="1", source="identity", doc=doc, lo=lo, hi=hi)
+
+
 @dataclass(frozen=True)
 class MapCalibration(Parameters):
     """Numbers that bend a scaled map to documented points; all leave the design point in place.
@@ -323,54 +327,14 @@ class MapCalibration(Parameters):
     design point.  RNI is the Reynolds number index, 1 at the design point.
     """
 
-    a_W: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="flow is multiplied by n**a_W",
-        lo=-5.0,
-        hi=5.0,
+    a_W: float = _bend(0.0, "flow is multiplied by n**a_W", -5, 5)
+    n_Re: float = _bend(0.0, "loss 1 - eta is multiplied by RNI**(-n_Re)", 0, 1)
+    c_PR: float = _bend(0.0, "eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)", 0, 200)
+    c_N: float = _bend(0.0, "eta is multiplied by exp(-c_N (n - 1)**2)", 0, 1000)
+    k_SM: float = _bend(
+        1.0, "PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)", 0.2, 5
     )
-    n_Re: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="loss 1 - eta is multiplied by RNI**(-n_Re)",
-        lo=0.0,
-        hi=1.0,
-    )
-    c_PR: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)",
-        lo=0.0,
-        hi=200.0,
-    )
-    c_N: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="eta is multiplied by exp(-c_N (n - 1)**2)",
-        lo=0.0,
-        hi=1000.0,
-    )
-    k_SM: float = par(
-        1.0,
-        unit="1",
-        source="identity",
-        doc="PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)",
-        lo=0.2,
-        hi=5.0,
-    )
-    a_SM: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)",
-        lo=-0.9,
-        hi=0.9,
-    )
+    a_SM: float = _bend(0.0, "PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)", -0.9, 0.9)
 
 
 @dataclass(frozen=True, kw_only=True)
