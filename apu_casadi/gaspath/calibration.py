@@ -47,6 +47,7 @@ SINGULAR = 1e10  # condition above which the points are said not to determine th
 WEAK = 1e3  # condition above which a combination is reported as weakly determined
 
 _FIELDS = tuple(f.name for f in dataclasses.fields(MapCalibration))
+_ALL = tuple(f"{s}.{f}" for s in SETS for f in _FIELDS)
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,7 @@ class CalibrationResult:
 
 def numbers() -> tuple[str, ...]:
     """Return the names of all numbers that can be fitted."""
-    both = [f"{s}.{f}" for s in SETS for f in _FIELDS]
-    return tuple(n for n in both if n not in ("turbine_map.k_SM", "turbine_map.a_SM"))
+    return tuple(n for n in _ALL if n not in ("turbine_map.k_SM", "turbine_map.a_SM"))
 
 
 def _with(gg: GasGenerator, values: Mapping[str, float]) -> GasGenerator:
@@ -220,7 +220,7 @@ def sensitivity(gg: GasGenerator, point: OperatingPoint, fixed: Sequence[str]) -
         np.asarray(a.full()) for a in gg.by_parameters.sensitivities(point.x, point.z, point.u, w)
     )
     names = (*gg.X.names, *gg.U.names, *gg.by_parameters.theta.names)
-    own = [names.index(f"{s}.{f}") for s in SETS for f in _FIELDS]
+    own = [names.index(n) for n in _ALL]
     open_ = [names.index(n) for n in ("N", "Wf", "PW")]  # what may move: the point stays steady
     held = np.vstack([xdot_w, y_w[gg.Y.indices(tuple(fixed))]])
     moved = -np.linalg.solve(held[:, open_], held[:, own])
@@ -251,73 +251,78 @@ def calibrate(
 
     points, names = tuple(points), tuple(free)
     _check_free(names, points)
-    targets = [(p, n, *p.measured[n]) for p in points for n in p.measured]
-    sigma = np.array([t[3] for t in targets])
-    measured = np.array([t[2] for t in targets])
-    index = [SETS.index(n.partition(".")[0]) * len(_FIELDS) + _FIELDS.index(n.partition(".")[2])
-             for n in names]  # fmt: skip
+    trial = _Trials(gg, points, names)
     fields = {f.name: f.metadata for f in dataclasses.fields(MapCalibration)}
     lower, upper = (
-        np.array([fields[n.partition(".")[2]][side] for n in names]) for side in ("lo", "hi")
+        np.array([fields[n.partition(".")[2]][side] for n in names], float) for side in ("lo", "hi")
     )
-    built: dict[bytes, tuple[GasGenerator, list[OperatingPoint]]] = {}
-
-    def solved(p: np.ndarray) -> tuple[GasGenerator, list[OperatingPoint]]:
-        key = p.tobytes()
-        if key not in built:
-            engine = _with(gg, dict(zip(names, p.tolist(), strict=True)))
-            built[key] = engine, [point.trim(engine) for point in points]
-        return built[key]
-
-    def model(p: np.ndarray) -> np.ndarray:
-        _, trims = solved(p)
-        return np.array(
-            [t[n] for t, point in zip(trims, points, strict=True) for n in point.measured]
-        )
-
-    def errors(p: np.ndarray) -> np.ndarray:
-        try:
-            return (model(p) - measured) / sigma
-        except ApuError:
-            if len(built) == 0:  # at the start there is nowhere to go back to
-                raise
-            return np.full(sigma.shape, np.inf)  # makes the trust region shrink
-
-    def jacobian(p: np.ndarray) -> np.ndarray:
-        engine, trims = solved(p)
-        rows = []
-        for t, point in zip(trims, points, strict=True):
-            S = sensitivity(engine, t, tuple(point.fixed))[:, index]
-            rows += [S[engine.Y.index(n)] for n in point.measured]
-        return np.array(rows) / sigma[:, None]
-
     # off the edge by a hundredth: some numbers are at their identity, and at their limit, when 0
     start = np.clip(_current(gg, names), lower + 0.01, upper - 0.01)
-    fit = least_squares(
-        errors, start, jacobian, bounds=(lower, upper), xtol=1e-13, ftol=1e-13, gtol=1e-13,
-        max_nfev=max_evaluations,
-    )  # fmt: skip
+    stop = {**dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13), "max_nfev": max_evaluations}
+    fit = least_squares(trial.errors, start, trial.jacobian, bounds=(lower, upper), **stop)
     if fit.status <= 0:
         raise OperatingPointError(
-            f"calibration did not converge in {len(built)} evaluations: sum of squared errors "
-            f"{2 * fit.cost:.4g} at " + _listing(names, fit.x)
+            f"calibration did not converge in {len(trial.built)} evaluations: sum of squared "
+            f"errors {2 * fit.cost:.4g} at " + _listing(names, fit.x)
         )
-    J = np.asarray(fit.jac)
-    covariance, condition, weak = _determined(J, names)
+    covariance, condition, weak = _determined(np.asarray(fit.jac), names)
     edge = 1e-9 * (upper - lower)
-    at_bound = tuple(
-        n for n, v, lo, hi, e in zip(names, fit.x, lower, upper, edge, strict=True)
-        if v - lo <= e or hi - v <= e
-    )  # fmt: skip
-    engine, _ = solved(fit.x)
+    bound = (fit.x - lower <= edge) | (upper - fit.x <= edge)
+    at_bound = tuple(n for n, b in zip(names, bound, strict=True) if b)
+    engine, _ = trial.solved(fit.x)
     residuals = tuple(
         Residual(p.name, n, value, float(m), s)
-        for (p, n, value, s), m in zip(targets, model(fit.x), strict=True)
+        for (p, n, value, s), m in zip(trial.targets, trial.model(fit.x), strict=True)
     )
     values = dict(zip(names, fit.x.tolist(), strict=True))
-    return CalibrationResult(
-        names, values, covariance, residuals, condition, weak, at_bound, engine, len(built)
-    )
+    told = covariance, residuals, condition, weak, at_bound, engine, len(trial.built)
+    return CalibrationResult(names, values, *told)
+
+
+class _Trials:
+    """The engines that a fit tries, and their errors at the points."""
+
+    def __init__(
+        self, gg: GasGenerator, points: tuple[CalibrationPoint, ...], names: tuple[str, ...]
+    ) -> None:
+        self.gg, self.points, self.names = gg, points, names
+        self.targets = [(p, n, *p.measured[n]) for p in points for n in p.measured]
+        self.sigma = np.array([t[3] for t in self.targets])
+        self.measured = np.array([t[2] for t in self.targets])
+        self.columns = [_ALL.index(n) for n in names]
+        self.built: dict[bytes, tuple[GasGenerator, list[OperatingPoint]]] = {}
+
+    def solved(self, p: np.ndarray) -> tuple[GasGenerator, list[OperatingPoint]]:
+        """Return the engine with the numbers p, trimmed at the points."""
+        key = p.tobytes()
+        if key not in self.built:
+            engine = _with(self.gg, dict(zip(self.names, p.tolist(), strict=True)))
+            self.built[key] = engine, [point.trim(engine) for point in self.points]
+        return self.built[key]
+
+    def model(self, p: np.ndarray) -> np.ndarray:
+        """Return what the engine says for each measurement."""
+        _, trims = self.solved(p)
+        pairs = zip(trims, self.points, strict=True)
+        return np.array([t[n] for t, point in pairs for n in point.measured])
+
+    def errors(self, p: np.ndarray) -> np.ndarray:
+        """Return (model - measured)/sigma."""
+        try:
+            return (self.model(p) - self.measured) / self.sigma
+        except ApuError:
+            if len(self.built) == 0:  # at the start there is nowhere to go back to
+                raise
+            return np.full(self.sigma.shape, np.inf)  # makes the trust region shrink
+
+    def jacobian(self, p: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the errors by p."""
+        engine, trims = self.solved(p)
+        rows = []
+        for t, point in zip(trims, self.points, strict=True):
+            S = sensitivity(engine, t, tuple(point.fixed))[:, self.columns]
+            rows += [S[engine.Y.index(n)] for n in point.measured]
+        return np.array(rows) / self.sigma[:, None]
 
 
 def _check_free(names: tuple[str, ...], points: tuple[CalibrationPoint, ...]) -> None:
@@ -426,8 +431,8 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
     for p in points:
         for role in ("ambient", "health", "fixed"):
             rows += [(p.name, role, n, repr(float(v)), "") for n, v in getattr(p, role).items()]
-        rows += [(p.name, "measured", n, repr(float(v)), repr(float(s)))
-                 for n, (v, s) in p.measured.items()]  # fmt: skip
+        for n, pair in p.measured.items():
+            rows.append((p.name, "measured", n, *(repr(float(v)) for v in pair)))
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     files.write_text(path, text.getvalue())

@@ -107,8 +107,8 @@ def _read_choice(path: Path, name: str, given: Mapping[str, Any]) -> MapChoice:
     elif how:
         raise ParameterError(f"{where}: {next(iter(how))} goes with file, not with shipped")
     elif given["shipped"].lower() not in SHIPPED:
-        raise ParameterError(f"{where}: shipped = {given['shipped']!r} "
-                             f"{nearest(given['shipped'], SHIPPED)}")  # fmt: skip
+        near = nearest(given["shipped"], SHIPPED)
+        raise ParameterError(f"{where}: shipped = {given['shipped']!r} {near}")
     else:
         table = shipped(given["shipped"])
     if table.kind != _KINDS[name]:

@@ -207,9 +207,13 @@ def explained(gg: GasGenerator, limits: Limits, y: np.ndarray) -> np.ndarray:
 
 
 def continue_many(
-    solver: Solver, p: np.ndarray, *, floor: float, n_threads: int | None,
+    solver: Solver,
+    p: np.ndarray,
+    *,
+    floor: float,
+    n_threads: int | None,
     state: tuple[np.ndarray, ...] | None = None,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
+) -> tuple[np.ndarray, ...]:
     """As :func:`continue_one` for columns; returns w, y, r, s, t, dt."""
     origin, s0 = origin_of(solver)
     M, o = p.shape[1], origin[:, None]
