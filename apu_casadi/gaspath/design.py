@@ -95,13 +95,7 @@ class DesignEquations:
         amb = ambient(altitude=p.altitude, Mach=p.Mach, dT_isa=p.dT_isa, war=p.war, gas=gas)
         z = {**v, "T4": p.T4}
         loss: dict[str, Any] = {"dp_burner": p.dp_burner, "dp_exhaust": p.dp_exhaust}
-        maps: dict[str, Any] = {
-            "W2": p.W2,
-            "PR_c": p.PR_c,
-            "eta_c": p.eta_c,
-            "PR_t": None,
-            "eta_t": p.eta_t,
-        }
+        maps = {n: getattr(p, n) for n in ("W2", "PR_c", "eta_c", "eta_t")}
         given = {"gas": gas, "amb": amb, "war": p.war, "Wf": v["Wf"]}
         y, res = stations(p=p, z=z, **given, **maps, **loss, PR_t=None, A3=1.0, A8=1.0)
         # at the design point the areas follow from the static states, not the other way round
