@@ -21,8 +21,8 @@ PARTS = (*CORE, "apu_casadi.gaspath", "apu_casadi.machine")
 UNIT = (*PARTS, "apu_casadi.unit")
 MODELS = (*CORE, "estimators.models")
 FILTERS = (*MODELS, "estimators.filters")
-BATCH = (*FILTERS, "estimators.batch")
-GENERIC = (*BATCH, "estimators.information", "estimators.detection")
+INFORMATION = (*FILTERS, "estimators.information")
+GENERIC = (*INFORMATION, "estimators.batch", "estimators.detection")
 ESTIMATORS = (*UNIT, *GENERIC, "estimators.apu")
 SHELL = (*CORE, "scenarios", "scenarios.shell")
 READING = (*ESTIMATORS, "scenarios.extensions", "scenarios.reading")
@@ -42,9 +42,9 @@ BELOW: dict[str, tuple[str, ...]] = {
     "estimators": (),
     "estimators.models": CORE,
     "estimators.filters": MODELS,
-    "estimators.batch": FILTERS,
-    "estimators.information": BATCH,
-    "estimators.detection": BATCH,
+    "estimators.information": FILTERS,
+    "estimators.batch": INFORMATION,
+    "estimators.detection": INFORMATION,
     "estimators.apu": (*UNIT, *GENERIC),
     "scenarios": (),
     "scenarios.shell": SHELL,

@@ -291,6 +291,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.ci  # starts a cluster; joblib and spawn, above, send the same models
 def test_dask(tmp_path):
     """A local cluster of threads and one of processes, in a process of its own."""
     pytest.importorskip("distributed")

@@ -42,9 +42,9 @@ from apu_casadi.core.errors import (
     nearest,
 )
 from apu_casadi.gaspath.conditions import AMBIENT
-from apu_casadi.gaspath.cycle import reynolds_index
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
+from apu_casadi.gaspath.stations import reynolds_index
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 

@@ -39,6 +39,7 @@ from apu_casadi.core.errors import (
     nearest,
 )
 from apu_casadi.core.means import PARTS, PHASORS, RMS
+from apu_casadi.core.measuring import measure
 from apu_casadi.core.results import dataset
 from apu_casadi.core.runstorage import PIECE, RowFile, place, row_file
 from apu_casadi.core.signals import Signal, Signals
@@ -560,8 +561,7 @@ def _collect(
     """Put the run into a labelled dataset."""
     gg, grid = apu.gas_generator, book.grid
     measured = {
-        f"{n}_meas": book.keep(f"{n}_meas", np.asarray(run[n]) + s * rng.standard_normal(grid.size))
-        for n, s in noise.gas.items()
+        f"{n}_meas": book.keep(f"{n}_meas", measure(run[n], s, rng)) for n, s in noise.gas.items()
     }
     signals = [*gg.Y, *_phasor_signals(), *book.severities]
     signals += [

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import AMBIENT, CONDITIONS, DEFAULT_DAY, day_words
+from apu_casadi.gaspath.health import HEALTH
 from scenarios.commands import given
 from scenarios.shell import jsontext, progress
 
@@ -43,7 +44,7 @@ NAME = "fit"
 HELP = "fit health factors to recorded data (CSV, Parquet, netCDF)"
 OPTIONS = f"""
 files FILE +           | recorded data (see above)
---estimate A,B =f_eta_c,f_W_c,f_eta_t,f_W_t | health factors, gain_SENSOR, bias_SENSOR (default: the
+--estimate A,B ={",".join(HEALTH)} | health factors, gain_SENSOR, bias_SENSOR (default: the
                        | four health factors)
 {given.UNIT}
 --own A,B =            | gains or biases that each file has for itself

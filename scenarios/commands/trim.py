@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.errors import SignalError, nearest
 from apu_casadi.core.version import installed
-from apu_casadi.unit.events import HEALTH_FACTORS
+from apu_casadi.gaspath.health import HEALTH
 from scenarios.commands import given
 from scenarios.shell import jsontext
 
@@ -47,7 +47,7 @@ OPTIONS = f"""
 --fix NAME=VALUE ... | fix an output, twice; PW=cube is a load like speed cubed through the design
                      | point
 --max-power T4=K     | highest shaft power at a temperature (T4 or T5)
---health NAME=VALUE ... | health factor, 1 is healthy: {", ".join(HEALTH_FACTORS)}
+--health NAME=VALUE ... | health factor, 1 is healthy: {", ".join(HEALTH)}
 --limit NAME=VALUE ...  | off_map (table spans), SM_min, T4_max, T5_max (K)
 {given.UNIT}
 --all                | print every output
@@ -181,7 +181,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
 
 
 def _second(point: OperatingPoint) -> str:
-    from apu_casadi.gaspath.cycle import Y
+    from apu_casadi.gaspath.stations import Y
 
     other = ", ".join(f"{k} = {point[k]:.6g} {Y[k].unit}" for k in ("N", "PW", "Wf", "T4", "SM"))
     return (
@@ -235,7 +235,7 @@ def _scalars(y: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _table(values: Mapping[str, float], names: list[str]) -> str:
-    from apu_casadi.gaspath.cycle import Y
+    from apu_casadi.gaspath.stations import Y
 
     rows = []
     for n in (n for n in names if n in values):

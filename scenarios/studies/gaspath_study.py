@@ -25,7 +25,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.stats import chi2
 
 from apu_casadi.core.backend import Caller, compiled
 from apu_casadi.core.errors import EstimationError
@@ -40,27 +39,23 @@ from apu_casadi.unit.control import GovernorParameters, governor
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.gaspath import (
-    DT,
-    GAINED,
-    HEALTH,
     HEALTH_SIGMA,
     HEALTH_WALK,
     JUMP,
     MODEL_ERROR,
     N_SIGMA,
     N_WALK,
-    OUTPUTS,
     GasPathFilter,
-    JumpTest,
     gas_path_filter,
-    gas_path_model,
     null_direction,
-    track_jumps,
 )
+from estimators.apu.gaspathmodel import DT, GAINED, HEALTH, OUTPUTS, gas_path_model
+from estimators.apu.healthjumps import JumpTest, track_jumps
 from estimators.apu.sensors import GAS_PATH
 from estimators.batch.smoother import rts_smoother
 from estimators.filters.filtering import FilterResult
 from estimators.filters.ukf import unscented_kalman_filter
+from estimators.information import consistency
 from estimators.information.bounds import linearisations, posterior_bound, snapshot_bound
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
@@ -406,7 +401,7 @@ class LinearReference:
 
     def nees(self, rows: np.ndarray) -> np.ndarray:
         """Return the normalised error squared of the factors at some samples, (seeds, rows)."""
-        return _squared(*self.errors(rows))
+        return consistency.nees(*self.errors(rows))
 
 
 # ------------------------------------------------------------------------------ measures
@@ -455,21 +450,6 @@ class Collected:
             self.paired.append(r.cov[self.rows])
 
 
-def _squared(e: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """e' P^-1 e over the last axis."""
-    return np.asarray(np.einsum("...i,...i->...", e, np.linalg.solve(P, e[..., None])[..., 0]))
-
-
-def _band(n: int, dof: int) -> tuple[float, float]:
-    """95 % band of the mean of n chi-squared numbers."""
-    return tuple(float(q) / n for q in chi2.ppf([0.025, 0.975], n * dof))  # type: ignore[return-value]
-
-
-def _independent(nees: np.ndarray) -> float:
-    """How many independent numbers the columns of (seeds, n) amount to: n^2 over sum of corr."""
-    return float(nees.shape[1] ** 2 / np.corrcoef(nees.T).sum())
-
-
 def measures(c: Collected, health: slice, null: np.ndarray, ny: int) -> dict[str, Any]:
     """Condense collected runs: RMSE over bound, NEES, NIS, the null direction; by checkpoint."""
     e, P, nis = np.array(c.error)[:, :, health], np.array(c.cov)[:, :, health, health], c.nis
@@ -478,15 +458,15 @@ def measures(c: Collected, health: slice, null: np.ndarray, ny: int) -> dict[str
     claimed = np.array(c.paired)[:, :, health, health]
     rmse = np.sqrt((e**2).mean(0))
     limit = np.sqrt(np.diagonal(B, axis1=2, axis2=3).mean(0))
-    nees = _squared(e, P).mean(0)
+    nees = consistency.nees(e, P).mean(0)
     along = np.einsum("ski,i->sk", e, null)
     var = np.einsum("skij,i,j->sk", P, null, null)
     least = np.einsum("skij,i,j->sk", B, null, null)
     var_paired = np.einsum("skij,i,j->sk", claimed, null, null)
     nees_null = (along**2 / var).mean(0)
-    low4, high4 = _band(n, 4)
-    low1, high1 = _band(n, 1)
-    low_y, high_y = _band(n, ny)
+    low4, high4 = consistency.band(n, 4)
+    low1, high1 = consistency.band(n, 1)
+    low_y, high_y = consistency.band(n, ny)
     nis_mean = np.array(nis).mean(0)
     inside = (nees >= low4) & (nees <= high4)
     return {
@@ -588,13 +568,13 @@ def efficiency(
     out = measures(c, slice(first, first + 4), null, len(OUTPUTS))
     out |= {"checkpoints": points.tolist(), "matched": matched}
     e, P = (np.array(v)[:, :, first : first + 4] for v in (c.error, c.cov))
-    every = _squared(e, P[..., first : first + 4])
+    every = consistency.nees(e, P[..., first : first + 4])
     out["nees_of"] = {
         name: every[i :: len(truths)].mean(0).tolist() for i, name in enumerate(engines)
     }
     if matched:
         e_exact, P_exact = chance.errors(c.rows)
-        exact = _squared(e_exact, P_exact)
+        exact = consistency.nees(e_exact, P_exact)
         excess = (every - exact).mean(1)
         along = (e_exact @ null) ** 2 / np.einsum("kij,i,j->k", P_exact, null, null)
         out["null"]["nees_exact"] = along.mean(0).tolist()
@@ -602,7 +582,7 @@ def efficiency(
             "nees_exact": exact.mean(0).tolist(), "nees_excess": float(excess.mean()),
             "nees_excess_stderr": float(excess.std() / math.sqrt(len(excess))),
             # the mean over the run of numbers that are nearly one number
-            "nees_independent": _independent(every),
+            "nees_independent": consistency.independent(every),
         }  # fmt: skip
     else:
         hours = len(c.error) * DURATION / 3600
@@ -793,7 +773,7 @@ def compare_filters(
             e = (r.mean[health] - x)[:, start:].T
             square[n] += (e**2).mean(0)
             P = r.cov[start:, health, health]
-            nees[n] += float(np.mean(np.sum(e * np.linalg.solve(P, e[..., None])[..., 0], 1)))
+            nees[n] += float(consistency.nees(e, P).mean())
         if j % 5 == 0:
             B = bound_of(filt, truth, case, jumps=[FAULT])[start:, health, health]
             limit += np.diagonal(B, axis1=1, axis2=2).mean(0)

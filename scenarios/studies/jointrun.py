@@ -20,7 +20,7 @@ from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.sharing import last
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.electrical.terminalsignals import PHASES
-from estimators.apu.gaspath import DT, HEALTH
+from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
 from scenarios import registry
 from scenarios.schema import Scenario

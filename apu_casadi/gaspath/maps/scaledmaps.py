@@ -160,6 +160,11 @@ def local_cubics(knots: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarr
     )
 
 
+def per(x: Any, number: Any) -> Any:
+    """x over a number of the engine, whose reciprocal is computed once for all derivatives."""
+    return x * (1 / number)
+
+
 def _held(x: Any, breaks: np.ndarray) -> Any:
     """Hold a query within the ends."""
     return ca.fmin(ca.fmax(x, float(breaks[0])), float(breaks[-1]))
@@ -223,7 +228,7 @@ def surface_logs(table: MapTable, N: Any, beta: Any, cell: Any) -> tuple[Any, li
 
 
 @kept
-def _log_map(table: MapTable) -> ca.Function:
+def table_logs(table: MapTable) -> ca.Function:
     """(N, beta) -> N as held, and (ln W, ln(PR - 1), ln eta) stacked."""
     N, beta, cell = ca.SX.sym("N"), ca.SX.sym("beta"), ca.SX.sym("cell", N_CELL)
     held, logs = surface_logs(table, N, beta, cell)
@@ -240,7 +245,7 @@ def map_function(table: MapTable) -> ca.Function:
     N, beta : scalars in the table's units.  W, PR, eta : scalars in the table's units.
     """
     N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
-    _, y = _log_map(table)(N, beta)
+    _, y = table_logs(table)(N, beta)
     out = [ca.exp(y[0]), 1 + ca.exp(y[1]), ca.exp(y[2])]
     return ca.Function("map", [N, beta], out, ["N", "beta"], ["W", "PR", "eta"])
 
@@ -452,16 +457,16 @@ class ScaledMap(Parametric):
     def _bent(self, n: ca.MX, beta: ca.MX, RNI: ca.MX, cal: Any) -> dict[str, ca.MX]:
         """Return the outputs by name, with the numbers of ``cal`` floats or symbols."""
         t = self.table
-        N_held, y = _log_map(t)(self.N_map_des * n, beta)
+        N_held, y = table_logs(t)(self.N_map_des * n, beta)
         surge = surge_function(t) if t.kind == "compressor" else None
         out = self._scaled(N_held, ca.vertsplit(y), RNI, cal, surge)
         out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
         return {k: out[k] for k in MapPoint._fields if k in out}
 
     @derived
-    def _design_logs(self) -> tuple[float, float, float]:
+    def design_logs(self) -> tuple[float, float, float]:
         """ln W, ln(PR - 1), ln eta of the table where the design point lies."""
-        _, y = _log_map(self.table)(self.N_map_des, self.beta_des)
+        _, y = table_logs(self.table)(self.N_map_des, self.beta_des)
         W, PR, eta = np.asarray(y).ravel().tolist()
         return W, PR, eta
 
@@ -472,16 +477,18 @@ class ScaledMap(Parametric):
 
         ``surge`` gives the unscaled line's pressure ratio by the unscaled flow.
         """
-        des = self._design_logs
-        held = N_held / self.N_map_des  # > 0, so that powers of it exist
-        W = self.W_des * ca.exp(y[0] - des[0]) * held**cal.a_W
+        des = self.design_logs
+        held = per(N_held, self.N_map_des)  # > 0, so that powers of it exist
+        # powers are written as exponentials, which are cheaper when differentiated
+        W = self.W_des * ca.exp(y[0] - des[0] + cal.a_W * ca.log(held))
         PR = 1 + (self.PR_des - 1) * ca.exp(y[1] - des[1])
         # ln((PR - 1)/(PR_des - 1)) is y - des itself
         droop = cal.c_PR * (y[1] - des[1]) ** 2 + cal.c_N * (held - 1) ** 2
-        eta = 1 - (1 - self.eta_des * ca.exp(y[2] - des[2] - droop)) * RNI ** (-cal.n_Re)
+        loss = 1 - self.eta_des * ca.exp(y[2] - des[2] - droop)
+        eta = 1 - loss * ca.exp(-cal.n_Re * ca.log(RNI))
         out = {"W": W, "PR": PR, "eta": eta}
         if surge is not None:
-            line = (surge(self._table_flow(W)) - 1) * (self.PR_des - 1) / math.exp(des[1])
+            line = (surge(self._table_flow(W)) - 1) * per(self.PR_des - 1, ca.exp(des[1]))
             # a tilt about n = 1 that saturates: a power law fitted above the design speed would
             # move the whole surge line at part speed, about which it knows nothing
             tilt = 1 + cal.a_SM * ca.tanh((held - 1) / TILT_WIDTH)
@@ -490,7 +497,7 @@ class ScaledMap(Parametric):
 
     def _table_flow(self, W: Any) -> Any:
         """Flow of the table that stands for a scaled flow."""
-        return W / self.W_des * math.exp(self._design_logs[0])
+        return W * per(ca.exp(self.design_logs[0]), self.W_des)
 
     def at(self, n: Any, beta: Any, RNI: Any, cell: Any, surge: Any = None) -> tuple[MapPoint, Any]:
         """Read the map at a point of a known cell; plain expressions, also of SX.

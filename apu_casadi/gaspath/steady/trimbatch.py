@@ -15,7 +15,7 @@ import numpy as np
 
 from apu_casadi.core.checked import array
 from apu_casadi.core.errors import SignalError, nearest
-from apu_casadi.gaspath.conditions import DEFAULT_DAY
+from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import (
     MEANING,
@@ -31,7 +31,7 @@ from apu_casadi.gaspath.steady.steadypoint import (
     stop_text,
 )
 from apu_casadi.gaspath.steady.trimbranch import Roots, may_fold, settle
-from apu_casadi.gaspath.steady.trimkernel import AMBIENT, DIRECT, NZ
+from apu_casadi.gaspath.steady.trimkernel import DIRECT, NZ
 from apu_casadi.gaspath.steady.trimsolver import (
     COMPILE_FROM,
     FLOORS,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from estimators.information.intervals import share_interval
+from estimators.information.consistency import share_interval
 from scenarios.pages.reports.claims import Claim, Pictures, Report
 from scenarios.pages.reports.words import between, percent, seeds_of, table
 from scenarios.studies.catalogue import Results

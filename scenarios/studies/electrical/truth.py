@@ -156,20 +156,13 @@ def samples_of(
         sensors: 1-sigma table.
         gains: relative gain error by sensor.
     """
-    out = {"t": truth.t}
-    for n in _SAMPLED:
-        v = truth.values[n] * (1.0 + (gains or {}).get(n, 0.0))
-        if rng is not None:
-            s = sensors[n]
-            noise = s.noise * np.abs(v) if s.relative else s.noise
-            v = v + noise * rng.standard_normal(v.shape)
-        out[n] = v
-    return out
+    true = {n: truth.values[n] for n in _SAMPLED}
+    return {"t": truth.t} | sensors.measure(true, rng, gains=gains)
 
 
 def drawn_gains(rng: np.random.Generator, sensors: SensorSet = ELECTRICAL) -> dict[str, float]:
     """Draw the constant gain errors of all sensors, Gaussian, from their table."""
-    return {n: sensors[n].gain * float(rng.standard_normal()) for n in GAIN_SENSORS}
+    return sensors.draw_gains(rng, GAIN_SENSORS)
 
 
 def chances(
