@@ -299,7 +299,7 @@ def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
 
 def _records(tasks: Sequence[_Task], workers: int | None) -> Generator[dict[str, Any]]:
     """Yield the records of all tasks, in the order in which they end."""
-    from apu_casadi.core.backend import available_threads
+    from apu_casadi.core.calling import available_threads
 
     n = min(available_threads() if workers is None else workers, len(tasks))
     if n <= 1:

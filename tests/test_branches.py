@@ -8,7 +8,8 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 
 from apu_casadi.gaspath.gasgenerator import GasGenerator, GasGeneratorState, default_compressor
-from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.gaspath.maps.mapfiles import shipped
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimming import initialise, trim_gas_generator
 from apu_casadi.gaspath.steady.trimsolver import solver_of

@@ -16,8 +16,8 @@ from apu_casadi.core import results
 from apu_casadi.core.errors import DataError, ScenarioError, SimulationError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, campaigns, registry
-from scenarios.campaign_records import COLUMNS
-from scenarios.campaigns import RUNS, counts, random_faults, run_campaign
+from scenarios.campaign_records import COLUMNS, RUNS
+from scenarios.campaigns import counts, random_faults, run_campaign
 from scenarios.cli import main
 from scenarios.schema import Scenario
 from scenarios.shell import workers

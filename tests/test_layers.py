@@ -206,7 +206,7 @@ def test_inner_packages_hold_no_code():
         ("scenarios/cli.py", "matplotlib.pyplot", "only scenarios.figures"),
         ("scenarios/cli.py", ".commands", "relative"),
         ("scenarios/shell/guard.py", "scenarios.registry", "upward"),
-        ("scenarios/studies/timing.py", "scenarios.bench.benchmarks", "sideways"),
+        ("scenarios/studies/jointrun.py", "scenarios.bench.benchmarks", "sideways"),
     ],
 )
 def test_the_rules_bite(path, module, words):

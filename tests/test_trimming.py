@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 
 from apu_casadi.core import backend
 from apu_casadi.core.errors import OperatingPointError, SignalError
-from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator
+from apu_casadi.gaspath.designdata import RPM
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import (
     MEANING,
     Limits,

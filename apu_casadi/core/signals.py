@@ -8,7 +8,7 @@ and missing names, wrong shapes and values that are not finite.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -47,7 +47,7 @@ class Signal:
             raise SignalError(f"signal {self.name}: nominal must be > 0, got {self.nominal!r}")
 
 
-class Signals:
+class Signals(Sized):
     """An ordered set of :class:`Signal`, with packing and unpacking by name."""
 
     def __init__(self, signals: Iterable[Signal] = ()) -> None:

@@ -44,7 +44,8 @@ from apu_casadi.gaspath.stations import (
 )
 from apu_casadi.gaspath.unitnumbers import NUMBERS, UnitParts, derivation, parts
 
-_NZ, _NX, _NU, _NA, _NT, _NC = map(len, (Z, X, U, AMBIENT_STATE, THETA, NUMBERS))
+_NZ, _NX, _NU, _NT = map(len, (Z, X, U, THETA))
+_NA, _NC = len(AMBIENT_STATE), len(NUMBERS)
 N_ORDERED = len(TEMPERATURES)  # unknowns that equations determine one after the other
 STEP_TOL = 1e-7  # of Newton's last step, relative: it converges quadratically, some 1e-13 is left
 

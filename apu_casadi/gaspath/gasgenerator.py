@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import OperatingPointError, SimulationError
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
@@ -29,7 +30,8 @@ from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.design import DesignPoint, solve_design
 from apu_casadi.gaspath.designdata import RPM, GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas
-from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.gaspath.maps.mapfiles import shipped
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration, ScaledMap
 
 __all__ = [

@@ -30,7 +30,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.means import Term
 from apu_casadi.core.sharing import Rebuilt, keep, kept

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.machine.meanstep import MeanStep

@@ -40,7 +40,8 @@ from apu_casadi.unit.events import (
     health_factors,
     in_order,
 )
-from apu_casadi.unit.multirate import MEANS, exchange_grid
+from apu_casadi.unit.machinestep import MEANS
+from apu_casadi.unit.multirate import exchange_grid
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -38,10 +38,11 @@ from apu_casadi.core.errors import (
     ValidityWarning,
     nearest,
 )
+from apu_casadi.core.filearrays import RowFile
 from apu_casadi.core.means import PARTS, PHASORS, RMS
 from apu_casadi.core.measuring import measure
 from apu_casadi.core.results import dataset
-from apu_casadi.core.runstorage import PIECE, RowFile, place, row_file
+from apu_casadi.core.runstorage import PIECE, place, row_file
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.faults.ttsc import Ttsc

@@ -51,7 +51,7 @@ rows of Table 4.  The digits printed are finer."""
 def published_points() -> list[CalibrationPoint]:
     """Return the points that the defaults were fitted to, from Tables 4 and 5."""
     from apu_casadi.gaspath.calibration import CalibrationPoint
-    from apu_casadi.gaspath.gasgenerator import GasGeneratorParameters
+    from apu_casadi.gaspath.designdata import GasGeneratorParameters
     from scenarios.validation.comparison import reference
 
     p = GasGeneratorParameters()

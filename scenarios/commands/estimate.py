@@ -18,13 +18,11 @@ from typing import Any
 from scenarios.commands import given
 from scenarios.shell import jsontext, usage
 from scenarios.shell.progress import bar, moving
+from scenarios.studies.estimation import names
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
 KEPT = "docs/estimation"
-_NAMES = "correctness electrical detection gaspath shaft-power isolation fitting joint speed"
-NAMES = tuple(_NAMES.split())
-"""The studies; here as well, so that the help needs nothing heavy.  A test compares."""
 
 
 _OUT = f"--out DIR ={KEPT} | where results are kept (default %(default)s)"
@@ -38,7 +36,7 @@ _JOINT = f"""
 --quiet                     | no progress bar, no list of files
 """
 _STUDY = f"""
-study NAME    | all, or one of {", ".join(NAMES)}
+study NAME    | all, or one of {", ".join(names())}
 --seeds int N | fresh seeds (default: the study's own)
 {_OUT}
 --again       | also run what is kept
@@ -87,9 +85,9 @@ def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi.core import results
     from apu_casadi.core.errors import ScenarioError
+    from apu_casadi.core.files import write_text
     from scenarios import registry
     from scenarios.shell import notices
-    from scenarios.shell.markdown import write_text
     from scenarios.studies import jointrun
 
     if args.seed < 0:
@@ -128,32 +126,31 @@ def _study(args: argparse.Namespace) -> int:
     """Run a study over fresh random seeds; parts that are kept are not run again."""
     from apu_casadi.core.errors import ParameterError, nearest
     from scenarios import registry
-    from scenarios.pages.reports import REPORTS
     from scenarios.studies import catalogue
     from scenarios.studies.kept import understood
 
     known = [*catalogue.STUDIES, "all"]
     if args.study not in known:
         raise ParameterError(f"unknown study {args.study!r} {nearest(args.study, known)}")
-    names = list(catalogue.STUDIES) if args.study == "all" else [args.study]
+    chosen = list(catalogue.STUDIES) if args.study == "all" else [args.study]
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
     usage.count("--seeds", args.seeds, least=2)
     folder = registry.prepare(args.out)
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
-    for name in names:
-        n = args.seeds or catalogue.get(name).seeds
+    for name in chosen:
         study = catalogue.get(name)
+        n = args.seeds or study.seeds
         todo = list(study.parts) if args.again else catalogue.pending(study, folder, n)
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
             record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
         with understood(name):
-            found[name] = REPORTS[name].claims(catalogue.results(record))
+            found[name] = study.report.claims(catalogue.results(record))
         if not args.json:
-            remark = catalogue.other_code(catalogue.get(name), record)
+            remark = catalogue.other_code(study, record)
             if remark:
                 print(f"  {remark}", flush=True)
             for c in found[name]:
@@ -190,8 +187,8 @@ def _page(args: argparse.Namespace) -> int:
     """Write the page and its figures from the kept studies."""
     from apu_casadi.core import files
     from apu_casadi.core.errors import DataError
+    from apu_casadi.core.files import write_text
     from scenarios.pages import estimation_page
-    from scenarios.shell.markdown import write_text
     from scenarios.studies import catalogue
 
     try:

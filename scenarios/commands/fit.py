@@ -184,7 +184,7 @@ def _deviation(p: given.Pair, unit: str) -> tuple[float, bool]:
     """Return a standard deviation in SI, and whether it is relative to the reading."""
     import numpy as np
 
-    from estimators.apu.recordings.recorded import UNITS, convert
+    from estimators.apu.recordings.units import UNITS, convert
 
     # the longest ending that is a unit: 3K, 1.5 kPa, 0.5%, 3 K
     endings = [u for u in UNITS if p.value.endswith(u) and not u[0].isdigit() and u != "-"]

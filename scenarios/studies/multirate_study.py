@@ -278,7 +278,7 @@ def table(rows: Sequence[Measured]) -> str:
 
 def figure(rows: Sequence[Measured]) -> Any:
     """Draw errors over exchange step, a panel for each quantity; return a matplotlib Figure."""
-    from scenarios.figures import plotting
+    from scenarios.figures.exchangeplot import figure_exchange_error
 
     curves = {
         (case, ex): (
@@ -291,7 +291,7 @@ def figure(rows: Sequence[Measured]) -> Any:
     }
     if not curves:
         raise ScenarioError("nothing to draw: at least two exchange steps are needed")
-    return plotting.figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
+    return figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
 
 
 def write_figure(rows: Sequence[Measured], path: Path, dpi: float | None = None) -> Path:

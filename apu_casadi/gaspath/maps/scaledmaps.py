@@ -46,7 +46,7 @@ from scipy.interpolate import BSpline
 from apu_casadi.core.errors import MapError
 from apu_casadi.core.parameters import Parameters, par
 from apu_casadi.core.sharing import Parametric, derived, kept
-from apu_casadi.gaspath.maps.mapfiles import MapTable
+from apu_casadi.gaspath.maps.maptable import MapTable
 
 REACH = 2.0  # table spans from the table's edge to where everything is held
 LOWEST = 0.05  # held below this fraction of the table's lowest speed

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled, mapped
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import mapped
 from apu_casadi.core.errors import EstimationError
 from apu_casadi.core.measuring import measure
 from apu_casadi.core.sharing import kept

@@ -11,9 +11,10 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import FLUXES
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES
+from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import FLUX_WALK, H_WALK, START_SIGMA
 from estimators.batch.relinearised import relinearised_filter
 from estimators.filters.belief import Belief

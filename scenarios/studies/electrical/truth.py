@@ -13,12 +13,12 @@ import scipy.linalg
 from apu_casadi.core.sharing import last, once
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.load import Load
-from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc
+from apu_casadi.machine.park import PHASES, Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.terminals import FLUXES
 from apu_casadi.machine.wrsg import Windings, currents, flux_rates
 from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.machinemodel import held
-from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED, PHASES, VOLTAGES
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED, VOLTAGES
 from estimators.apu.sensors import ELECTRICAL, SensorSet
 from scenarios.studies.electrical.protocol import ATOL, DT, FULL, RTOL, UNIT_STEP
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalfilter import electrical_filter
-from estimators.apu.electrical.terminalsignals import PHASES
 from estimators.apu.electrical.tracking import track
 from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.filters.belief import Belief
@@ -91,14 +91,14 @@ def quiet(n_seeds: int = 50, seed0: int = SEED0, *, level: float = FAULT_LEVEL) 
                     resets += len(track(filt, prior, data)[1])
             row[kind] = {"alarms": alarms, "largest_h_over_sigma": max(tops),
                          "mean_nis": float(np.mean(nis)),
-                         "tail": _chance(np.array(tops), level)}  # fmt: skip
+                         "tail": chance_of_alarm(np.array(tops), level)}  # fmt: skip
             if kind == "exact sensors":
                 row[kind]["resets"] = resets
         out[name] = row
     return out
 
 
-def _chance(tops: np.ndarray, level: float) -> dict[str, Any]:
+def chance_of_alarm(tops: np.ndarray, level: float) -> dict[str, Any]:
     """Return how likely a run is to pass the level, by the tail of the largest statistics of runs.
 
     Beyond ``TAIL_FROM`` the share of runs is continued as exp(-z^2/2), which a Gaussian process has
