@@ -146,7 +146,7 @@ def unit_of(parameters: str = "{}", engine: str | None = None, content: str = ""
 def unit_for(s: Scenario) -> Apu:
     """Return the unit that a scenario is about."""
     parameters = json.dumps(dict(s.parameters), sort_keys=True)
-    return unit_of(parameters, *([s.engine, digest(s.engine)] if s.engine else []))
+    return unit_of(parameters, *([s.engine, digest(s.engine, "engine file")] if s.engine else []))
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:

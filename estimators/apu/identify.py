@@ -241,6 +241,7 @@ def gas_path_transient(
     prior: float = PRIOR,
     sensors: SensorSet = GAS_PATH,
     backend: str | None = None,
+    gas_generator: GasGenerator | None = None,
 ) -> Sensitivities:
     """Return what a recording through a load ramp tells of the four health factors.
 
@@ -255,11 +256,12 @@ def gas_path_transient(
         prior: standard deviation of each health factor before.
         sensors: the sensor table.
         backend: see :func:`apu_casadi.core.backend.compiled`.
+        gas_generator: the engine; the paper's by default.
 
     Raises:
         OperatingPointError, EstimationError: the engine does not run, or is lost, on the way.
     """
-    gg = _DEFAULT
+    gg = gas_generator or _DEFAULT
     ss = gg.state_space
     dt, K = 0.02, round(seconds / 0.02)
     t = dt * np.arange(K)
@@ -302,6 +304,7 @@ def shaft_power_snapshot(
     eta_bias: float = 0.0,
     samples: int = SAMPLES,
     gain_errors: bool = False,
+    gas_generator: GasGenerator | None = None,
 ) -> dict[str, Any]:
     """Return how much measured shaft power reduces the health factors' standard deviations.
 
@@ -318,12 +321,13 @@ def shaft_power_snapshot(
     """
     g = gas_path(
         point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
-        eta_bias=eta_bias, gain_errors=gain_errors,
+        eta_bias=eta_bias, gain_errors=gain_errors, gas_generator=gas_generator,
     )  # fmt: skip
     without = g.only(BASE)
     C0, C1 = without.covariance(), g.covariance()
     # with gain errors considered it is no longer exactly invisible: take it without them
-    plain = gas_path(point, sensors=GAS_PATH, samples=samples, prior=prior).only(BASE)
+    of: dict[str, Any] = {"samples": samples, "prior": prior, "gas_generator": gas_generator}
+    plain = gas_path(point, sensors=GAS_PATH, **of).only(BASE)
     v = np.linalg.svd(plain.signatures())[2][-1]
     v = v * np.sign(v[np.abs(v).argmax()])
     s0, s1 = np.sqrt(np.diag(C0)), np.sqrt(np.diag(C1))
@@ -504,6 +508,7 @@ def snapshot_trials(
     power_noise: float = GAS_PATH["PW"].noise,
     eta_bias: float = 0.0,
     samples: int = SAMPLES,
+    gas_generator: GasGenerator | None = None,
 ) -> Trials:
     """Estimate the health factors from random snapshots of the nonlinear engine.
 
@@ -514,13 +519,13 @@ def snapshot_trials(
     Raises:
         EstimationError: a draw has no steady readings, or the iteration does not converge.
     """
-    gg = _DEFAULT
+    gg = gas_generator or _DEFAULT
     at = _steady(point, gg)
     read = _Reader(gg, at)
     rows = gg.Y.indices(GAS_PATH.names)
     g = gas_path(
         point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
-        eta_bias=eta_bias,
+        eta_bias=eta_bias, gas_generator=gas_generator,
     )  # fmt: skip
     nominal = np.array([at[n] for n in GAS_PATH.names])
     sigma = np.array([GAS_PATH.sigma(n, v) for n, v in zip(GAS_PATH.names, nominal, strict=True)])

@@ -23,8 +23,9 @@ from scenarios.commands import given
 from scenarios.shell import jsontext, progress, usage
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.identify import Severity, Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
 
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     sets, added = _sets(args, sensors)
     f = _found(args)
     if args.figure is not None:
-        files.save_figure(_figure(f.point, args.samples), args.figure)
+        files.save_figure(_figure(f.point, args.samples, _engine(args)), args.figure)
     if args.json:
         jsontext.show(_report(args, sensors, sets, added, f))
         return 0
@@ -87,13 +88,15 @@ def _sets(
     from estimators.information.identifiability import compare_sensors, which_to_add
 
     how: dict[str, Any] = {"prior": args.prior / 100, "samples": args.samples}
-    how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors}
-    if args.engine is not None:
-        how["gas_generator"] = given.engine(args)
+    how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors, **_engine(args)}
     g = study.gas_path(args.point, **how)
     more = [s for s in g.sensors if s not in sensors]
     sets = {"these": list(sensors), **{f"+ {s}": [*sensors, s] for s in more}}
     return compare_sensors(g, sets), which_to_add(g, sensors, more)
+
+
+def _engine(args: argparse.Namespace) -> dict[str, GasGenerator]:
+    return {} if args.engine is None else {"gas_generator": given.engine(args)}
 
 
 @dataclass(frozen=True)
@@ -127,12 +130,14 @@ def _found(args: argparse.Namespace) -> Found:
     from estimators.information.identifiability import identify
 
     first, prior = given.names(args.point)[0], args.prior / 100
-    options = {"prior": prior, "samples": args.samples}
+    engine = _engine(args)
+    options: dict[str, Any] = {"prior": prior, "samples": args.samples, **engine}
     variants, seeds = study.VARIANTS, range(10_000, 10_000 + args.trials)
     snapshot, needed = study.shaft_power_snapshot, study.needed_samples
     power = {n: snapshot(first, **{**options, **v}) for n, v in variants.items()}
-    at = {"swept": {"samples": args.samples}}
-    aims = {n: needed(a, first, prior=prior, **variants[n]) for n, a in study.AIMS.items()}
+    at = {"swept": {"samples": args.samples, **engine}}
+    how: dict[str, Any] = {"prior": prior, **engine}
+    aims = {n: needed(a, first, **how, **variants[n]) for n, a in study.AIMS.items()}
     trials = {}
     if args.trials:
         progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
@@ -142,13 +147,13 @@ def _found(args: argparse.Namespace) -> Found:
     if args.transient:
         powers = {"without PW": False, "with PW": True}
         transient = study.gas_path_transient
-        ramp = {n: identify(transient(power=p, prior=prior)) for n, p in powers.items()}
+        ramp = {n: identify(transient(power=p, **how)) for n, p in powers.items()}
     return Found(
         first,
         power,
         study.snapshot_sweep(first, priors=SWEPT, variants=at),
         study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
-        study.limiting_noises(first, prior=prior),
+        study.limiting_noises(first, **how),
         aims,
         study.severity_study(),
         trials,
@@ -444,20 +449,18 @@ def _electrical(rows: list[Severity]) -> list[str]:
     return lines
 
 
-def _figure(point: str, samples: int) -> Any:
+def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
     from estimators.apu import identify as study
     from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 
     noise = study.GAS_PATH["PW"].noise
     priors = list(study.PRIORS)
     curves = {}
+    keys = ("reduction", "null_before", "null_after")
     for label, variant in study.VARIANTS.items():
-        rows = study.snapshot_sweep(
-            point, power_noises=[noise], variants={label: {"samples": samples, **variant}}
-        )
-        curves[label] = {
-            k: [r[k] for r in rows] for k in ("reduction", "null_before", "null_after")
-        }
+        variants = {label: {"samples": samples, **engine, **variant}}
+        rows = study.snapshot_sweep(point, power_noises=[noise], variants=variants)
+        curves[label] = {k: [r[k] for r in rows] for k in keys}
     return plot_gain_of_a_sensor(
         priors,
         curves,
