@@ -57,10 +57,13 @@ _SENSORS = f"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the four actions."""
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    calls = {_joint: _JOINT, _study: _STUDY, _page: _PAGE, _sensors: _SENSORS}
-    for call, table in calls.items():
-        name, doc = call.__name__.strip("_"), call.__doc__
-        p = actions.add_parser(name, help=doc, description=doc)
+    for name, call, table in (
+        ("joint", _joint, _JOINT),
+        ("study", _study, _STUDY),
+        ("page", _page, _PAGE),
+        ("sensors", _sensors, _SENSORS),
+    ):
+        p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
         p.set_defaults(action=call)
         usage.declare(p, table)
 
