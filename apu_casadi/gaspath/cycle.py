@@ -186,11 +186,11 @@ class Cycle(Parametric):
         W5 = W2 * (1 - p.bleed_overboard) + v["Wf"]
         design_5 = d["W5"] * ca.sqrt(d["T5"]) / d["P5"]
         corrected_5 = per(W5 * ca.sqrt(z["T5"]) / (P4 / PR_t), design_5)
-        y, res = stations(
-            p=p, gas=unit.gas, amb=amb, war=v["war"], Wf=v["Wf"], W2=W2, PR_c=PR_c, eta_c=eta_c,
-            dp_burner=dp_burner, PR_t=PR_t, eta_t=eta_t, dp_exhaust=p.dp_exhaust * corrected_5**2,
-            A3=unit.design.A3, A8=unit.design.A8, z=z,
-        )  # fmt: skip
+        loss = {"dp_burner": dp_burner, "dp_exhaust": p.dp_exhaust * corrected_5**2}
+        maps = {"W2": W2, "PR_c": PR_c, "eta_c": eta_c, "PR_t": PR_t, "eta_t": eta_t}
+        areas = {"A3": unit.design.A3, "A8": unit.design.A8}
+        given = {"gas": unit.gas, "amb": amb, "war": v["war"], "Wf": v["Wf"]}
+        y, res = stations(p=p, z=z, **given, **maps, **loss, **areas)
         capacity = W_t * H["f_W_t"]
         res["turbine flow"] = y["W41"] * ca.sqrt(z["T41"]) / y["P4"] / capacity - 1
         power = {"P_turb": y["P_turb"], "P_cpr": y["P_cpr"], "eta_cpr": p.eta_cpr}

@@ -157,7 +157,7 @@ class CycleFunctions(Parametric):
         x, _, u, theta = self.symbols()
         _, c, _ = self._split(theta)
         args = [x, u] if self.numbers is not None else [x, u, theta]
-        return ca.Function("similar", args, self.cycle.similar.call([x, u, c], True, False))
+        return ca.Function("similar", args, [self.cycle.similar(x, u, c)])
 
     def start(self, x: Any, u: Any, theta: Any) -> Any:
         """First guess of z; ``theta`` counts where it holds numbers."""

@@ -94,11 +94,10 @@ class DesignEquations:
         gas = Gas.of_symbols(p.x_HC, data)
         amb = ambient(altitude=p.altitude, Mach=p.Mach, dT_isa=p.dT_isa, war=p.war, gas=gas)
         z = {**v, "T4": p.T4}
-        y, res = stations(
-            p=p, gas=gas, amb=amb, war=p.war, Wf=v["Wf"], W2=p.W2, PR_c=p.PR_c, eta_c=p.eta_c,
-            dp_burner=p.dp_burner, PR_t=None, eta_t=p.eta_t, dp_exhaust=p.dp_exhaust, A3=1.0,
-            A8=1.0, z=z,
-        )  # fmt: skip
+        loss: dict[str, Any] = {"dp_burner": p.dp_burner, "dp_exhaust": p.dp_exhaust}
+        maps = {n: getattr(p, n) for n in ("W2", "PR_c", "eta_c", "eta_t")}
+        given = {"gas": gas, "amb": amb, "war": p.war, "Wf": v["Wf"]}
+        y, res = stations(p=p, z=z, **given, **maps, **loss, PR_t=None, A3=1.0, A8=1.0)
         # at the design point the areas follow from the static states, not the other way round
         A3, A8 = (1 / (res.pop(n) + 1) for n in ("static state 3", "exit flow"))
         res["static pressure 3"] = y["Ps3"] / y["P3"] - p.Ps3_P3

@@ -11,6 +11,11 @@ from apu_casadi.gaspath.conditions import CONDITIONS
 
 RPM = math.pi / 30.0  # rad/s per r/min
 
+_W2 = "Table 4; Table 3's corrected flow contradicts it"
+_POWER = "Table 4, power closure"
+_AREA_3 = "Table 4, fixes the area at 3"
+_J = "assumed: 356 kJ at design speed, 0.7 s of design power; generators included"
+
 
 def _design(name: str, doc: str, source: str) -> Any:
     """Declare an ambient condition of the design point: the default day, and its range."""
@@ -27,10 +32,7 @@ class GasGeneratorParameters(Parameters):
     dT_isa: float = _design("dT_isa", "design ISA deviation", "Table 3")
     war: float = _design("war", "design humidity", "Table 4 (SNOx)")
     N: float = par(36050.0 * RPM, unit="rad/s", source="Table 3", doc="design rotor speed", lo=1)
-    W2: float = par(
-        3.1442, unit="kg/s", source="Table 4; Table 3's corrected flow contradicts it",
-        doc="design compressor inlet flow", lo=1e-3,
-    )  # fmt: skip
+    W2: float = par(3.1442, unit="kg/s", source=_W2, doc="design compressor inlet flow", lo=1e-3)
     PR_c: float = par(
         8.0, unit="1", source="Table 3", doc="compressor pressure ratio", lo=1.5, hi=60
     )
@@ -68,17 +70,11 @@ class GasGeneratorParameters(Parameters):
         1.9185, unit="1", source="kerosene; fits Table 4", doc="hydrogen per carbon", lo=0, hi=4
     )
     eta_cpr: float = par(
-        1.0, unit="1", source="Table 4, power closure", doc="power transfer to the compressor",
-        lo=0.5, hi=1,
-    )  # fmt: skip
+        1.0, unit="1", source=_POWER, doc="power transfer to the compressor", lo=0.5, hi=1
+    )
     P_acc: float = par(30e3, unit="W", source="Table 3", doc="accessory power", lo=0)
     gas_data: str = "nasa7"  # the data behind the paper's tables; "nasa9" for newer physics
     Ps3_P3: float = par(
-        0.95742, unit="1", source="Table 4, fixes the area at 3", doc="static over total pressure",
-        lo=0.6, hi=0.999,
-    )  # fmt: skip
-    J: float = par(
-        0.05, unit="kg m^2",
-        source="assumed: 356 kJ at design speed, 0.7 s of design power; generators included",
-        doc="inertia at the rotor", lo=1e-5,
-    )  # fmt: skip
+        0.95742, unit="1", source=_AREA_3, doc="static over total pressure", lo=0.6, hi=0.999
+    )
+    J: float = par(0.05, unit="kg m^2", source=_J, doc="inertia at the rotor", lo=1e-5)

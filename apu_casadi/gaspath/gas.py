@@ -73,9 +73,8 @@ def species(data: str) -> dict[str, tuple[float, np.ndarray]]:
 
 def _cp_over_R(a: Any, T: Any) -> Any:
     """cp/R of one NASA-9 range."""
-    return (
-        a[0] / T**2 + a[1] / T + a[2] + T * (a[3] + T * (a[4] + T * (a[5] + T * a[6])))
-    )  # fmt: skip
+    slope = a[3] + T * (a[4] + T * (a[5] + T * a[6]))
+    return a[0] / T**2 + a[1] / T + a[2] + T * slope
 
 
 def _h_over_R(a: Any, T: Any) -> Any:

@@ -89,12 +89,10 @@ def parts(c: ca.SX, data: str, compressor: MapTable, turbine: MapTable) -> UnitP
     ):
         k = GIVEN.index(f"{name}.a_W")
         made = object.__new__(ScaledMap)
-        made.__dict__.update(
-            table=table, W_des=W, PR_des=PR, eta_des=eta,
-            cal=of_symbols(MapCalibration, c[k : k + _N_CALIBRATION]),
-            design_logs=tuple(v[f"{name}.{n}"] for n in _LOGS),
-            **{n: v[f"{name}.{n}"] for n, _ in _PLACE},
-        )  # fmt: skip
+        made.__dict__.update(table=table, W_des=W, PR_des=PR, eta_des=eta)
+        made.__dict__.update({n: v[f"{name}.{n}"] for n, _ in _PLACE})
+        made.__dict__["cal"] = of_symbols(MapCalibration, c[k : k + _N_CALIBRATION])
+        made.__dict__["design_logs"] = tuple(v[f"{name}.{n}"] for n in _LOGS)
         scaled.append(made)
     return UnitParts(p, gas, design, *scaled)
 
@@ -135,11 +133,9 @@ def derivation(data: str, compressor: MapTable, turbine: MapTable) -> ca.Functio
     x = ca.SX.sym("x")
     coefficients, R = fuel_burning(x, data)
     fuel = ca.Function("fuel", [x], [ca.vertcat(ca.vec(coefficients.T), R)])
-    derived = ca.vertcat(
-        point[: 4 + len(TEMPERATURES)], *(rest[n] for n in _VALUES), *logs,
-        fuel(own[OWN.index("gas_generator.x_HC")]),
-    )  # fmt: skip
-    return ca.Function(
-        "derivation", [given], [derived, ca.norm_inf(eq.residual(w, own))],
-        ["given"], ["derived", "residual"],
-    )  # fmt: skip
+    burnt = fuel(own[OWN.index("gas_generator.x_HC")])
+    first = point[: 4 + len(TEMPERATURES)]
+    derived = ca.vertcat(first, *(rest[n] for n in _VALUES), *logs, burnt)
+    names = ["given"], ["derived", "residual"]
+    residual = ca.norm_inf(eq.residual(w, own))
+    return ca.Function("derivation", [given], [derived, residual], *names)

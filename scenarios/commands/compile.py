@@ -78,12 +78,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def gas_generator_functions() -> list[str]:
-    """Compile state update, output and their combination of the default engine."""
+    """Compile state update, output and their combination for engines of the default structure."""
     from apu_casadi.core.backend import compiled
     from apu_casadi.gaspath.gasgenerator import GasGenerator
 
-    gg = GasGenerator()
-    return [str(compiled(f).name()) for f in (gg.f, gg.g, gg.step)]
+    family = GasGenerator().family
+    return [str(compiled(f).name()) for f in (family.f, family.g, family.step)]
 
 
 def joint_functions() -> list[str]:

@@ -32,11 +32,9 @@ law.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -317,6 +315,10 @@ def off_function(table: MapTable) -> ca.Function:
     )
 
 
+def _bend(default: float, doc: str, lo: float, hi: float) -> Any:
+    return par(default, unit="1", source="identity", doc=doc, lo=lo, hi=hi)
+
+
 @dataclass(frozen=True)
 class MapCalibration(Parameters):
     """Numbers that bend a scaled map to documented points; all leave the design point in place.
@@ -325,54 +327,14 @@ class MapCalibration(Parameters):
     design point.  RNI is the Reynolds number index, 1 at the design point.
     """
 
-    a_W: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="flow is multiplied by n**a_W",
-        lo=-5.0,
-        hi=5.0,
+    a_W: float = _bend(0.0, "flow is multiplied by n**a_W", -5, 5)
+    n_Re: float = _bend(0.0, "loss 1 - eta is multiplied by RNI**(-n_Re)", 0, 1)
+    c_PR: float = _bend(0.0, "eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)", 0, 200)
+    c_N: float = _bend(0.0, "eta is multiplied by exp(-c_N (n - 1)**2)", 0, 1000)
+    k_SM: float = _bend(
+        1.0, "PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)", 0.2, 5
     )
-    n_Re: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="loss 1 - eta is multiplied by RNI**(-n_Re)",
-        lo=0.0,
-        hi=1.0,
-    )
-    c_PR: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)",
-        lo=0.0,
-        hi=200.0,
-    )
-    c_N: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="eta is multiplied by exp(-c_N (n - 1)**2)",
-        lo=0.0,
-        hi=1000.0,
-    )
-    k_SM: float = par(
-        1.0,
-        unit="1",
-        source="identity",
-        doc="PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)",
-        lo=0.2,
-        hi=5.0,
-    )
-    a_SM: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)",
-        lo=-0.9,
-        hi=0.9,
-    )
+    a_SM: float = _bend(0.0, "PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)", -0.9, 0.9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -434,34 +396,13 @@ class ScaledMap(Parametric):
     @derived
     def function(self) -> ca.Function:
         """(n, beta, RNI) -> W, PR, eta, for a compressor SM, and off."""
-        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
-        out = self._bent(n, beta, RNI, self.cal)
-        names = ["n", "beta", "RNI"]
-        return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
-
-    @derived
-    def calibrated(self) -> ca.Function:
-        """As ``function`` with the numbers of the calibration as fourth argument.
-
-        (n, beta, RNI, cal) with cal of shape (6,) in the order of :class:`MapCalibration`'s fields,
-        for derivatives by them.
-        """
-        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
-        fields = [f.name for f in dataclasses.fields(MapCalibration)]
-        cal = ca.MX.sym("cal", len(fields))
-        numbers = SimpleNamespace(**dict(zip(fields, ca.vertsplit(cal), strict=True)))
-        out = self._bent(n, beta, RNI, numbers)
-        args, names = [n, beta, RNI, cal], ["n", "beta", "RNI", "cal"]
-        return ca.Function("calibrated_map", args, list(out.values()), names, list(out))
-
-    def _bent(self, n: ca.MX, beta: ca.MX, RNI: ca.MX, cal: Any) -> dict[str, ca.MX]:
-        """Return the outputs by name, with the numbers of ``cal`` floats or symbols."""
-        t = self.table
+        n, beta, RNI, t = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI"), self.table
         N_held, y = table_logs(t)(self.N_map_des * n, beta)
         surge = surge_function(t) if t.kind == "compressor" else None
-        out = self._scaled(N_held, ca.vertsplit(y), RNI, cal, surge)
+        out = self._scaled(N_held, ca.vertsplit(y), RNI, surge)
         out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
-        return {k: out[k] for k in MapPoint._fields if k in out}
+        names = ["n", "beta", "RNI"]
+        return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
 
     @derived
     def design_logs(self) -> tuple[float, float, float]:
@@ -471,13 +412,13 @@ class ScaledMap(Parametric):
         return W, PR, eta
 
     def _scaled(
-        self, N_held: Any, y: list[Any], RNI: Any, cal: Any, surge: Callable[[Any], Any] | None
+        self, N_held: Any, y: list[Any], RNI: Any, surge: Callable[[Any], Any] | None
     ) -> dict[str, Any]:
         """Scale and bend what the table says: W, PR, eta, and SM if there is a surge line.
 
         ``surge`` gives the unscaled line's pressure ratio by the unscaled flow.
         """
-        des = self.design_logs
+        des, cal = self.design_logs, self.cal
         held = per(N_held, self.N_map_des)  # > 0, so that powers of it exist
         # powers are written as exponentials, which are cheaper when differentiated
         W = self.W_des * ca.exp(y[0] - des[0] + cal.a_W * ca.log(held))
@@ -514,7 +455,7 @@ class ScaledMap(Parametric):
         t = self.table
         N_held, y = surface_logs(t, self.N_map_des * n, beta, cell)
         line = None if surge is None else lambda W: surge_PR(t, W, surge)
-        out = self._scaled(N_held, y, RNI, self.cal, line)
+        out = self._scaled(N_held, y, RNI, line)
         off = off_function(t)(self.N_map_des * n, beta)[0]
         return MapPoint(out["W"], out["PR"], out["eta"], out.get("SM"), off), self._table_flow(
             out["W"]

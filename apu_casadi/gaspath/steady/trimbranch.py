@@ -122,9 +122,14 @@ class _March:
     """Search in one direction of speed, or T4: where has the open quantity its value again?"""
 
     def __init__(
-        self, solver: Solver, limits: Limits, w: np.ndarray, p: np.ndarray, direction: float,
+        self,
+        solver: Solver,
+        limits: Limits,
+        w: np.ndarray,
+        p: np.ndarray,
+        direction: float,
         compile: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.solver, self.limits, self.w0, self.p, self.compile = solver, limits, w, p, compile
         spec = solver.kernel.spec
         if "N" in spec:

@@ -318,18 +318,22 @@ class TrimKernel(Rebuilt):
         """The specification as an identifier."""
         return "_".join("law" if n == LAW else n for n in self.spec)
 
-    def sought(self, w: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Return s from w = (z, N, Wf, PW), by columns, for an engine's numbers c."""
-        nominal = np.asarray(self._nominal(ca.DM(c))).ravel()
+    def nominal(self, c: np.ndarray) -> np.ndarray:
+        """Return the magnitudes of w = (z, N, Wf, PW) for an engine's numbers c, shape (14,)."""
+        return np.asarray(self._nominal(ca.DM(c))).ravel()
+
+    def sought(self, w: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+        """Return s from w, by columns, with the magnitudes of an engine."""
         s = (w.T / nominal).T
         s[self.log] = np.log(s[self.log])
         return s[self.free]
 
     def design_start(self, c: np.ndarray) -> np.ndarray:
         """Return s at the design point of an engine with the numbers c, shape (n,)."""
-        w = np.asarray(self._nominal(ca.DM(c))).ravel()
+        nominal = self.nominal(c)
+        w = nominal.copy()
         w[NZ - 2 : NZ] = [c[NUMBERS.index(f"{m}.beta_des")] for m in MAPS]
-        return self.sought(w, c)
+        return self.sought(w, nominal)
 
 
 def _fuel_of(PW: Any, unit: UnitParts, delta: Any) -> Any:

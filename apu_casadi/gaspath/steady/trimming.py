@@ -138,10 +138,8 @@ def _point(
     gg: GasGenerator, w: np.ndarray, y: np.ndarray, p: np.ndarray, residual: float, total: int
 ) -> OperatingPoint:
     u = np.concatenate([w[NZ + 1 :], p[: len(AMBIENT)]])
-    theta = p[len(AMBIENT) : N_FIRST].copy()
-    return OperatingPoint(
-        w[NZ : NZ + 1], w[:NZ], u, theta, y, gg.Y.unpack(y), residual, total
-    )  # fmt: skip
+    x, z, theta = w[NZ : NZ + 1], w[:NZ], p[len(AMBIENT) : N_FIRST].copy()
+    return OperatingPoint(x, z, u, theta, y, gg.Y.unpack(y), residual, total)
 
 
 def _refuse(

@@ -90,7 +90,7 @@ class Solver(Rebuilt):
     def __init__(self, gg: GasGenerator, spec: tuple[str, str]) -> None:
         """Take the code that all engines of this structure share."""
         self.gg, self.code = gg, code_of(gg.family.cycle, spec)
-        self.kernel = self.code.kernel
+        self.kernel, self.nominal = self.code.kernel, self.code.kernel.nominal(gg.numbers)
         self.regular: bool | None = None
 
     def one(self, which: str, *args: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -106,7 +106,7 @@ class Solver(Rebuilt):
 
     def sought(self, w: np.ndarray) -> np.ndarray:
         """Return the unknowns as sought from w = (z, N, Wf, PW), by columns."""
-        return self.kernel.sought(w, self.gg.numbers)
+        return self.kernel.sought(w, self.nominal)
 
     def jacobian(self, s: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Return the Jacobian of the equations by the unknowns as sought."""
@@ -207,9 +207,13 @@ def explained(gg: GasGenerator, limits: Limits, y: np.ndarray) -> np.ndarray:
 
 
 def continue_many(
-    solver: Solver, p: np.ndarray, *, floor: float, n_threads: int | None,
+    solver: Solver,
+    p: np.ndarray,
+    *,
+    floor: float,
+    n_threads: int | None,
     state: tuple[np.ndarray, ...] | None = None,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
+) -> tuple[np.ndarray, ...]:
     """As :func:`continue_one` for columns; returns w, y, r, s, t, dt."""
     origin, s0 = origin_of(solver)
     M, o = p.shape[1], origin[:, None]
