@@ -53,6 +53,10 @@ __all__ = [
 ]
 
 
+def _itself(value: Any) -> Any:
+    return value
+
+
 @dataclass(frozen=True)
 class Sensor:
     """One sensor.
@@ -112,10 +116,14 @@ class Sensor:
         nominal = next((Y[n].nominal for n in self.reads if Y[n].unit == self.unit), 1.0)
         return Signal(self.name, self.unit, f"reading of {', '.join(self.reads)}", nominal=nominal)
 
+    @property
+    def expression(self) -> Callable[..., Any]:
+        """What it reads of the values of ``reads``, its lag left out."""
+        return _itself if self.value is None else self.value
+
     def of(self, y: Mapping[str, Any]) -> Any:
         """Return what it reads of outputs by name, its lag left out: numbers or expressions."""
-        values = [y[n] for n in self.reads]
-        return values[0] if self.value is None else self.value(*values)
+        return self.expression(*(y[n] for n in self.reads))
 
     def sigma(self, reading: Any) -> Any:
         """Return the standard deviation of the noise at a reading, in its unit."""
