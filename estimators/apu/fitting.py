@@ -29,7 +29,8 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.control import GovernorParameters, governor
 from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
-from estimators.batch.fit import FitProblem, FitResult
+from estimators.batch.fit import FitProblem
+from estimators.batch.fitresult import FitResult
 from estimators.information.consistency import coverage as shares_covered
 from estimators.models.filtermodel import (
     FilterModel,

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from estimators.apu.fitting import EngineData, EngineFit
     from estimators.apu.recordings.recorded import Reading, Table
     from estimators.apu.sensors import SensorSet
-    from estimators.batch.fit import Profile
+    from estimators.batch.fitresult import Profile
 
 NAME = "fit"
 HELP = "fit health factors to recorded data (CSV, Parquet, netCDF)"

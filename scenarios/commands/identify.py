@@ -23,7 +23,8 @@ from scenarios.shell import jsontext, progress, usage
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from estimators.apu.identify import Severity, Trials
+    from estimators.apu.identify import Trials
+    from estimators.apu.severity import Severity
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
@@ -63,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.core import files
     from apu_casadi.core.errors import ParameterError
     from estimators.apu import identify as study
+    from estimators.apu.severity import severity_study
     from estimators.information.identifiability import compare_sensors, which_to_add
 
     usage.count("--trials", args.trials, least=0)
@@ -96,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         )
         for label in study.AIMS
     }
-    electrical = study.severity_study()
+    electrical = severity_study()
     trials = {}
     if args.trials:
         progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)

@@ -199,10 +199,10 @@ def _leaky(n: int, seed0: int, tell: Tell) -> Any:
 
 
 def _ridge(n: int, seed0: int, tell: Tell) -> Any:
-    from estimators.apu import identify
+    from estimators.apu import severity
 
     rows = []
-    for s in identify.severity_study():
+    for s in severity.severity_study():
         row = dataclasses.asdict(s)
         row["fault"] = {"mu": s.fault.mu, "k_rf": s.fault.k_rf, "kappa": s.fault._kappa}
         rows.append(row)
