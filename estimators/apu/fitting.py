@@ -147,7 +147,7 @@ def _level(t: np.ndarray, v: np.ndarray, steady: bool) -> np.ndarray:
     there = np.isfinite(v)
     full = np.interp(t, t[there], v[there])
     if steady or t.size < 3:
-        return full
+        return np.asarray(full)
     half = max(1, round(SMOOTH / 2 / float(np.median(np.diff(t)))))
     sums = np.concatenate([[0.0], np.cumsum(full)])
     k = np.arange(t.size)
@@ -182,7 +182,7 @@ def to_recording(
         )
 
     def sigma(name: str, v: np.ndarray) -> np.ndarray:
-        return np.array([sensors.sigma(name, r) for r in _level(t, v, steady)]) / root
+        return np.asarray(sensors.sigma(name, _level(t, v, steady)) / root * np.ones(v.size))
 
     outputs, noise = {}, {}
     for name in lifted.model.y.names:

@@ -200,6 +200,10 @@ class SensorSet:
             out.append(new)
         return SensorSet(tuple(out))
 
+    def including(self, *names: str) -> SensorSet:
+        """Return the set with those of :data:`KNOWN` that are named and not in it."""
+        return self.add(*(n for n in names if n in KNOWN and n not in self))
+
     def only(self, names: Sequence[str]) -> SensorSet:
         """Return the set of some of the sensors, in the order of the names.
 

@@ -100,8 +100,8 @@ class FitProblem(Rebuilt):
         self.model = m = self.lifted.model
         names = [*estimate, *consider, *own]
         for n in names:
-            if n not in m.p:
-                state = " (it is a state of this model)" if n in m.x else ""
+            if n not in m.p.names:
+                state = " (it is a state of this model)" if n in m.x.names else ""
                 raise ParameterError(f"{m.name}: no parameter {n!r}{state} {nearest(n, m.p.names)}")
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
@@ -162,10 +162,10 @@ class FitProblem(Rebuilt):
         """Guess of the states: as given, else what was measured under the same name, else known."""
         model, out = self.model, np.empty((len(self.model.x), data.size))
         for n in given:
-            if n not in model.x:
+            if n not in model.x.names:
                 raise ParameterError(f"guess of state {n!r} {nearest(n, model.x.names)}")
         for i, s in enumerate(model.x):
-            row = data.y[model.y.index(s.name)] if s.name in model.y else np.full(1, np.nan)
+            row = data.y[model.y.index(s.name)] if s.name in model.y.names else np.full(1, np.nan)
             there = ~np.isnan(row)
             if s.name in given:
                 out[i] = given[s.name]
@@ -557,7 +557,7 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
         bound = float((run.upper if sign > 0 else run.lower)[i] * scale)
         step = target * sigma if sigma is not None else 0.01 * scale
         a, ra, near = at, 0.0, best
-        b = at + sign * step
+        b: float = at + sign * step
         for _ in range(points):
             b = min(b, bound) if sign > 0 else max(b, bound)
             rb, near = root_drop(b, near)
@@ -574,14 +574,14 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
             # bracketed by a and b: false position, damped towards the middle
             lo, hi, rl, rh = a, b, ra, rb
             for _ in range(points):
-                x = lo + (target - rl) / (rh - rl) * (hi - lo)
+                x: float = lo + (target - rl) / (rh - rl) * (hi - lo)
                 x = min(max(x, min(lo, hi) + 0.05 * abs(hi - lo)),
                         max(lo, hi) - 0.05 * abs(hi - lo))  # fmt: skip
                 r, near = root_drop(x, near)
                 if abs(r - target) <= 1e-3 * target or abs(hi - lo) <= 1e-9 * scale:
                     return x
                 lo, hi, rl, rh = (x, hi, r, rh) if r < target else (lo, x, rl, r)
-            return lo + (target - rl) / (rh - rl) * (hi - lo)
+            return float(lo + (target - rl) / (rh - rl) * (hi - lo))
         return sign * math.inf
 
     lower, upper = end(-1.0), end(1.0)

@@ -96,7 +96,7 @@ class FitResult:
     def correlation(self) -> np.ndarray:
         """Correlations of the estimates, shape (n, n); NaN where undetermined."""
         s = np.where(np.isfinite(self.sigma), self.sigma, np.nan)
-        return self.covariance / np.outer(s, s)
+        return np.asarray(self.covariance / np.outer(s, s))
 
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval of one parameter, from its standard error."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -123,7 +123,9 @@ class Transcription(Rebuilt):
         self.sizes, self.shared, self.own = tuple(sizes), tuple(shared), tuple(own)
         self.prior = prior and not lifted.steady
         self.kernel = kernel(lifted, (*self.shared, *self.own))
-        self._compile = lambda f: compiled(f, backend=backend, build=build)
+        self._compile: Callable[[ca.Function], ca.Function] = lambda f: compiled(
+            f, backend=backend, build=build
+        )
         nx, ns, nw, nq, nt = self.kernel.sizes
         R, K = len(self.sizes), sum(self.sizes)
         self.n_theta = len(self.shared) + R * len(self.own)

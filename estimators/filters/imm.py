@@ -201,7 +201,7 @@ class ImmResult:
     @property
     def probability(self) -> np.ndarray:
         """Probabilities of the modes after each sample, (M, K)."""
-        return np.exp(self.log_probability)
+        return np.asarray(np.exp(self.log_probability))
 
     @property
     def best(self) -> np.ndarray:

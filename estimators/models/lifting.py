@@ -311,7 +311,7 @@ def _sorted(
 ) -> tuple[Any, Any, Any]:
     """Outputs, next state and held rows of a changed model, called with a stage's arguments."""
     x, _, u, p, w, dt = given
-    X = ca.vertcat(*(x[model.x.index(n)] if n in model.x else 0 for n in big.x.names))
+    X = ca.vertcat(*(x[model.x.index(n)] if n in model.x.names else 0 for n in big.x.names))
     P = ca.vertcat(
         ca.MX(0, 1), *(known[n] if n in known else p[model.p.index(n)] for n in big.p.names)
     )
@@ -323,7 +323,8 @@ def _sorted(
 
 def _start(ss: StateSpace, model: FilterModel, steady: bool) -> ca.Function:
     x, u, p, _, _ = model.symbols()
-    theta = [x[model.x.index(n)] if n in model.x else p[model.p.index(n)] for n in ss.theta.names]
+    own = model.x.names
+    theta = [x[model.x.index(n)] if n in own else p[model.p.index(n)] for n in ss.theta.names]
     at = x[: len(ss.x)]
     z = ss.z_of(at, u[model.u.indices(ss.u.names)], ca.vertcat(ca.MX(0, 1), *theta))
     return ca.Function(f"{ss.name}_start", [x, u, p], [z if steady else ca.vertcat(z, at, z)])

@@ -234,22 +234,22 @@ def _pairs(items: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 def _sensors(items: Sequence[str]) -> SensorSet:
     """The table of sensors, changed and extended by ``--sigma``."""
-    import dataclasses
+    from dataclasses import replace
 
     import numpy as np
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.recordings.recorded import UNITS, convert
-    from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
+    from estimators.apu.sensors import KNOWN, Sensor, SensorSet, gas_path_table
 
-    known = {s.name: s for s in GAS_PATH.sensors}
+    known = {s.name: s for s in gas_path_table().sensors}
     for item in items:
         name, value = _split(item, "--sigma", "NAME=VALUE")
-        if name not in GasGenerator.Y:
+        if name not in GasGenerator.Y and name not in KNOWN:
             raise ParameterError(
                 f"--sigma {item!r}: unknown output {nearest(name, GasGenerator.Y.names)}"
             )
-        unit = GasGenerator.Y[name].unit
+        unit = KNOWN[name].unit if name in KNOWN else GasGenerator.Y[name].unit
         # the longest ending that is a unit: 3K, 1.5 kPa, 0.5%, 3 K
         ending = next(
             (u for u in sorted(UNITS, key=len, reverse=True)
@@ -269,20 +269,22 @@ def _sensors(items: Sequence[str]) -> SensorSet:
             )
         if not number > 0:
             raise ParameterError(f"--sigma {item!r}: a standard deviation must be > 0")
+        new = Sensor(name, number, relative, 0.0, unit, "given by the user")
         if name in known:
-            known[name] = dataclasses.replace(
-                known[name], noise=number, relative=relative, source="changed by the user"
-            )
-        else:
-            known[name] = Sensor(name, number, relative, 0.0, unit, "given by the user")
+            old = replace(known[name], source="changed by the user")
+            new = replace(old, noise=number, relative=relative)
+        elif name in KNOWN:
+            new = replace(KNOWN[name], noise=number, relative=relative, gain=0.0, source=new.source)
+        known[name] = new
     return SensorSet(tuple(known.values()))
 
 
 def _known_targets(mapping: Mapping[str, Any]) -> None:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.fitting import AMBIENT
+    from estimators.apu.sensors import KNOWN
 
-    valid = [*GasGenerator.Y.names, *AMBIENT, "time"]
+    valid = list(dict.fromkeys([*GasGenerator.Y.names, *KNOWN, *AMBIENT, "time"]))
     for name in mapping:
         if name not in valid:
             raise DataError(f"--column {name}=...: unknown quantity {nearest(name, valid)}")
@@ -300,8 +302,8 @@ def _data(
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.fitting import AMBIENT, INPUTS, EngineData
 
-    Y, U = GasGenerator.Y, GasGenerator.U
-    readings = {s: table.get(s, Y[s].unit) for s in sensors.names if s in table}
+    U = GasGenerator.U
+    readings = {s.name: table.get(s.name, s.unit) for s in sensors.sensors if s.name in table}
     measured = [n for n in readings if n not in INPUTS]
     if not measured:
         raise DataError(

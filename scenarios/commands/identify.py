@@ -77,9 +77,9 @@ def run(args: argparse.Namespace) -> int:
         )
     sensors = study.BASE if args.sensors is None else _names(args.sensors)
     options = {"prior": args.prior / 100, "samples": args.samples}
-    g = study.gas_path(
-        args.point, eta_bias=args.eta_bias / 100, gain_errors=args.gain_errors, **options
-    )
+    table = study.CANDIDATES.including(*sensors)
+    biased = {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors}
+    g = study.gas_path(args.point, sensors=table, **biased, **options)
     more = [s for s in g.sensors if s not in sensors]
     sets = {"these": list(sensors), **{f"+ {s}": [*sensors, s] for s in more}}
     comparison = compare_sensors(g, sets)
@@ -427,9 +427,10 @@ def _electrical(rows: list[Severity]) -> list[str]:
 
 def _figure(point: str, samples: int) -> Any:
     from estimators.apu import identify as study
+    from estimators.apu.sensors import GAS_PATH
     from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 
-    noise = study.GAS_PATH["PW"].noise
+    noise = GAS_PATH["PW"].noise
     priors = list(study.PRIORS)
     curves = {}
     for label, variant in study.VARIANTS.items():
