@@ -11,7 +11,6 @@ import json
 import math
 import os
 from collections.abc import Callable
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,8 +121,9 @@ def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
 
     if path is None:
         return GasGenerator()
-    made: GasGenerator = import_module("apu_casadi.gaspath.engines").read_engine(path)
-    return made
+    from apu_casadi.gaspath.engines import read_engine
+
+    return read_engine(Path(path))
 
 
 @last(4)

@@ -9,6 +9,7 @@ import pytest
 
 from apu_casadi.core import results
 from apu_casadi.core.errors import ScenarioError
+from apu_casadi.gaspath.engines import read_engine, write_engine
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.fault import FAULTS
@@ -210,19 +211,12 @@ def test_names_of_files_are_checked():
 
 @pytest.fixture
 def other_engine(tmp_path, monkeypatch):
-    """A file that stands for an engine with a worse compressor."""
+    """An engine with a worse compressor, in a file."""
     path = tmp_path / "engine.toml"
-    path.write_text("eta_c = 0.8\n")
     poor = GasGenerator().parameters.change(eta_c=0.80)
-    made = dataclasses.replace(GasGenerator(), parameters=poor)
-
-    def read(where):
-        assert where is None or str(where).endswith("engine.toml")
-        return GasGenerator() if where is None else made
-
-    monkeypatch.setattr(registry, "engine_of", read)
+    write_engine(dataclasses.replace(GasGenerator(), parameters=poor), path)
     monkeypatch.chdir(tmp_path)
-    return path, made
+    return path, read_engine(path)
 
 
 def test_every_command_takes_another_engine(other_engine, capsys):
@@ -252,7 +246,7 @@ def test_a_scenario_names_its_engine(other_engine, monkeypatch):
     assert registry.unit_for(s).gas_generator == made
     assert registry.unit_for(s.change(engine=None)).gas_generator == GasGenerator()
     key = campaigns._task(s, "propagator", None).key
-    path.write_text("eta_c = 0.7\n")
+    path.write_text(path.read_text() + "\n")
     assert campaigns._task(s, "propagator", None).key != key
     path.unlink()
     with pytest.raises(

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.identify import Severity, Trials
+    from estimators.apu.identify import Trials
+    from estimators.apu.severity import Severity
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
@@ -90,6 +91,7 @@ def _sets(
     from estimators.information.identifiability import compare_sensors, which_to_add
 
     how: dict[str, Any] = {"prior": args.prior / 100, "samples": args.samples}
+    how["sensors"] = study.CANDIDATES.including(*sensors)
     how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors, **_engine(args)}
     g = study.gas_path(args.point, **how)
     more = [s for s in g.sensors if s not in sensors]
@@ -129,6 +131,7 @@ class Found:
 
 def _found(args: argparse.Namespace) -> Found:
     from estimators.apu import identify as study
+    from estimators.apu.severity import severity_study
     from estimators.information.identifiability import identify
 
     first, prior = given.names(args.point)[0], args.prior / 100
@@ -157,7 +160,7 @@ def _found(args: argparse.Namespace) -> Found:
         study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
         study.limiting_noises(first, **how),
         aims,
-        study.severity_study(),
+        severity_study(),
         trials,
         ramp,
     )
@@ -412,9 +415,10 @@ def _electrical(rows: list[Severity]) -> list[str]:
 
 def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
     from estimators.apu import identify as study
+    from estimators.apu.sensors import GAS_PATH
     from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 
-    noise = study.GAS_PATH["PW"].noise
+    noise = GAS_PATH["PW"].noise
     priors = list(study.PRIORS)
     curves = {}
     keys = ("reduction", "null_before", "null_after")
