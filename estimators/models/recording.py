@@ -239,7 +239,7 @@ def record(
         ("input", inputs or {}, model.u),
     ):  # fmt: skip
         for name in names:
-            if name not in known:
+            if name not in known.names:
                 raise DataError(f"unknown {what} {name!r} {nearest(name, known.names)}")
     if not outputs:
         raise DataError("no output is measured")

@@ -23,6 +23,7 @@ from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
+from estimators.apu.sensors import gas_path_table
 from scenarios import registry
 from scenarios.schema import Scenario
 
@@ -97,10 +98,11 @@ def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
     case = joint_case(seed)
     s = json.loads(ds.attrs["scenario"])
     unit = registry.unit_for(Scenario.from_dict(s))
+    options.setdefault("gas_sensors", gas_path_table())
+    gas, electrical = case.gas_gains, case.electrical_gains
     found = estimate_joint(
-        ds, seed, apu=unit, gas_gains=case.gas_gains, electrical_gains=case.electrical_gains,
-        **options,
-    )  # fmt: skip
+        ds, seed, apu=unit, gas_gains=gas, electrical_gains=electrical, **options
+    )
     found.attrs |= {
         "scenario": ds.attrs["scenario"], "phases": ds.attrs["phases"], "seed": seed,
         "gas_gains": json.dumps(case.gas_gains),

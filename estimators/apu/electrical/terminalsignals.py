@@ -42,7 +42,7 @@ JUMP_SIZES = Signals(
 )  # fmt: skip
 PREDICTED = Signals(
     [Signal(f"{n}_smooth", s.unit, f"{n} as samples before predict it", nominal=s.nominal)
-     for n, s in ((n, INPUTS[n] if n in INPUTS else OUTPUTS[n]) for n in GAIN_SENSORS)]
+     for n, s in ((n, INPUTS[n] if n in INPUTS.names else OUTPUTS[n]) for n in GAIN_SENSORS)]
     + [Signal(f"{n}_{when}_smooth", "V", f"the same, {text}", nominal=300.0)
        for when, text in (("mid", "midway to the next sample"), ("next", "of the next sample"))
        for n in VOLTAGES]

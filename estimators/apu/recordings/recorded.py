@@ -32,7 +32,7 @@ __all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_map
 
 
 def _known(name: str) -> bool:
-    known = name in PLAUSIBLE or name in KNOWN or name in GasGenerator.Y
+    known = name in PLAUSIBLE or name in KNOWN or name in GasGenerator.Y.names
     return known or is_time_name(name)
 
 

@@ -169,7 +169,7 @@ def _plain(a: np.ndarray, what: str, tell: Tell) -> np.ndarray:
                      "the first")  # fmt: skip
                 # two steps, so that no digit of the nanoseconds is lost
                 start = a[np.isfinite(v)][0]
-                return (a - start).astype(float) / scale
+                return np.asarray((a - start).astype(float) / scale)
         if there.max() > _YEARS[1]:
             raise DataError(
                 f"{what}: unit missing? {there.max():.6g} s are {there.max() / 3.156e7:.3g} years: "
