@@ -202,8 +202,10 @@ def to_recording(
         wide = np.full(t.size, OPEN * design)
         if there.any():
             inputs[name] = (t, np.interp(t, t[there], v[there]))
-            inputs[f"sigma_{name}"] = (t, np.where(there, np.maximum(sigma(name, v), 1e-9 * design),
-                                                   wide))  # fmt: skip
+            inputs[f"sigma_{name}"] = (
+                t,
+                np.where(there, np.maximum(sigma(name, v), 1e-9 * design), wide),
+            )
         else:
             inputs[name], inputs[f"sigma_{name}"] = (t, np.full(t.size, design)), (t, wide)
     for name, value in data.ambient.items():
@@ -376,7 +378,7 @@ def steady_truth(gg: GasGenerator, theta: np.ndarray) -> EngineData:
             gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, theta, strict=True))
         )
         for PW in POWERS
-    ]  # fmt: skip
+    ]
     readings = {n: np.array([p[n] for p in points]) for n in (*OUTPUTS, *INPUTS)}
     return EngineData("steady", np.arange(len(points), dtype=float), readings, dict(DEFAULT_DAY))
 
@@ -391,7 +393,7 @@ def transient_truth(
     ss, par = gg.state_space, GovernorParameters()
     start = trim_gas_generator(
         gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True))
-    )  # fmt: skip
+    )
     run = stepper(ss, 1, rtol=1e-9, atol=1e-11)
     x, Wf_I = start.x.copy(), float(start["Wf"])
     t, rows = np.arange(K) * dt, []
@@ -464,9 +466,12 @@ def coverage(
     truth = [(steady_truth if steady else transient_truth)(gg, th) for th in healths]
     averaged = READINGS if steady else 1
     problem = FitProblem(
-        lifted, [truth[0].t.size], HEALTH, consider=tuple(considered),
+        lifted,
+        [truth[0].t.size],
+        HEALTH,
+        consider=tuple(considered),
         build=(not steady) if build is None else build,
-    )  # fmt: skip
+    )
     error, sigma = np.full((n, 4), np.nan), np.full((n, 4), np.nan)
     chi2, freedom, failed = [], 0, 0
     for i in range(n):

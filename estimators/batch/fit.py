@@ -82,6 +82,16 @@ class FitProblem(Rebuilt):
         ParameterError: unknown or doubled names, nothing to estimate.
     """
 
+    lifted: Lifted
+    model: FilterModel
+    estimate: tuple[str, ...]
+    own: tuple[str, ...]
+    consider: tuple[str, ...]
+    program: Transcription
+    free: list[int]
+    held: list[int]
+    names: tuple[str, ...]
+
     @building
     def __init__(
         self,
@@ -575,8 +585,9 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
             lo, hi, rl, rh = a, b, ra, rb
             for _ in range(points):
                 x: float = lo + (target - rl) / (rh - rl) * (hi - lo)
-                x = min(max(x, min(lo, hi) + 0.05 * abs(hi - lo)),
-                        max(lo, hi) - 0.05 * abs(hi - lo))  # fmt: skip
+                x = min(
+                    max(x, min(lo, hi) + 0.05 * abs(hi - lo)), max(lo, hi) - 0.05 * abs(hi - lo)
+                )
                 r, near = root_drop(x, near)
                 if abs(r - target) <= 1e-3 * target or abs(hi - lo) <= 1e-9 * scale:
                     return x

@@ -269,10 +269,8 @@ def _block(
     x = [m.x for m in models]
     n = [len(s) for s in x]
     _, nu, np_, _, ny = models[0].sizes
-    shapes = {
-        "logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2, "u": nu,
-        "y": ny, "R": ny, "dt": 1, "p": np_,
-    }  # fmt: skip
+    shapes = {"logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2}
+    shapes |= {"u": nu, "y": ny, "R": ny, "dt": 1, "p": np_}
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
     mixer = root_mixer if roots else plain_mixer
     logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])

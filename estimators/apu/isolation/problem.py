@@ -64,8 +64,10 @@ class Hypothesis:
         """Mean and variance of a normal distribution of sizes that covers the ranges."""
         mean = [float(np.mean(r)) for r in self.ranges]
         # sqrt(3) wider than the uniform one: the filter's start, divided out again afterwards
-        var = [3 * float(np.mean([(a * a + a * b + b * b) / 3 for a, b in r])) - 3 * m * m
-               for r, m in zip(self.ranges, mean, strict=True)]  # fmt: skip
+        var = [
+            3 * float(np.mean([(a * a + a * b + b * b) / 3 for a, b in r])) - 3 * m * m
+            for r, m in zip(self.ranges, mean, strict=True)
+        ]
         return np.array(mean), np.array(var)
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
