@@ -214,13 +214,7 @@ def to_recording(
             raise DataError(f"{data.name}: {name} has gaps; ambient conditions are needed always")
         inputs[name] = float(a) if a.ndim == 0 else (t, a)
     p = dict.fromkeys(lifted.model.p.names, 0.0) | dict.fromkeys(HEALTH, 1.0)
-    return record(
-        lifted.model,
-        outputs=outputs,
-        sigma=noise,
-        inputs=inputs,
-        p=p,
-    )
+    return record(lifted.model, outputs=outputs, sigma=noise, inputs=inputs, p=p)
 
 
 def _read(lifted: Lifted, r: Recording, name: str) -> np.ndarray:
@@ -344,11 +338,7 @@ def fit_engine(
         p[i] = list(values.values())
         recordings[k] = dataclasses.replace(r, p=p)
     problem = FitProblem(
-        lifted,
-        [r.size for r in recordings],
-        estimate,
-        own=own,
-        consider=tuple(consider or ()),
+        lifted, [r.size for r in recordings], estimate, own=own, consider=tuple(consider or ())
     )
     result = problem.solve(recordings, prior=prior, bounds=bounds, consider=consider)
     # an input left open is an unknown without a reading

@@ -363,10 +363,7 @@ def snapshot_sweep(
     """
     chosen = VARIANTS if variants is None else variants
     return [
-        {
-            "variant": label,
-            **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options),
-        }
+        {"variant": label, **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options)}
         for label, options in chosen.items()
         for noise in power_noises
         for prior in priors

@@ -39,11 +39,7 @@ from estimators.models.filtermodel import FilterModel
 from estimators.models.lifting import Lifted, plain
 from estimators.models.recording import Recording
 
-__all__ = [
-    "FitProblem",
-    "fit",
-    "profile",
-]
+__all__ = ["FitProblem", "fit", "profile"]
 
 #: Eigenvalue of the information, parameters scaled to unit information each, below which a
 #: direction counts as undetermined; and below which it is reported as hardly determined.

@@ -321,10 +321,4 @@ def glr_threshold(
         fit(crossings.sum(0) - crossings[i], size * (parts - 1) / parts)[0] for i in range(parts)
     ]
     sigma = math.sqrt((parts - 1) / parts * float(np.sum((np.array(left) - np.mean(left)) ** 2)))
-    return {
-        "threshold": threshold,
-        "sigma": sigma,
-        "A": math.exp(a),
-        "B": B,
-        "largest": largest,
-    }
+    return {"threshold": threshold, "sigma": sigma, "A": math.exp(a), "B": B, "largest": largest}

@@ -288,11 +288,7 @@ def _block(
     ll = ca.vertcat(*(o[7][2] for o in outs))
     check = ca.vertcat(*(o[7][0] for o in outs))
     new, total, mean, var = _weigher(x, common)(logs, ll, m_f, P_f)
-    carried = [
-        new,
-        ca.vertcat(*(o[0] for o in outs)),
-        ca.vertcat(*(ca.vec(o[1]) for o in outs)),
-    ]
+    carried = [new, ca.vertcat(*(o[0] for o in outs)), ca.vertcat(*(ca.vec(o[1]) for o in outs))]
     S = ca.vertcat(*(ca.diag(o[6]) for o in outs))
     kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check), S]
     name = "imm_roots" if roots else "imm"

@@ -482,9 +482,7 @@ class SensorComparison:
 
 
 def compare_sensors(
-    sensitivities: Sensitivities,
-    sets: Mapping[str, Sequence[str]],
-    **options: float,
+    sensitivities: Sensitivities, sets: Mapping[str, Sequence[str]], **options: float
 ) -> SensorComparison:
     """Tell what several sets of sensors can know.
 

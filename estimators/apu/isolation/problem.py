@@ -14,15 +14,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit.apu import Apu
 from estimators.apu.sensors import GAS_PATH, SensorSet
 
-__all__ = [
-    "CLASSES",
-    "DEFAULT",
-    "FAULTS",
-    "SNAPSHOT",
-    "Hypothesis",
-    "Protocol",
-    "severity_of_loss",
-]
+__all__ = ["CLASSES", "DEFAULT", "FAULTS", "SNAPSHOT", "Hypothesis", "Protocol", "severity_of_loss"]
 
 DT = 0.02  # s
 HEALTH = GasGenerator.THETA.names
