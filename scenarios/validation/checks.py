@@ -61,7 +61,9 @@ def _peak_error(
     return worst
 
 
-@section("generator", "Starter/generator: steady state, two solvers, shunt, power balance")
+@section(
+    "generator", "Starter/generator: steady state, two solvers, shunt, power balance", order=30
+)
 def generator() -> list[Row]:
     """Measure the machine against the linear solution, against itself in other form."""
     gen = Generator()
@@ -138,7 +140,7 @@ def _power_balance(gen: Generator, load: SeriesLoad, fault: Ttsc, label: str) ->
     )
 
 
-@section("joint", "Joint scenario: energy handed over, steady start, wall time")
+@section("joint", "Joint scenario: energy handed over, steady start, wall time", order=31)
 def joint() -> list[Row]:
     """Run the paper's four-phase scenario with 50 us waveforms and look at its books."""
     from scenarios import registry
@@ -177,7 +179,9 @@ def joint() -> list[Row]:
     ]  # fmt: skip
 
 
-@section("conservation", "Mass and energy across every component at random operating points")
+@section(
+    "conservation", "Mass and energy across every component at random operating points", order=32
+)
 def conservation(n: int = 50, seed: int = 0) -> list[Row]:
     """First law and continuity with enthalpies re-evaluated outside the model."""
     gg = Apu().gas_generator

@@ -11,19 +11,12 @@ import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module, resources
+from importlib import resources
 
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError, nearest
+from scenarios.shell.registered import Registry
 
 KINDS = ("input", "calibrated", "predicted", "check")
-MODULES = (
-    "scenarios.validation.paper_tables",
-    "scenarios.validation.paper_figures",
-    "scenarios.validation.checks",
-    "scenarios.validation.peers.gas",
-    "scenarios.validation.peers.machine",
-    "scenarios.validation.peers.cycle",
-)
 
 
 class SkippedError(ApuError):
@@ -63,26 +56,24 @@ class Row:
 
 
 Section = Callable[[], list[Row]]
-_SECTIONS: dict[str, tuple[str, Section]] = {}
+SECTIONS: Registry[tuple[str, Section]] = Registry(
+    "scenarios.validation", "validation section", scripts=("dpsim_run", "pycycle_run")
+)
 
 
-def section(name: str, title: str) -> Callable[[Section], Section]:
-    """Register a section under a short name."""
+def section(name: str, title: str, order: float) -> Callable[[Section], Section]:
+    """Register a section under a short name; ``order`` is its place on the page, ascending."""
 
     def register(function: Section) -> Section:
-        if name in _SECTIONS and _SECTIONS[name][1].__qualname__ != function.__qualname__:
-            raise ScenarioError(f"validation section {name!r} is registered twice")
-        _SECTIONS[name] = (title, function)
+        SECTIONS.add(name, order, (title, function))
         return function
 
     return register
 
 
 def sections() -> dict[str, tuple[str, Section]]:
-    """Return every section as ``{name: (title, function)}``, in the order of the modules."""
-    for module in MODULES:
-        import_module(module)
-    return dict(_SECTIONS)
+    """Return every section as ``{name: (title, function)}``, in the order of the page."""
+    return SECTIONS.all()
 
 
 def run(name: str) -> list[Row]:

@@ -178,7 +178,9 @@ def _table_mean(table: str) -> float:
 
 
 @section(
-    "table6", "Table 6: mean relative errors of the gas generator (reference: the paper's own)"
+    "table6",
+    "Table 6: mean relative errors of the gas generator (reference: the paper's own)",
+    order=20,
 )
 def table6() -> list[Row]:
     """Compare mean errors; the paper runs GasTurb's own code, so its 1e-6 is a rounding error."""
@@ -215,7 +217,11 @@ def _machine(kind: str, solver: str) -> xr.Dataset:
     return machine_transient(kind, solver)
 
 
-@section("table9", "Table 9: mean relative errors of the generator (reference: the paper's own)")
+@section(
+    "table9",
+    "Table 9: mean relative errors of the generator (reference: the paper's own)",
+    order=21,
+)
 def table9() -> list[Row]:
     """Compare mean errors with SM-MATLAB's columns, and the transients by two solvers."""
     rows = [
@@ -247,7 +253,7 @@ def table9() -> list[Row]:
     return rows
 
 
-@section("table10", "Table 10: the joint run, phase by phase (reference: steady values)")
+@section("table10", "Table 10: the joint run, phase by phase (reference: steady values)", order=22)
 def table10() -> list[Row]:
     """Compare the end of every phase with published steady values and with our own trims.
 

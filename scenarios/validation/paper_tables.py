@@ -78,7 +78,7 @@ def _compare(
     return rows
 
 
-@section("table4", "Table 4: design point, 0 km, Mach 0, 500 kW")
+@section("table4", "Table 4: design point, 0 km, Mach 0, 500 kW", order=10)
 def table4() -> list[Row]:
     """Compute every row from the inputs; no map enters at the design point but for HPCSM."""
     rows = _compare(
@@ -93,7 +93,7 @@ def table4() -> list[Row]:
     return [*rows, mean_row(predicted, "predicted", 2e-4, "goal for a calculation without tuning")]
 
 
-@section("table5", "Table 5: off-design point, 8000 m, Mach 0.7, 222 kW")
+@section("table5", "Table 5: off-design point, 8000 m, Mach 0.7, 222 kW", order=11)
 def table5() -> list[Row]:
     """Compute every row; W2, T3, P3, T5 and HPCSM were used to calibrate the maps."""
     rows = _compare(
@@ -122,14 +122,14 @@ def _terminal(table: str, P: float, voltage_kind: str, tolerance: float, reason:
     return rows
 
 
-@section("table7", "Table 7: starter/generator, 225 kW")
+@section("table7", "Table 7: starter/generator, 225 kW", order=12)
 def table7() -> list[Row]:
     """Terminal voltage is where V_ref was set (calibrated); currents follow from the load."""
     reason = "the reference's own phases scatter by 3e-4 of their mean"
     return _terminal("table7", 225e3, "calibrated", 3e-4, reason)
 
 
-@section("table8", "Table 8: starter/generator, 100 kW")
+@section("table8", "Table 8: starter/generator, 100 kW", order=13)
 def table8() -> list[Row]:
     """Predict the terminal voltage at 100 kW with the voltage setting of Table 7."""
     reason = "regulator droop with K_A = 250, known only to lie between 215 and 264"

@@ -180,7 +180,11 @@ def explained(gg: GasGenerator, peer: dict[str, float]) -> list[Row]:
     return rows
 
 
-@section("pycycle", "Gas generator against pyCycle: design, off-design line, altitude, as ratios")
+@section(
+    "pycycle",
+    "Gas generator against pyCycle: design, off-design line, altitude, as ratios",
+    order=60,
+)
 def pycycle() -> list[Row]:
     """Compare T3, P3, T4, T5, W2, Wf and SFC; ``error`` is the ratio less one.
 

@@ -111,7 +111,9 @@ def equilibrium_errors(data: str) -> dict[float, float]:
     return worst
 
 
-@section("cantera", "Gas properties against Cantera: frozen and in equilibrium, 200-2200 K")
+@section(
+    "cantera", "Gas properties against Cantera: frozen and in equilibrium, 200-2200 K", order=40
+)
 def cantera() -> list[Row]:
     """Compare both data sets over fuel-air ratios 0-0.04.
 

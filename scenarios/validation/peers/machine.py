@@ -129,7 +129,11 @@ def peak_error(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b)[:, keep].max(axis=1) / np.abs(b).max(axis=1)).max())
 
 
-@section("dpsim", "Machine against dpsim: load steps, short circuit, fault as its equivalent shunt")
+@section(
+    "dpsim",
+    "Machine against dpsim: load steps, short circuit, fault as its equivalent shunt",
+    order=50,
+)
 def dpsim() -> list[Row]:
     """Compare voltages and winding currents of all phases after the first 0.5 ms.
 
