@@ -17,8 +17,8 @@ from typing import Any
 from apu_casadi.core.errors import ScenarioError, nearest
 from scenarios.bench.linearity import Curves, linear, linear_rows
 from scenarios.bench.measuring import PARTS, Part, Row, Size
-from scenarios.shell import markdown
 from scenarios.shell.computer import machine
+from scenarios.shell.template import Template
 from scenarios.validation.comparison import SkippedError
 
 LINEAR = "linear"  # measures curves, not rows
@@ -99,34 +99,28 @@ def run(
     return Report(rows, curves, skipped, where, time.perf_counter() - start)
 
 
-HEAD = ("what", "target", "figure", "error", "may be", "", "peer", "times faster")
+TEXT = Template.of("benchmarks.md")
 
 
-def cells(r: Row) -> tuple[str, ...]:
-    """Return a row as texts."""
-    unit = r.unit
-    sign = ">=" if r.more else "<="
-    target = "-" if r.target is None else f"{sign} {r.target:g} {unit}"
-    return (
-        r.what,
-        target,
-        f"{r.value:.3g} {unit}",
-        "-" if r.error_target == 0 else f"{r.error:.1e}",
-        "-" if r.error_target == 0 else f"{r.error_target:.0e}",
-        "met" if r.met else "inaccurate" if not r.accurate else "missed",
-        r.peer or "-",
-        "-" if r.ratio is None else f"{r.ratio:.3g}",
-    )
+def cells(r: Row) -> dict[str, Any]:
+    """Return the values of a row of the page."""
+    sign, judged = ">=" if r.more else "<=", r.error_target != 0
+    return vars(r) | {
+        "target": "-" if r.target is None else f"{sign} {r.target:g} {r.unit}",
+        "error": r.error if judged else None,
+        "error_target": r.error_target if judged else None,
+        "verdict": "met" if r.met else "inaccurate" if not r.accurate else "missed",
+        "peer": r.peer or "-",
+    }
 
 
 def table(report: Report) -> str:
     """Return the report as a text table."""
-    body = [cells(r) for rows in report.rows.values() for r in rows]
-    widths = [max(len(row[k]) for row in (HEAD, *body)) for k in range(len(HEAD))]
-    lines = [
-        "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
-        for row in (HEAD, *body)
-    ]
+    rows = [cells(r) for rows in report.rows.values() for r in rows]
+    body = [row[:-1] for row in TEXT.rows("rows", rows)]  # what the error is, on the page only
+    widths = [max(len(row[k]) for row in body) for k in range(len(body[0]))]
+    padded = ([c.ljust(w) for c, w in zip(row, widths, strict=True)] for row in body)
+    lines = ["  ".join(row).rstrip() for row in padded]
     return "\n".join([*lines, "", _where(report.machine), *_left_out(report)])
 
 
@@ -143,27 +137,13 @@ def _left_out(report: Report) -> list[str]:
 def page(report: Report, image: str | None) -> str:
     """Return the page BENCHMARKS.md."""
     m = report.machine
-    busy = ""
-    if m["load_before"] > 0.3:
-        busy = (
-            f" **Other programs were running: the load average was {m['load_before']} before the "
-            "start, so times are too long.**"
-        )
-    everything = [r for rows in report.rows.values() for r in rows]
-    body = [(*cells(r), r.measure) for r in everything]
-    parts = [
-        "# Benchmarks",
-        "Made by `apu bench --page BENCHMARKS.md`; `--peers` adds the rows against other programs. "
-        f"It took {report.seconds:.0f} s.",
-        f"{_where({**m, 'load_before': 0.0})}; generated C where there is a compiler "
-        f"(backend `{m['backend']}`).{busy}",
-        "Times are medians on one core unless a row says otherwise, after compiling and loading; "
-        "ratios come from one run. The error is that of the very answers that were timed; a row "
-        "is met when figure and error both are.",
-        markdown.markdown_table((*HEAD, "the error is"), body, right=(2, 3)),
-    ]
+    busy = " " + TEXT.text("busy", **m) if m["load_before"] > 0.3 else ""
+    where = _where({**m, "load_before": 0.0})
+    rows = [cells(r) for rows in report.rows.values() for r in rows]
+    parts = [TEXT.text("top", seconds=report.seconds, where=where, backend=m["backend"], busy=busy)]
+    parts.append(TEXT.table("rows", rows, right=(2, 3)))
     if image is not None:
-        parts += ["## Cost is linear", f"![Cost against simulated time, runs and rate]({image})"]
+        parts.append(TEXT.text("linear", image=image))
     if report.skipped:
         parts += ["## Skipped", "\n".join(f"- {n}: {why}" for n, why in report.skipped.items())]
     return "\n\n".join(parts) + "\n"
