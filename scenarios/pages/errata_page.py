@@ -27,7 +27,7 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios.shell.template import Template
-from scenarios.validation.comparison import Row, reference
+from scenarios.validation.comparison import reference
 from scenarios.validation.paper_figures import HEALTH
 from scenarios.validation.paper_tables import design_point, high_altitude_point, table4, table5
 
@@ -86,15 +86,6 @@ def corrected_flow() -> str:
     small = design_point(_apu().change({"gas_generator.W2": W2}).gas_generator)
     power = {"small": small["PW"] / 1e3, "full": y["PW"] / 1e3}
     return TEXT.text("corrected_flow", table_4=table_4, W2=W2, **power)
-
-
-def _mean(rows: list[Row], kinds: tuple[str, ...] = ("predicted",)) -> float:
-    errors = [abs(r.error) for r in rows if r.kind in kinds]
-    return sum(errors) / len(errors)
-
-
-def _row(rows: list[Row], name: str) -> Row:
-    return next(r for r in rows if r.quantity == name)
 
 
 def gas_data() -> str:
