@@ -108,7 +108,24 @@ def relative(ours: float, reference: float) -> float:
     return (ours - reference) / abs(reference) if reference else ours - reference
 
 
+def compared(
+    what: str, unit: str, reference: float, ours: float, tolerance: float, reason: str, kind: str
+) -> Row:
+    """Return the row of two values with their relative error."""
+    return Row(what, unit, reference, ours, relative(ours, reference), tolerance, reason, kind)
+
+
+def check(what: str, error: float, tolerance: float, reason: str) -> Row:
+    """Return the row of an error that a check defines, relative."""
+    return Row(what, "1", 0.0, error, error, tolerance, reason, "check")
+
+
+def timing(what: str, unit: str, value: float) -> Row:
+    """Return the row of a time, of which nothing is asked."""
+    return Row(what, unit, math.nan, value, 0.0, math.inf, "a timing is no test", "check")
+
+
 def mean_row(rows: list[Row], what: str, tolerance: float, reason: str) -> Row:
     """Summarise: the mean absolute error of ``rows``."""
     m = sum(abs(r.error) for r in rows) / len(rows)
-    return Row(f"mean of {len(rows)} {what} rows", "1", 0.0, m, m, tolerance, reason, "check")
+    return check(f"mean of {len(rows)} {what} rows", m, tolerance, reason)
