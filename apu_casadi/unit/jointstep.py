@@ -62,13 +62,13 @@ def _function(apu: Apu, machine: Propagator | MeanStep) -> ca.Function:
     carry, u = ca.MX.sym("carry", ends[-1]), ca.MX.sym("u", len(gg.U))
     theta, u_sg = ca.MX.sym("theta", len(gg.THETA)), ca.MX.sym("u_sg", len(ss.u))
     series, dt = ca.MX.sym("series", machine.parameters.size), ca.MX.sym("dt")
-    fault = [ca.MX.sym("fault", len(ss.theta))] if len(ss.theta) else []
-    held = [u, theta, u_sg, *fault, series, dt]
+    theta_sg = ca.MX.sym("theta_sg", machine.theta.size)
+    held = [u, theta, u_sg, theta_sg, series, dt]
 
     N, z, Wf_I, x_sg = (carry[i:j] for i, j in pairwise(ends))
     u_now = ca.MX(u_sg)
     u_now[ss.u.index("w_r")] = w_r = apu.w_r(N)
-    x1, *Y, means, miss = machine.advance(x_sg, series, u_now, *fault, dt)
+    x1, *Y, means, miss = machine.advance(x_sg, series, u_now, theta_sg, dt)
     at = ss.x.index("theta_e")
     x1[at] -= 2 * math.pi * ca.floor(x1[at] / (2 * math.pi) + 0.5)
     fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=gov)
@@ -87,7 +87,7 @@ def _function(apu: Apu, machine: Propagator | MeanStep) -> ca.Function:
         f"joint_block_{ss.name}_{n_out}",
         [carry, *held],
         [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))],
-        ["carry", "u", "theta", "u_sg", *(["fault"] if fault else []), "series", "dt"],
+        ["carry", "u", "theta", "u_sg", "theta_sg", "series", "dt"],
         ["last", "y", "means", "checks", *(["waves"] if Y else [])],
     )
 
@@ -113,9 +113,8 @@ class JointBlock(Rebuilt):
         """Advance ``BLOCK`` steps; None where a check fails and the ordinary loop must decide."""
         m = self.machine
         carry = np.concatenate([N, z, [Wf_I], x_sg])
-        fault = [m.theta] if m.theta.size else []
         last, y, means, checks, *waves = self._call(
-            carry, u, theta, u_sg, *fault, m.parameters, m.dt
+            carry, u, theta, u_sg, m.theta, m.parameters, m.dt
         )
         *miss, residual, w_r = checks
         good = (

@@ -25,7 +25,8 @@ from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine.generator import GeneratorPoint
 from apu_casadi.machine.meanstep import MeanStep
-from apu_casadi.machine.propagation import SPEED_RANGE, Propagator
+from apu_casadi.machine.propagation import Propagator
+from apu_casadi.machine.transition import SPEED_RANGE
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
 
