@@ -6,7 +6,8 @@ limits fuel; no temperature is limited, and a run that gets too hot says so
 (:mod:`apu_casadi.unit.validity`).
 
 Another law is another subclass of :class:`Governor`, with numbers, states, ``demand`` and
-``rates``; ``Apu(governor=...)`` takes it, and runs, linear models and filters follow it.
+``rates``; ``Apu(governor=...)`` takes it, and runs, linear models and filters follow it.  Entered
+in ``GOVERNORS`` it has a word, which ``Apu.change`` and scenarios take as ``governor.kind``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.parameters import Parameters, par
+from apu_casadi.core.register import Register
 from apu_casadi.core.signals import Signal, Signals
 
 
@@ -110,6 +112,10 @@ def _limited(value: Any, low: Any, high: Any) -> Any:
     return ca.fmax(low, ca.fmin(high, value))
 
 
+GOVERNORS: Register[type[Governor]] = Register("governor")
+
+
+@GOVERNORS.add("PI")
 @dataclass(frozen=True)
 class GovernorParameters(Governor):
     """The PI law, with limits and back-calculation.
@@ -165,6 +171,12 @@ class GovernorParameters(Governor):
     def rates(self, e: Any, x: Sequence[Any], cut: Any) -> tuple[Any, ...]:
         """Rate of the integrator, which tracks the limits."""
         return (self.Ki * e + cut / self.T_aw,)
+
+
+def word_of(governor: Governor) -> str:
+    """Return the word of a governor in ``GOVERNORS``; its class's name if it has none."""
+    kinds = (word for word, kind in GOVERNORS.items() if kind is type(governor))
+    return next(kinds, type(governor).__name__)
 
 
 class GovernorOut(NamedTuple):
