@@ -32,13 +32,13 @@ __all__ = ["STUDIES", "State", "get", "other_code", "pending", "read", "results"
 PACKAGES = ("apu-casadi", "casadi", "numpy", "scipy", "filterpy")
 
 
-def _studies() -> dict[str, Study]:
+def walk() -> dict[str, Study]:
     """Return the study of each file of the folder, in the order of the page."""
     found = (import_module(f"{estimation.__name__}.{n}").STUDY for n in estimation.files())
     return {s.name: s for s in sorted(found, key=lambda s: (s.order, s.name))}
 
 
-STUDIES: dict[str, Study] = _studies()
+STUDIES: dict[str, Study] = walk()
 """All studies by name, in the order of the page."""
 
 
