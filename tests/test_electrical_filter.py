@@ -33,6 +33,7 @@ from estimators.apu.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
+from estimators.information.consistency import nees
 from scenarios.studies import catalogue
 from scenarios.studies.electrical.alarms import chance_of_alarm
 from scenarios.studies.electrical.delays import detection
@@ -46,7 +47,6 @@ from scenarios.studies.electrical.protocol import (
     FULL_UNBALANCED,
     PART,
 )
-from scenarios.studies.electrical.scores import nees
 from scenarios.studies.electrical.truth import (
     chances,
     drawn_gains,

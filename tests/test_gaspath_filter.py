@@ -15,19 +15,9 @@ from apu_casadi.core.errors import DataError, EstimationError, ParameterError
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu import gaspath
-from estimators.apu.gaspath import (
-    DT,
-    HEALTH,
-    OUTPUTS,
-    JumpTest,
-    gas_path_filter,
-    gas_path_model,
-    null_direction,
-    samples,
-    track_jumps,
-    whitened,
-    window_means,
-)
+from estimators.apu.gaspath import gas_path_filter, null_direction, samples, window_means
+from estimators.apu.gaspathmodel import DT, GOVERNOR, HEALTH, OUTPUTS, gas_path_model
+from estimators.apu.healthjumps import JumpTest, track_jumps, whitened
 from estimators.filters.filtering import FilterResult
 from scenarios.studies.gaspath import course, enginetruth, montecarlo
 from scenarios.studies.gaspath.chance import LinearReference
@@ -150,7 +140,7 @@ def test_fuel_follows_its_governor_within_a_step():
     x = np.append(point.x, np.ones(4))
     u = dict(Wf=point["Wf"], PW=222e3, dT_isa=5.0)
     N = {}
-    for name, law in (("held", None), ("governed", gaspath.GOVERNOR)):
+    for name, law in (("held", None), ("governed", GOVERNOR)):
         model = gas_path_model(GG, gains=(), governed=law)
         N[name] = float(model.transition(x, model.u.pack(u), [], np.zeros(len(model.w)), DT)[0][0])
     power = (N["held"] - N["governed"]) * point["N"] * GG.parameters.J / DT

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, available_threads, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller, available_threads
 from apu_casadi.core.rootfinding import Newton
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.steady.steadypoint import Status
 from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.averaged import joint_vectors
 from apu_casadi.unit.linearisation import linearise_joint
 from scenarios.bench.measuring import Row, Size, apu, part, timed

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.backend import available_threads
+from apu_casadi.core.calling import available_threads
 from apu_casadi.core.results import phase_summary
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.multirate import simulate_joint

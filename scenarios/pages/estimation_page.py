@@ -12,8 +12,8 @@ from typing import Any
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.files import write_text
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
-from scenarios.shell.markdown import write_text
 from scenarios.shell.template import Template
 from scenarios.studies import catalogue
 from scenarios.studies.kept import understood

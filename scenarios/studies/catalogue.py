@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from apu_casadi.core.errors import ParameterError, nearest
+from apu_casadi.core.files import write_text
 from scenarios.shell.locking import locked
-from scenarios.shell.markdown import write_text
 from scenarios.studies import estimation, kept
 from scenarios.studies.registration import Results, Study, plain
 

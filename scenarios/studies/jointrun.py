@@ -19,11 +19,13 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.sharing import last
+from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
-from estimators.apu.electrical.terminalsignals import PHASES
-from estimators.apu.gaspath import DT, HEALTH
+from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
+from estimators.apu.sensors import gas_path_table
 from scenarios import registry
+from scenarios.schema import Scenario
 from scenarios.shell.template import Template
 from scenarios.studies.registration import series
 
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import xarray as xr
-
-    from scenarios.schema import Scenario
 
 __all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
 
@@ -149,10 +149,12 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
         )
     if s.duration < 3 * DT:
         raise ScenarioError(f"{s.name}: {s.duration:g} s are too short to estimate anything in")
-    unit = registry.unit_of(json.dumps(dict(s.parameters), sort_keys=True))
     given: dict[str, Any] = {**s.start(), "ambient": s.ambient, "events": s.events()}
     fine: dict[str, Any] = {"dt": FINE, "exchange": "corrected", "waveform_dt": WAVEFORM}
-    ds = simulate_joint(unit, duration=s.duration, progress=progress, **given, **fine)
+    fine["solver"] = "cvodes"
+    ds = simulate_joint(
+        registry.unit_for(s), duration=s.duration, progress=progress, **given, **fine
+    )
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     return ds
@@ -168,7 +170,8 @@ def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
     """
     case = joint_case(seed)
     s = json.loads(ds.attrs["scenario"])
-    unit = registry.unit_of(json.dumps(s.get("parameters", {}), sort_keys=True))
+    unit = registry.unit_for(Scenario.from_dict(s))
+    options.setdefault("gas_sensors", gas_path_table())
     gains: dict[str, Any] = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
     found = estimate_joint(ds, seed, apu=unit, **gains, **options)
     found.attrs |= {n: json.dumps(v) for n, v in gains.items()} | {"seed": seed}

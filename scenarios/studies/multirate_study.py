@@ -33,7 +33,7 @@ from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Event, FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.monolithic import simulate_monolithic
@@ -190,7 +190,8 @@ def measure(
             options: dict[str, Any] = {"rtol": _RTOL, "progress": tick}
             if ex != "one model":
                 simulate = simulate_joint
-                options |= {"dt": dt, "exchange": ex, "waveform_dt": None, "warn_exchange": False}
+                options |= {"dt": dt, "exchange": ex, "waveform_dt": None, "solver": "cvodes"}
+                options["warn_exchange"] = False
             # build the integrators first: that is paid once, and is no part of the comparison
             case.run(simulate, apu, duration=T_EVENT + COMMON, **{**options, "progress": None})
             start = time.process_time()
@@ -319,7 +320,7 @@ def regulator_mode(generator: Generator | None = None) -> Mode:
 def fault_words() -> str:
     """Tell the severity of the study's stator fault in words."""
     event = CASES["TTSC fault"].event
-    assert isinstance(event, FaultChange) and event.fault is not None
+    assert isinstance(event, FaultChange) and isinstance(event.fault, Ttsc)
     f = event.fault
     return TEXT.text("fault", percent=100 * f.mu, k_rf=f.k_rf, kappa=f.kappa)
 

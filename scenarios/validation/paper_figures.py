@@ -28,7 +28,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from scenarios.validation.comparison import Row, compared, run, section
 
 if TYPE_CHECKING:

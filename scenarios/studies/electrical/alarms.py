@@ -8,14 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import scipy.stats
 
+from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalfilter import electrical_filter
-from estimators.apu.electrical.terminalsignals import PHASES
 from estimators.apu.electrical.tracking import track
 from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
+from estimators.information.consistency import count_limit
 from scenarios.studies.electrical.protocol import (
     DT,
     FULL,
@@ -181,9 +181,7 @@ def false_alarms(
         "hours": seen,
         "level": level,
         "alarms": alarms,
-        "upper_95_per_hour_from_count": float(
-            scipy.stats.chi2.ppf(0.95, 2 * (alarms + 1)) / 2 / seen
-        ),
+        "upper_95_per_hour_from_count": count_limit(alarms) / seen,
         "rate_per_hour": rate0 * math.exp(-level / 2),
         "level_for_one_per_hour": 2 * math.log(max(rate0, 1.0)),
         "z_of_level": at,

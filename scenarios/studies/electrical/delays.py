@@ -11,11 +11,11 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalfilter import electrical_filter
-from estimators.apu.electrical.terminalsignals import PHASES
 from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.filters.ekf import extended_kalman_filter
-from estimators.information.intervals import share_interval
+from estimators.information.consistency import share_interval
 from scenarios.studies.electrical.protocol import (
     DETECT,
     DT,

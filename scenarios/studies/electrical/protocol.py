@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from estimators.apu.electrical import electricalfilter
 from estimators.filters.ekf import ekf_step
 

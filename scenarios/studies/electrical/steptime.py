@@ -11,7 +11,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.signals import Signals
 from estimators.apu.electrical.electricalfilter import electrical_filter
 from estimators.filters.belief import Belief

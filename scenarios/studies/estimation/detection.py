@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from estimators.information.intervals import share_interval
+from estimators.information.consistency import share_interval
 from scenarios.figures.studyplot import plot_rate
 from scenarios.studies.electrical.alarms import false_alarms, quiet
 from scenarios.studies.electrical.delays import detection

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.gaspath import HEALTH
+from estimators.apu.gaspathmodel import HEALTH
 from estimators.apu.joint import cross_talk
 from estimators.apu.monolithic_filter import compare_monolithic
 from scenarios.studies import jointrun
@@ -97,6 +97,7 @@ def _monolithic(n: int, seed0: int, tell: Tell) -> Any:
     full, part = (SeriesLoad.from_power(P) for P in (225e3, 100e3))
     events = [LoadChange(MONOLITHIC / 2, part)]
     fine: dict[str, Any] = {"dt": 0.005, "exchange": "corrected", "waveform_dt": 1e-4}
+    fine["solver"] = "cvodes"
     ds = simulate_joint(Apu(), duration=MONOLITHIC, load=full, events=events, **fine)
     return {"duration": MONOLITHIC, "seed": seed0, "compared": compare_monolithic(ds, seed0)}
 

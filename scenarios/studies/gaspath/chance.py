@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError
-from estimators.apu.gaspath import HEALTH, JUMP, OUTPUTS, GasPathFilter
+from estimators.apu.gaspath import JUMP, GasPathFilter
+from estimators.apu.gaspathmodel import HEALTH, OUTPUTS
+from estimators.information import consistency
 from estimators.information.bounds import linearisations, snapshot_bound
 from estimators.models.recording import Recording
 from scenarios.studies.gaspath.course import FAULT, Case, power_profile
@@ -93,9 +95,4 @@ class LinearReference:
 
     def nees(self, rows: np.ndarray) -> np.ndarray:
         """Return the normalised error squared of the factors at some samples, (seeds, rows)."""
-        return squared(*self.errors(rows))
-
-
-def squared(e: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """e' P^-1 e over the last axis."""
-    return np.asarray(np.einsum("...i,...i->...", e, np.linalg.solve(P, e[..., None])[..., 0]))
+        return consistency.nees(*self.errors(rows))

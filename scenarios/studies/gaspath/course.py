@@ -12,20 +12,14 @@ import numpy as np
 
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu import gaspath
-from estimators.apu.gaspath import (
-    DT,
-    GAINED,
-    HEALTH_SIGMA,
-    JUMP,
-    GasPathFilter,
-    JumpTest,
-    gas_path_filter,
-)
+from estimators.apu.gaspath import HEALTH_SIGMA, JUMP, GasPathFilter, gas_path_filter
+from estimators.apu.gaspathmodel import DT, GAINED
+from estimators.apu.healthjumps import JumpTest
 from estimators.filters.ekf import ekf_step
 
 TUNED = range(1, 201)

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError
-from estimators.apu.gaspath import DT, HEALTH, gas_path_filter
+from estimators.apu.gaspath import gas_path_filter
+from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.batch.smoother import rts_smoother
 from estimators.filters.ukf import unscented_kalman_filter
+from estimators.information import consistency
 from scenarios.studies.gaspath.chance import LinearReference
 from scenarios.studies.gaspath.course import (
     ETA_SIGMA,
@@ -73,7 +75,7 @@ def compare_filters(seeds: Sequence[int] = tuple(FRESH)[:50]) -> list[dict[str, 
             e = (r.mean[health] - x)[:, start:].T
             square[n] += (e**2).mean(0)
             P = r.cov[start:, health, health]
-            nees[n] += float(np.mean(np.sum(e * np.linalg.solve(P, e[..., None])[..., 0], 1)))
+            nees[n] += float(consistency.nees(e, P).mean())
         if j % 5 == 0:
             B = bound_of(filt, truth, case, jumps=[FAULT])[start:, health, health]
             limit += np.diagonal(B, axis1=1, axis2=2).mean(0)

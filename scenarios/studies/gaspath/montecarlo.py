@@ -9,22 +9,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from apu_casadi.core.sharing import kept
-from estimators.apu.gaspath import (
-    DT,
-    HEALTH,
-    OUTPUTS,
-    GasPathFilter,
-    gas_path_filter,
-    null_direction,
-    track_jumps,
-)
+from estimators.apu.gaspath import GasPathFilter, gas_path_filter, null_direction
+from estimators.apu.gaspathmodel import DT, HEALTH, OUTPUTS
+from estimators.apu.healthjumps import track_jumps
 from estimators.filters.filtering import FilterResult
+from estimators.information import consistency
 from estimators.information.bounds import posterior_bound
 from estimators.models.filtermodel import FilterModel
-from scenarios.studies.gaspath.chance import LinearReference, squared
+from scenarios.studies.gaspath.chance import LinearReference
 from scenarios.studies.gaspath.course import (
     CHECKPOINTS,
     DURATION,
@@ -81,16 +75,6 @@ class Collected:
             self.paired.append(r.cov[self.rows])
 
 
-def _band(n: int, dof: int) -> tuple[float, float]:
-    """95 % band of the mean of n chi-squared numbers."""
-    return tuple(float(q) / n for q in chi2.ppf([0.025, 0.975], n * dof))  # type: ignore[return-value]
-
-
-def _independent(nees: np.ndarray) -> float:
-    """How many independent numbers the columns of (seeds, n) amount to: n^2 over sum of corr."""
-    return float(nees.shape[1] ** 2 / np.corrcoef(nees.T).sum())
-
-
 def measures(c: Collected, health: slice, null: np.ndarray, ny: int) -> dict[str, Any]:
     """Condense collected runs: RMSE over bound, NEES, NIS, the null direction; by checkpoint."""
     e, P, nis = np.array(c.error)[:, :, health], np.array(c.cov)[:, :, health, health], c.nis
@@ -99,15 +83,15 @@ def measures(c: Collected, health: slice, null: np.ndarray, ny: int) -> dict[str
     claimed = np.array(c.paired)[:, :, health, health]
     rmse = np.sqrt((e**2).mean(0))
     limit = np.sqrt(np.diagonal(B, axis1=2, axis2=3).mean(0))
-    nees = squared(e, P).mean(0)
+    nees = consistency.nees(e, P).mean(0)
     along = np.einsum("ski,i->sk", e, null)
     var = np.einsum("skij,i,j->sk", P, null, null)
     least = np.einsum("skij,i,j->sk", B, null, null)
     var_paired = np.einsum("skij,i,j->sk", claimed, null, null)
     nees_null = (along**2 / var).mean(0)
-    low4, high4 = _band(n, 4)
-    low1, high1 = _band(n, 1)
-    low_y, high_y = _band(n, ny)
+    low4, high4 = consistency.band(n, 4)
+    low1, high1 = consistency.band(n, 1)
+    low_y, high_y = consistency.band(n, ny)
     nis_mean = np.array(nis).mean(0)
     inside = (nees >= low4) & (nees <= high4)
     return {
@@ -218,14 +202,14 @@ def efficiency(
     out = measures(c, slice(first, first + 4), null, len(OUTPUTS))
     out |= {"checkpoints": points.tolist(), "matched": matched}
     e, P = (np.array(v)[:, :, first : first + 4] for v in (c.error, c.cov))
-    every = squared(e, P[..., first : first + 4])
+    every = consistency.nees(e, P[..., first : first + 4])
     out["nees_of"] = {
         name: every[i :: len(truths)].mean(0).tolist() for i, name in enumerate(engines)
     }
     if not matched:
         return out | alarms.measures(len(c.error))
     e_exact, P_exact = chance.errors(c.rows)
-    exact = squared(e_exact, P_exact)
+    exact = consistency.nees(e_exact, P_exact)
     excess = (every - exact).mean(1)
     along = (e_exact @ null) ** 2 / np.einsum("kij,i,j->k", P_exact, null, null)
     out["null"]["nees_exact"] = along.mean(0).tolist()
@@ -234,5 +218,5 @@ def efficiency(
         "nees_excess": float(excess.mean()),
         "nees_excess_stderr": float(excess.std() / math.sqrt(len(excess))),
         # the mean over the run of numbers that are nearly one number
-        "nees_independent": _independent(every),
+        "nees_independent": consistency.independent(every),
     }

@@ -11,14 +11,13 @@ import numpy as np
 
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.gaspath import (
-    DT,
-    HEALTH,
     HEALTH_SIGMA,
     MODEL_ERROR,
     GasPathFilter,
     gas_path_filter,
     null_direction,
 )
+from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.apu.sensors import GAS_PATH
 from estimators.filters.filtering import FilterResult
 from scenarios.studies.gaspath.course import (
