@@ -219,6 +219,20 @@ def test_other_constants_make_all_parts_pending(toy, tmp_path, monkeypatch):
     assert catalogue.pending(study, tmp_path, 40) == []
     monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: {"Q": 2.0})
     assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
+    monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: {})
+    assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
+
+
+def test_a_constant_that_moved_makes_nothing_pending(toy, tmp_path, monkeypatch):
+    """A name that came or went is code, which the fingerprint compares; a value is a constant."""
+    study, *_ = toy
+    catalogue.run("correctness", tmp_path, n_seeds=40)
+    values = fingerprint.constants("estimators.apu.electrical")
+    values["NEW"], gone = 1.0, values.pop("H_WALK")
+    monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: values)
+    assert catalogue.pending(study, tmp_path, 40) == []
+    values["H_WALK"] = 2 * gone
+    assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
 
 
 def test_other_seeds_make_a_part_pending_and_are_printed_as_they_were(toy, tmp_path, monkeypatch):
