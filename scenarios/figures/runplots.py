@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.results import RPM, phases
+from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import SEVERITY, caption_of, scenario_of
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HOT = "#b91c1c"
-FACTORS = {"f_eta_c": "$η_c$", "f_W_c": "$W_c$", "f_eta_t": "$η_t$", "f_W_t": "$W_t$"}
 HEALTHY, HURT = ("#d8efe3", "#14532d"), ("#f8cfc8", "#7f1d1d")  # ground and ink
 LOADS = (("#bfd7ee", "#0b3c66"), ("#dbe8f5", "#0b3c66"))
 Lane = list[tuple[float, float, str, tuple[str, str]]]
@@ -153,10 +153,10 @@ def _load_words(x: dict[str, Any]) -> str:
 def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
     """Return the stretches of constant gas-path health."""
     t, lane = ds["time"].values, []
-    gas = np.column_stack([ds[f].values for f in FACTORS])
+    gas = np.column_stack([ds[f].values for f in HEALTH_FACTORS])
     for a, b, i in _segments(t, gas, rows):
-        factors = zip(FACTORS.values(), gas[i], strict=True)
-        off = [f"{s} {100 * (v - 1):+.3g} %" for s, v in factors if v != 1.0]
+        factors = zip(HEALTH_FACTORS.values(), gas[i], strict=True)
+        off = [f"{h.symbol} {100 * (v - 1):+.3g} %" for h, v in factors if v != 1.0]
         off = [x.replace(" -", " −").replace(" ", "\u00a0") for x in off]
         words = ", ".join(off[:2]) + "\n" + ", ".join(off[2:]) if off else "healthy"
         lane.append((a, b, words.strip(), HURT if off else HEALTHY))
@@ -200,7 +200,7 @@ def figure_20(ds: xr.Dataset) -> Figure:
     Raises:
         DataError: a variable is missing.
     """
-    fs.need(ds, [*FACTORS, *SEVERITY, "P_e"])
+    fs.need(ds, [*HEALTH_FACTORS, *SEVERITY, "P_e"])
     rows = phases(ds)
     loads = [(a, b, w, LOADS[i % 2]) for i, (a, b, w) in enumerate(_load_lane(ds, rows))]
     gas, stator = _gas_lane(ds, rows), _stator_lane(ds, rows)
