@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.errors import NotApplicable, SimulationError
+from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.machine.loads.load import SeriesLoad
 from apu_casadi.unit import validity
@@ -76,7 +76,8 @@ class JointRun:
         self.load, self.fault = asked.load, asked.fault
         self.slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
         self._gas_step = gg.stepper if settings.fast else None
-        self._free = asked.hook is None and not (asked.noise.N or settings.noisy)
+        by_blocks = settings.exact and asked.hook is None and not asked.noise.N
+        self._ways = (self._block, self._step) if by_blocks else (self._step,)
 
     def at_start(self) -> Row:
         """What is recorded of the first instant."""
@@ -101,14 +102,12 @@ class JointRun:
 
     def advance(self, k: int, until: float) -> tuple[int, Row]:
         """Go on by a block of exchange steps, or by one."""
-        return first_able((self._block, self._step), k, until)
+        grid = self.asked.grid
+        free = k + BLOCK < grid.size and grid[k + BLOCK] <= until + SAME_INSTANT
+        return first_able(self._ways if free else self._ways[-1:], k)
 
-    def _block(self, k: int, until: float) -> tuple[int, Row]:
+    def _block(self, k: int) -> tuple[int, Row]:
         grid = self.asked.grid[k : k + BLOCK + 1]
-        if not self._free:
-            raise NotApplicable("noise or a hook acts in every step")
-        if grid[-1] > until + SAME_INSTANT:
-            raise NotApplicable(f"an event at {until:.6g} s is near")
         done, made = self.machine.block(self.x, self.z, self.governor, self.u, self.theta, grid)
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
@@ -117,7 +116,7 @@ class JointRun:
     def _row(self, y: np.ndarray, made: MachineMade) -> Row:
         return Row(y, made.means, self.factors, self.machine.phase.fault, made.t, made.w)
 
-    def _step(self, k: int, _until: float) -> tuple[int, Row]:
+    def _step(self, k: int) -> tuple[int, Row]:
         noise, way, gg = self.asked.noise, self.settings.way, self.apu.gas_generator
         if noise.w1 or noise.w2:
             draw = self._rng.standard_normal

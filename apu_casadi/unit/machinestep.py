@@ -15,6 +15,7 @@ import numpy as np
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.machine.generator import GeneratorPoint
+from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.integrators import (
     SETTLED,
@@ -171,6 +172,7 @@ class Blocks:
         self.apu, self.phase, self.settings = apu, phase, settings
         self.fast = fast if isinstance(fast, Means | Samples) else None
         self._made: JointBlock | None = None
+        self._refused = ""
 
     @property
     def quad(self) -> tuple[str, ...]:
@@ -178,12 +180,18 @@ class Blocks:
         return () if self.fast is None else self.fast.quad
 
     def _block(self) -> JointBlock:
+        if self._refused:
+            raise NotApplicable(self._refused)
         if self._made is None:
-            if self.fast is None:
-                raise NotApplicable("exact propagation does not hold, or is not asked for")
-            fast = self.fast.fast()
-            if isinstance(self.fast, Samples) and not fast.constant:
-                raise NotApplicable(f"{fast.ss.name}: its coefficients depend on the rotor angle")
+            try:
+                if self.fast is None:
+                    raise NotApplicable("exact propagation does not hold, or is not asked for")
+                fast = self.fast.fast()
+                if isinstance(fast, Propagator) and not fast.constant:
+                    raise NotApplicable("the coefficients depend on the rotor angle")
+            except NotApplicable as error:
+                self._refused = str(error)
+                raise
             self._made = JointBlock(self.apu, fast)
         return self._made
 
@@ -199,9 +207,10 @@ class Blocks:
         grid: np.ndarray,
     ) -> tuple[BlockResult, np.ndarray, np.ndarray]:
         """Advance over the grid of a block; with the samples' instants and waveforms."""
-        if grid.size != BLOCK + 1 or np.abs(np.diff(grid) - self.settings.dt).max() > SAME_INSTANT:
+        block = self._block()
+        if np.abs(np.diff(grid) - self.settings.dt).max() > SAME_INSTANT:
             raise NotApplicable("the steps of a block are whole exchange steps")
-        done = self._block()(x, z, governor, x_sg, u, theta, u_sg)
+        done = block(x, z, governor, x_sg, u, theta, u_sg)
         if self.settings.waveform_dt is None or not isinstance(self.fast, Samples):
             return done, np.empty(0), np.empty((len(WAVEFORMS), 0))
         fast, stored = self.fast.fast(), self.fast.stored
