@@ -32,6 +32,7 @@ TINY = benchmarks.Size(
 ROW = benchmarks.Row("it", 2.0, "ms", 3.0, 1e-7, 1e-6, "relative")
 
 
+@pytest.mark.ci  # what is measured is tested on its own; this is the benchmark of it
 @pytest.mark.parametrize("name", ["trim", "deck", "derivatives", "linearisation", "shell"])
 def test_the_parts_run_and_are_accurate(name):
     rows = benchmarks.PARTS[name](TINY)
@@ -39,6 +40,7 @@ def test_the_parts_run_and_are_accurate(name):
     assert all(math.isfinite(r.value) and r.value > 0 for r in rows)
 
 
+@pytest.mark.ci  # as above
 def test_the_joint_parts_run_and_are_accurate(monkeypatch):
     """The process without compiled code is left out: it takes its time to build everything."""
     monkeypatch.setattr(benchmarks, "_virtual_machine", lambda *_: [])

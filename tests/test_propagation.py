@@ -11,7 +11,9 @@ from apu_casadi.core.errors import SimulationError
 from apu_casadi.machine import propagation
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.propagation import Propagator, gregory, strides
 
 GEN = Generator()
@@ -171,8 +173,8 @@ def test_transition_matrices_agree_with_exponentials():
 
     ss, u, h = GEN.variant(KW100), GEN.inputs(KW100), 100e-6
     table = propagation.transition_table(ss, u, np.zeros(0), W, h=h)
-    n = len(propagation.linear_states(ss))
-    nominal = ss.x.nominals[ss.x.indices(propagation.linear_states(ss))]
+    n = len(ss.linear)
+    nominal = ss.x.nominals[ss.x.indices(ss.linear)]
     for w in (0.95 * W, W, 1.03 * W):
         u[ss.u.index("w_r")] = w
         M = propagation._coefficients(ss)(0.7, u, []).full()

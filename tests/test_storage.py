@@ -17,9 +17,9 @@ from apu_casadi import Apu, FaultChange, HealthChange, SeriesLoad, Ttsc, simulat
 from apu_casadi.core import netcdf3, results, runstorage
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.filearrays import File, RowFile, lazy
-from apu_casadi.machine.generator import MeasurementNoise
+from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit import recorder
-from apu_casadi.unit.multirate import Noise
+from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.stepmeans import StepMeans
 
 LONG = 200_000

@@ -62,6 +62,20 @@ class Parameters:
                 raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
         return dataclasses.replace(self, **values)
 
+    def symbolic(self, **values: Any) -> Self:
+        """Return a copy with some values replaced by symbols or expressions, unchecked.
+
+        Raises:
+            ParameterError: unknown name.
+        """
+        names = [f.name for f in dataclasses.fields(self)]
+        for n in values:
+            if n not in names:
+                raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
+        new = object.__new__(type(self))
+        new.__dict__.update({n: values.get(n, getattr(self, n)) for n in names})
+        return new
+
     def table(self) -> list[tuple[str, float, str, str, str]]:
         """Return rows (name, value, unit, meaning, source), for printing and for file headers."""
         return [

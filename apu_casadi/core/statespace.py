@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -126,7 +126,7 @@ class StateSpace(Parametric):
         g: Any,
         z: Any,
         cse: bool = False,
-    ) -> StateSpace:
+    ) -> Self:
         """Make the functions from one set of expressions.
 
         Args:

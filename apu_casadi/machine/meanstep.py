@@ -22,20 +22,19 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
-from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import (
     SPEED_RANGE,
-    applicable,
     cached_table,
     end_weights,
     exciter_step,
     leap,
-    linear_states,
     parity,
     symmetry,
     through,
@@ -141,7 +140,11 @@ def _shifted(weights: Any, term: Term, highest: int) -> list[Any]:
 
 
 def _harmonics(
-    ss: StateSpace, at_sample: tuple[Any, Any, Any], quad: Sequence[str], weights: Any, share: Any
+    ss: GeneratorModel,
+    at_sample: tuple[Any, Any, Any],
+    quad: Sequence[str],
+    weights: Any,
+    share: Any,
 ) -> Any:
     """What each mean of ``quad`` gets from one sample (x, u, theta); shape (means,)."""
     x, u, th = at_sample
@@ -159,7 +162,7 @@ def _harmonics(
     return ca.vertcat(*total)
 
 
-def _parts(ss: StateSpace, x: Any, u: Any, th: Any, terms: ca.Function) -> list[list[Any]]:
+def _parts(ss: GeneratorModel, x: Any, u: Any, th: Any, terms: ca.Function) -> list[list[Any]]:
     """Coefficients c0, c1, s1, c2, s2 of each term, at one sample; c0 alone where that is all."""
     at = ss.x.index("theta_e")
     phi = 2 * math.pi * np.arange(_PHASES) / _PHASES
@@ -191,7 +194,7 @@ def _parts(ss: StateSpace, x: Any, u: Any, th: Any, terms: ca.Function) -> list[
     return found
 
 
-def _constant_step(gen: Generator, ss: StateSpace, quad: tuple[str, ...]) -> ca.Function:
+def _constant_step(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     nx, nu, n_P = len(ss.x), len(ss.u), parity(ss, 1).even.size
     X0, U, dt = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("dt")
     series = ca.MX.sym("series", len(PANELS) * 4 * n_P)
@@ -335,7 +338,7 @@ def _end_weights(turn: _Turn) -> ca.Function:
 
 
 def _periodic_step(
-    gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float, harmonics: int
+    gen: Generator, ss: GeneratorModel, quad: tuple[str, ...], dt: float, harmonics: int
 ) -> ca.Function:
     nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
     turn, kinds = _turn(dt, gen.machine.w_rated), parity(ss, 1)
@@ -367,7 +370,7 @@ def _periodic_step(
         xk = X[:, -1]
         states.append(X)
     sign = np.ones((nx, 1))
-    sign[ss.x.indices(linear_states(ss)), 0] = kinds.sign[: len(linear_states(ss))]
+    sign[ss.x.indices(ss.linear), 0] = kinds.sign[: len(ss.linear)]
     xk = xk * sign
     xk[at] = x[at]
     half = ca.Function(
@@ -397,7 +400,7 @@ def _periodic_step(
     X_tail = X[:, turn.first :] * reversed_
     ends = ca.mtimes(X_tail, weights[1:, turn.first :].T)
     linear = np.zeros((nx, 1))
-    linear[ss.x.indices(linear_states(ss)), 0] = 1
+    linear[ss.x.indices(ss.linear), 0] = 1
     # the exciter's last step is as long as it must be
     V_tail = Y[-1, turn.first :]
     V_end, V_middle, V_start = (
@@ -425,7 +428,7 @@ def _periodic_step(
 
 
 @kept
-def _function(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float,
+def _function(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...], dt: float,
               harmonics: int) -> ca.Function:  # fmt: skip
     """Function (x0, series, u[, theta], dt) -> (x, mean, miss); ``dt`` only bounds the samples."""
     if harmonics == 0:
@@ -434,7 +437,7 @@ def _function(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float,
 
 
 @kept
-def _caller(gen: Generator, ss: StateSpace, quad: tuple[str, ...], dt: float, harmonics: int,
+def _caller(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...], dt: float, harmonics: int,
             _in_use: str) -> Caller:  # fmt: skip
     """The same in the backend in use, one for each layout."""
     return Caller(compiled(_function(gen, ss, quad, dt, harmonics), level=3))
@@ -461,7 +464,7 @@ class MeanStep(Rebuilt):
     def __init__(
         self,
         gen: Generator,
-        ss: StateSpace,
+        ss: GeneratorModel,
         u: np.ndarray,
         theta: np.ndarray,
         *,
@@ -470,8 +473,8 @@ class MeanStep(Rebuilt):
         within: tuple[float, float] = (0.0, 1.0),
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
-        if not applicable(ss):
-            raise NotApplicable(f"{ss.name}: a constant-power load is not linear")
+        if not ss.linear:
+            raise NotApplicable(f"{ss.name}: its load is not linear")
         self.ss, self.dt, self.quad = ss, dt, tuple(quad)
         self.theta = np.array(theta, dtype=float)
         w_rated = gen.machine.w_rated

@@ -30,14 +30,15 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term
 from apu_casadi.core.sharing import Rebuilt, keep, kept
 from apu_casadi.core.simulation import StepResult
-from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.generatormodel import GeneratorModel
 
 SETTLING = 1e-3  # s, in which the windings follow a step of speed
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
@@ -55,16 +56,6 @@ SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolate
 _NODES = 4  # Chebyshev nodes in speed
 
 
-def linear_states(ss: StateSpace) -> list[str]:
-    """Names of the states that obey the linear equations: flux linkages and fault current."""
-    return [n for n in ss.x.names if n.startswith("lam_") or n == "i_fault"]
-
-
-def applicable(ss: StateSpace) -> bool:
-    """Whether the model is linear in its winding states at constant speed."""
-    return "G_load" not in ss.x
-
-
 @dataclass(frozen=True)
 class _Split:
     """Positions of the parts of a generator's state."""
@@ -75,15 +66,15 @@ class _Split:
     drive: int  # E_fd among all states
 
 
-def _split(ss: StateSpace) -> _Split:
-    linear = ss.x.indices(linear_states(ss))
+def _split(ss: GeneratorModel) -> _Split:
+    linear = ss.x.indices(ss.linear)
     angle, drive = ss.x.index("theta_e"), ss.x.index("E_fd")
     slow = [i for i in range(len(ss.x)) if i not in (*linear, angle)]
     return _Split(linear, slow, angle, drive)
 
 
 @kept
-def _coefficients(ss: StateSpace) -> ca.Function:
+def _coefficients(ss: GeneratorModel) -> ca.Function:
     """Function (theta_e, u, theta) -> augmented matrix M of d/dt [x; E; E'; E''; E'''; 1].
 
     Checks that the model is linear in x and E where it is taken to be.
@@ -153,7 +144,7 @@ def _transition(
 
 
 @kept
-def _coefficients_at(ss: StateSpace, count: int) -> Caller:
+def _coefficients_at(ss: GeneratorModel, count: int) -> Caller:
     """:func:`_coefficients` at ``count`` angles at once."""
     return Caller(compiled(_coefficients(ss).map(count), build=False))
 
@@ -175,10 +166,10 @@ class Parity(NamedTuple):
     odd: np.ndarray
 
 
-def parity(ss: StateSpace, leaps: int) -> Parity:
+def parity(ss: GeneratorModel, leaps: int) -> Parity:
     """Return the parity of the entries of ``leaps`` transition matrices (:class:`Strides`)."""
-    names = linear_states(ss)
-    sign = np.array([-1.0 if k in ("lam_s0", "i_fault") else 1.0 for k in names] + [1.0] * EXTRA)
+    names = ss.linear
+    sign = np.array([-1.0 if k in ss.reversing else 1.0 for k in names] + [1.0] * EXTRA)
     one = np.outer(sign, sign[: len(names)]).ravel()  # column by column
     entries = np.tile(one, leaps)
     return Parity(sign, np.flatnonzero(entries > 0), np.flatnonzero(entries < 0))
@@ -187,15 +178,15 @@ def parity(ss: StateSpace, leaps: int) -> Parity:
 _PROBE = np.array([0.1, 0.9, 2.3])  # rotor angles, rad, without any symmetry
 
 
-def _scale(ss: StateSpace) -> np.ndarray:
+def _scale(ss: GeneratorModel) -> np.ndarray:
     """Factors that make coefficients of all states comparable, shape (n + EXTRA, n + EXTRA)."""
     nominal = np.append(ss.x.nominals[_split(ss).linear], np.ones(EXTRA))
     return np.asarray(nominal / nominal[:, None])
 
 
-def _scaled(ss: StateSpace, u: np.ndarray, theta: np.ndarray) -> Any:
+def _scaled(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray) -> Any:
     """Function (angles, speeds) -> matrices M of :func:`_coefficients` in nominal units."""
-    n, iw, scale = len(linear_states(ss)), ss.u.index("w_r"), _scale(ss)
+    n, iw, scale = len(ss.linear), ss.u.index("w_r"), _scale(ss)
 
     def M_of(angle: np.ndarray, w: np.ndarray) -> np.ndarray:
         U = np.repeat(u[:, None], angle.size, axis=1)
@@ -207,7 +198,7 @@ def _scaled(ss: StateSpace, u: np.ndarray, theta: np.ndarray) -> Any:
     return M_of
 
 
-def symmetry(ss: StateSpace, u: np.ndarray, theta: np.ndarray, w_rated: float) -> bool:
+def symmetry(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray, w_rated: float) -> bool:
     """Return whether the coefficients are constant; check that half a turn reverses the phases.
 
     Raises:
@@ -258,7 +249,7 @@ class Table:
 
 
 def transition_table(
-    ss: StateSpace,
+    ss: GeneratorModel,
     u: np.ndarray,
     theta: np.ndarray,
     w_rated: float,
@@ -279,7 +270,7 @@ def transition_table(
         NotApplicable: the Fourier series or the steps do not converge, or a noise in the zero
             sequence does not change its sign with the phases.
     """
-    n = len(linear_states(ss))
+    n = len(ss.linear)
     centre, half = w_rated, SPEED_RANGE * w_rated
     k = np.arange(_NODES)
     nodes = centre + half * np.cos(np.pi * (2 * k + 1) / (2 * _NODES))
@@ -416,7 +407,7 @@ def strides(n_out: int, h: float, constant: bool, fine: bool) -> Strides:
 
 
 @kept
-def exciter_step(gen: Generator, ss: StateSpace) -> tuple[ca.Function, ca.Function]:
+def exciter_step(gen: Generator, ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
     """The exciter's drive and its step, of the states that are neither windings nor angle.
 
     First: (slow, V_t, V_ref) -> (E, E', E'', E''').  Second, by the classical Runge-Kutta method:
@@ -447,7 +438,7 @@ def exciter_step(gen: Generator, ss: StateSpace) -> tuple[ca.Function, ca.Functi
 
 @kept
 def leap(
-    gen: Generator, ss: StateSpace, m: int, constant: bool, chained: bool = False
+    gen: Generator, ss: GeneratorModel, m: int, constant: bool, chained: bool = False
 ) -> tuple[ca.Function, ca.Function]:
     """One step of the exciter over m samples, and the terminal voltage with its rate.
 
@@ -457,7 +448,7 @@ def leap(
     These are matrices over one sample, two samples and so on, or, ``chained``, from each sample to
     the next.  Second: (x, u, theta) -> (V_t, dV_t/dt).
     """
-    p, s, n = gen.machine, _split(ss), len(linear_states(ss))
+    p, s, n = gen.machine, _split(ss), len(ss.linear)
     nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
     x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
     V_t = ss.g(x, u, th)[ss.y.index("V_t")]
@@ -557,8 +548,15 @@ def _fold(step: ca.Function, steps: int, n_P: Sequence[int], constant: bool,
 
 
 @kept
-def _advance(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs: tuple[str, ...],
-             quad: tuple[str, ...], constant: bool) -> ca.Function:  # fmt: skip
+def _advance(
+    gen: Generator,
+    ss: GeneratorModel,
+    n_out: int,
+    plan: Strides,
+    outputs: tuple[str, ...],
+    quad: tuple[str, ...],
+    constant: bool,
+) -> ca.Function:
     """n_out samples at once: (x0, P, u, theta, h) -> (x, y, mean, miss).
 
     Where ``constant``, ``P`` is one column of even transition matrix entries for the whole step;
@@ -645,7 +643,7 @@ class Propagator(Rebuilt):
     def __init__(
         self,
         gen: Generator,
-        ss: StateSpace,
+        ss: GeneratorModel,
         u: np.ndarray,
         theta: np.ndarray,
         *,
@@ -656,8 +654,8 @@ class Propagator(Rebuilt):
         fine: bool = False,
     ) -> None:
         """Compute or fetch the table, build or fetch the functions."""
-        if not applicable(ss):
-            raise NotApplicable(f"{ss.name}: a constant-power load is not linear")
+        if not ss.linear:
+            raise NotApplicable(f"{ss.name}: its load is not linear")
         if n_out < 10:
             raise NotApplicable(f"{ss.name}: at least 10 samples are needed, got {n_out}")
         self.ss, self.n_out, self.dt = ss, n_out, dt
@@ -758,7 +756,7 @@ class Propagator(Rebuilt):
 
 
 @kept
-def _caller(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs: tuple[str, ...],
+def _caller(gen: Generator, ss: GeneratorModel, n_out: int, plan: Strides, outputs: tuple[str, ...],
             quad: tuple[str, ...], constant: bool, _in_use: str) -> Caller:  # fmt: skip
     """Function of :func:`_advance` in the backend in use, one for each layout."""
     fun = _advance(gen, ss, n_out, plan, outputs, quad, constant)
@@ -766,7 +764,7 @@ def _caller(gen: Generator, ss: StateSpace, n_out: int, plan: Strides, outputs: 
 
 
 def cached_table(
-    ss: StateSpace,
+    ss: GeneratorModel,
     u: np.ndarray,
     theta: np.ndarray,
     w_rated: float,

@@ -206,7 +206,7 @@ def trim(
         OperatingPointError: no such point; says why, and the best point reached.
 
     Examples:
-        >>> from apu_casadi.machine.loads.load import SeriesLoad
+        >>> from apu_casadi.machine.loads.series import SeriesLoad
         >>> round(trim(Apu(), load=SeriesLoad.from_power(100e3)).gas["Wf"], 4)
         0.0297
     """

@@ -36,7 +36,8 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.machine.generator import Generator, GeneratorPoint
+from apu_casadi.machine.generator import Generator, GeneratorPoint, load_of_kind
+from apu_casadi.machine.generatormodel import DRIVES
 from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.exchange import coupled
@@ -67,16 +68,25 @@ def has_severity(gen: Generator, load_kind: str) -> bool:
     neutral, no inductance in the load.  Elsewhere that current is a state of its own, whose time
     constant vanishes with h, and there is no derivative by h at h = 0 at the instant of a step.
     """
-    return gen.neutral == "grounded" and load_kind != "inductive"
+    return gen.neutral == "grounded" and not load_of_kind(load_kind).inductive("a")
 
 
-def _balanced_inputs(ss: StateSpace) -> Signals:
+def _by_phase(load_kind: str) -> tuple[str, ...]:
+    """Return the names of a load's inputs that have a value for each phase, without ``_a``."""
+    names = [s.name for s in load_of_kind(load_kind).own.inputs]
+    return tuple(n[:-2] for n in names if n.endswith("_a") and f"{n[:-2]}_c" in names)
+
+
+def _balanced_inputs(load_kind: str) -> Signals:
     """Inputs of the averaged model: one value for all three phases."""
-    kept = [ss.u[n] for n in ("w_r", "V_ref", "P_load", "tau_load") if n in ss.u]
-    if "R_a" in ss.u:
-        kept.append(Signal("R", "ohm", "load resistance of each phase"))
-    if "L_a" in ss.u:
-        kept.append(Signal("L", "H", "load inductance of each phase", nominal=1e-4))
+    kept: list[Signal] = list(DRIVES)
+    for s in load_of_kind(load_kind).own.inputs:
+        base, phase = s.name[:-2], s.name[-2:]
+        if base not in _by_phase(load_kind):
+            kept.append(s)
+        elif phase == "_a":
+            doc = s.doc.replace(", phase a", " of each phase")
+            kept.append(dataclasses.replace(s, name=base, doc=doc))
     return Signals(kept)
 
 
@@ -84,24 +94,24 @@ def _balanced_inputs(ss: StateSpace) -> Signals:
 def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpace:
     """Return one generator, averaged over an electrical period, under a balanced load.
 
-    States are the generator's without the rotor angle; inputs w_r, V_ref and the load's R (and L),
-    or P_load and tau_load; theta is the severity h where :func:`has_severity`, else empty; outputs
+    States are the generator's without the rotor angle; inputs w_r, V_ref and the load's, one value
+    for all phases; theta is the severity h where :func:`has_severity`, else empty; outputs
     are field, magnitudes, power, torque and the voltages and currents on the rotor's axes.
 
     Args:
         gen: the generator.
-        load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"``.
+        load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
     """
     faulty = has_severity(gen, load_kind)
     full = gen.state_space(load_kind, "coupled" if faulty else None)
     X = Signals([s for s in full.x if s.name != "theta_e"])
-    U, TH = _balanced_inputs(full), _SEVERITY if faulty else Signals()
+    U, TH = _balanced_inputs(load_kind), _SEVERITY if faulty else Signals()
     Y = Signals([*(full.y[n] for n in _KEPT), *_AXES])
     (xv, x), (uv, u), (tv, th) = X.sx(), U.sx(), TH.sx()
 
     inputs = dict.fromkeys(full.u.names, ca.SX(0))
     inputs |= {n: u[n] for n in U.names if n in full.u}
-    inputs |= {f"{n}_{k}": u[n] for n in ("R", "L") if n in u for k in "abc"}
+    inputs |= {f"{n}_{k}": u[n] for n in _by_phase(load_kind) for k in "abc"}
     u_full = full.u.stack(inputs)
     fault = ca.SX(0, 1)
     if faulty:  # with k_rf = 0, h = mu/(1 - mu); only h matters if kappa = mu
@@ -132,8 +142,8 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
 
 def load_kind(point: GeneratorPoint) -> str:
     """Return the kind of load of a steady point."""
-    names = point.ss.u.names
-    return "constant_power" if "P_load" in names else "inductive" if "L_a" in names else "resistive"
+    assert point.ss.load is not None
+    return point.ss.load.kind
 
 
 def generator_vectors(
@@ -148,9 +158,7 @@ def generator_vectors(
     ss = averaged_generator(gen, load_kind(point))
     x_full = point.ss.x.unpack(point.x)
     values = {n: u_full[n] for n in ss.u.names if n in u_full}
-    for n in ("R", "L"):
-        if n not in ss.u:
-            continue
+    for n in _by_phase(load_kind(point)):
         phases = [u_full[f"{n}_{k}"] for k in "abc"]
         if not np.allclose(phases, phases[0], rtol=1e-9, atol=0):
             raise SignalError(
@@ -210,7 +218,7 @@ def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
 
     Args:
         apu: the unit.
-        load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"``.
+        load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
     """
     X, U, TH, Y = _joint_signals(apu, load_kind)
     Z = apu.gas_generator.z

@@ -26,14 +26,14 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import fineness
+from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import SPEED_RANGE, Propagator
 from apu_casadi.unit.exchange import PAPER, Exchange
 from apu_casadi.unit.stepmeans import StepMeans
 
 if TYPE_CHECKING:
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 SOLVERS = ("auto", "cvodes", "idas", "propagator")
@@ -97,8 +97,8 @@ class Phase:
 
     gen: Generator
     load: Load
-    fault: Ttsc | None
-    ss: StateSpace
+    fault: Fault | None
+    ss: GeneratorModel
     u: np.ndarray
     theta: np.ndarray
     symmetric: bool
@@ -289,7 +289,7 @@ class Stepwise:
 
     def over(self, step: Step, quad: tuple[str, ...], share: float = 1.0) -> Integrated:
         """Integrate over a step, which is the first ``share`` of a longer one."""
-        s, fine = self.settings, fineness(self.phase.load)
+        s, fine = self.settings, self.phase.load.fineness
         run = stepper(
             self.model,
             s.n_out(step.h),

@@ -16,7 +16,6 @@ import numpy as np
 
 from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
-from apu_casadi.machine.loads.load import SeriesLoad
 from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Ambient, Event, FaultChange, HealthChange, LoadChange
@@ -28,7 +27,7 @@ from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Row
 
 if TYPE_CHECKING:
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 
@@ -43,7 +42,7 @@ class Asked:
     """
 
     load: Load
-    fault: Ttsc | None
+    fault: Fault | None
     ambient: Ambient
     health: dict[str, float]
     grid: np.ndarray
@@ -65,7 +64,7 @@ class JointRun:
         self, apu: Apu, asked: Asked, settings: Settings, rng: np.random.Generator
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
-        start = _balanced_part(asked.load)
+        start = asked.load.balanced_part
         self.factors = dict(asked.health)
         self.point = apu.steady_state(start, ambient=asked.ambient, health=self.factors)
         self.machine = MachineStep(apu, self.point.generator, start, settings, asked.phasors)
@@ -179,13 +178,3 @@ class JointRun:
         words = validity.overload(self.apu, N=N, Wf=Wf, health=self.factors, **asked)
         words = words or f"{error}; {validity.before(gg, t, self.y)}"
         return SimulationError(f"at t = {end:.6g} s: {words}")
-
-
-def _balanced_part(load: Load) -> Load:
-    """Return the load itself when balanced, else the balanced load of equal mean admittance."""
-    if not isinstance(load, SeriesLoad) or load.balanced:
-        return load
-    w = 2 * math.pi * 400.0
-    Y = sum(1 / complex(R, w * L) for R, L in zip(load.R, load.L, strict=True)) / 3
-    Z = 1 / Y
-    return SeriesLoad(R=(Z.real,) * 3, L=(max(Z.imag, 0.0) / w,) * 3)

@@ -19,7 +19,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.core.statespace import StateSpace

@@ -32,7 +32,7 @@ from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
 if TYPE_CHECKING:
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 NOISE = tuple(["w1_q", "w1_d", "w1_0", "w2_fd", "w2_kd", "w2_kq"])
@@ -99,7 +99,7 @@ class MachineStep:
         """What must be known of the steps so far."""
         return [*self.spikes, *self.means.warnings]
 
-    def switch(self, load: Load, fault: Ttsc | None, t: float) -> bool:
+    def switch(self, load: Load, fault: Fault | None, t: float) -> bool:
         """Change load and fault at the instant t, s, where they differ; the flux linkages stay."""
         old = self.phase
         if load == old.load and fault == old.fault:

@@ -29,7 +29,6 @@ from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
-from apu_casadi.machine.loads.load import fineness
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import (
@@ -48,15 +47,15 @@ from apu_casadi.unit.stepmeans import MEANS, rms_at_rest
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 
 @kept
 def joint_state_space(
     apu: Apu,
-    load_kind: str = "resistive",
-    faulted: str | None = None,
+    load: Load | str = "resistive",
+    fault: Fault | str | None = None,
     integrals: tuple[str, ...] = (),
 ) -> StateSpace:
     """Return the unit as one :class:`StateSpace`.
@@ -68,14 +67,14 @@ def joint_state_space(
 
     Args:
         apu: the unit.
-        load_kind, faulted: variant of the generator, see :mod:`apu_casadi.machine.generator`.
+        load, fault: variant of the generator, see :meth:`Generator.state_space`.
         integrals: what of the generator is to be averaged, see :mod:`apu_casadi.core.means`: the
             time integrals are carried as further states ``int_P_total``, ``int_v_a^2``, and with
             them the time ``t_step`` since the step's start; the step's length ``h_step`` is then an
             input.  As states they cost IDAS nothing; as quadratures every step would solve the gas
             path once more.
     """
-    gg, gen = apu.gas_generator, apu.generator.state_space(load_kind, faulted)
+    gg, gen = apu.gas_generator, apu.generator.state_space(load, fault)
     own_u = [s for s in gen.u if s.name != "w_r"]
     clock = [Signal("t_step", "s", "time since the step's start", nominal=0.02)]
     length = [Signal("h_step", "s", "length of the step", nominal=0.02)]
@@ -90,9 +89,11 @@ def joint_state_space(
     u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
     ends = np.cumsum([0, 1, len(apu.governor.X), len(gen.x)]).tolist()
     N, x_gov, x_sg = (x[i:j] for i, j in pairwise(ends))
-    health, fault = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
+    health, severity = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
-    u_gg, moves, y_sg = coupled(apu.link, gen, N=N, x=x_gov, x_gen=x_sg, inputs=inputs, fault=fault)
+    u_gg, moves, y_sg = coupled(
+        apu.link, gen, N=N, x=x_gov, x_gen=x_sg, inputs=inputs, fault=severity
+    )
     share = x[X.index("t_step")] / u[U.index("h_step")] if integrals else ca.MX(0)
 
     def model(z: Any) -> tuple[Any, Any, Any]:
@@ -203,7 +204,7 @@ class _OneModel:
     ) -> None:
         self.apu, self.grid, self.ambient, self.how = apu, grid, ambient, how
         self.load, self.factors = load, health
-        self.fault: Ttsc | None = None
+        self.fault: Fault | None = None
         self.point = apu.steady_state(load, ambient=ambient, health=health)
         self.y, self.nsteps, self.worst = self.point.gas.y, 0, 0.0
         own = (*apu.governor.start(self.point.gas["Wf"]), *self.point.generator.x)
@@ -267,7 +268,7 @@ class _OneModel:
     def advance(self, k: int, _until: float) -> tuple[int, np.ndarray]:
         """Integrate over one output interval."""
         t, h = float(self.grid[k]), float(self.grid[k + 1] - self.grid[k])
-        gg, at, fine = self.apu.gas_generator, self.ss.x.index("theta_e"), fineness(self.load)
+        gg, at, fine = self.apu.gas_generator, self.ss.x.index("theta_e"), self.load.fineness
         self.u[-1] = h
         how = self.how | {n: fine * self.how[n] for n in ("rtol", "atol")}
         x0 = np.concatenate([self.x, np.zeros(1 + len(self.quad))])

@@ -37,13 +37,13 @@ from apu_casadi.unit.exchange import EXCHANGES
 from apu_casadi.unit.integrators import SOLVERS, WAVEFORMS, Settings, ramped
 from apu_casadi.unit.jointrun import Asked, JointRun
 from apu_casadi.unit.noise import Noise
-from apu_casadi.unit.recorder import Recorder
+from apu_casadi.unit.recorder import Recorder, stored_severities
 from apu_casadi.unit.stepmeans import MEANS
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
 
 __all__ = [
@@ -80,7 +80,7 @@ def simulate_joint(
     load: Load,
     ambient: Ambient | None = None,
     health: Mapping[str, float] | None = None,
-    fault: Ttsc | None = None,
+    fault: Fault | None = None,
     events: Sequence[Event] = (),
     dt: float = 0.02,
     exchange: str = "paper",
@@ -171,7 +171,8 @@ def simulate_joint(
     rng = np.random.default_rng(seed)
     system = JointRun(apu, asked, settings, rng)
     samples, means = system.machine.samples(asked.grid), system.machine.means
-    record = Recorder(apu.gas_generator, asked.grid, samples, means, storage)
+    severities = stored_severities(events, asked.fault)
+    record = Recorder(apu.gas_generator, asked.grid, samples, means, storage, severities)
     record.put(0, 1, system.at_start())
     run(system, asked.grid, events, record=record.put, progress=progress)
     return _concluded(system, record, rng, exchange, events, warn_exchange, attrs or {})

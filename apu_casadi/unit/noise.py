@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import SignalError, nearest
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.machine.generator import MeasurementNoise
+from apu_casadi.machine.measurement import MeasurementNoise
 
 
 @dataclass(frozen=True)

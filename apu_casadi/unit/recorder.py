@@ -5,28 +5,32 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
-import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from apu_casadi.core.filearrays import RowFile
+from apu_casadi.core.measuring import measure
 from apu_casadi.core.results import dataset
-from apu_casadi.core.runstorage import PIECE, RowFile, place, row_file
+from apu_casadi.core.runstorage import PIECE, place, row_file
+from apu_casadi.core.signals import Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import Event, FaultChange
 from apu_casadi.unit.integrators import WAVEFORMS
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans, phasor_signals
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.unit.noise import Noise
 
 _TOGETHER = 512  # entries of means whose rms values are made at once
-_HEALTHY = (0.0, math.nan, math.nan)
+_STORED = Signals(Ttsc.severities)  # severities that every run stores
 _WAVE_ROWS = ("time_w", *(f"{n} waveform" for n in WAVEFORMS))  # P_total is a mean as well
 
 
@@ -43,7 +47,7 @@ class Row(NamedTuple):
     y: np.ndarray
     means: RawMeans | np.ndarray
     factors: Mapping[str, float]
-    fault: Ttsc | None
+    fault: Fault | None
     t: np.ndarray
     w: np.ndarray
 
@@ -58,6 +62,7 @@ class Recorder:
         samples: waveform samples in all, the start included.
         means: makes what is kept of the means.
         storage: see :func:`apu_casadi.unit.multirate.simulate_joint`.
+        severities: what is kept of the severity of faults.
     """
 
     def __init__(
@@ -67,16 +72,18 @@ class Recorder:
         samples: int,
         means: StepMeans,
         storage: str | os.PathLike[str] = "memory",
+        severities: Signals = _STORED,
     ) -> None:
+        self.severities = severities
         self._raw, self._raw_at = list[RawMeans](), 0
         self.gg, self.grid, self._means = gg, grid, means
-        n_slow = len(gg.Y) + len(means.kept) + len(gg.THETA) + 3
+        n_slow = len(gg.Y) + len(means.kept) + len(gg.THETA) + len(severities)
         size = 8 * (n_slow * grid.size + (1 + len(WAVEFORMS)) * samples)
         self._first = self._end = 0  # instants in the arrays
         self._first_w = self._n = 0  # samples before those in the arrays, and in them
         self._residual = 0.0
         self._factors: Mapping[str, float] | None = None
-        self._fault: Ttsc | None = None
+        self._fault: Fault | None = None
         self.file: RowFile | None = None
         where = place(size, storage)
         if where is None:
@@ -93,7 +100,8 @@ class Recorder:
     def _allocate(self, steps: int, samples: int) -> None:
         self.Y = np.zeros((len(self.gg.Y), steps))
         self.means = np.zeros((len(self._means.kept), steps))
-        self.held = np.empty((len(self.gg.THETA) + 3, steps))  # health and severity
+        # health and severity
+        self.held = np.empty((len(self.gg.THETA) + len(self.severities), steps))
         self.t_w = np.empty(samples)
         self.waves = np.empty((len(WAVEFORMS), samples))
 
@@ -107,7 +115,7 @@ class Recorder:
             self.means[:, at] = row.means.reshape(-1, n)
         if row.factors is not self._factors or row.fault is not self._fault:
             self._factors, self._fault = row.factors, row.fault
-            now = (*row.factors.values(), *_severity(row.fault))
+            now = (*row.factors.values(), *_now(self.severities, row.fault))
             self._column = np.array(now)[:, None]
         self.held[:, at] = self._column
         if self.t_w.size:
@@ -200,7 +208,8 @@ class Recorder:
     def _slow(self) -> dict[str, np.ndarray]:
         """Means, rms values, phasors, health and severity by name."""
         d = dict(zip(self._means.kept, self.means, strict=True))
-        return d | dict(zip((*self.gg.THETA.names, "mu", "k_rf", "kappa"), self.held, strict=True))
+        names = (*self.gg.THETA.names, *self.severities.names)
+        return d | dict(zip(names, self.held, strict=True))
 
     def collect(
         self,
@@ -212,7 +221,7 @@ class Recorder:
     ) -> xr.Dataset:
         """Put the run into a labelled dataset, with what noisy sensors read of it."""
         gg, y_sg = self.gg, apu.generator.state_space().y
-        signals = [*gg.Y, *phasor_signals()]
+        signals = [*gg.Y, *phasor_signals(), *self.severities]
 
         def measured(signal: Any, values: np.ndarray) -> dict[str, Any]:
             name = f"{signal.name}_meas"
@@ -221,8 +230,7 @@ class Recorder:
 
         values: dict[str, dict[str, Any]] = {"time": dict(run)}
         for n, s in noise.gas.items():
-            drawn = s * rng.standard_normal(self.grid.size)
-            values["time"] |= measured(gg.Y[n], np.asarray(run[n]) + drawn)
+            values["time"] |= measured(gg.Y[n], measure(run[n], s, rng))
         times = {"time": self.grid}
         t_w, w = self.samples()
         if w:
@@ -236,7 +244,14 @@ class Recorder:
         return dataset(times, values, signals=signals, attrs=told)
 
 
-def _severity(fault: Ttsc | None) -> tuple[float, float, float]:
-    if fault is None:
-        return _HEALTHY
-    return fault.mu, fault.k_rf, math.nan if fault.kappa is None else fault.kappa
+def stored_severities(events: Iterable[Event], *others: Fault | None) -> Signals:
+    """Return what a run stores of the severity of its faults, the TTSC's always."""
+    faults = (*(e.fault for e in events if isinstance(e, FaultChange)), *others)
+    stored = [*_STORED, *(s for f in faults if f is not None for s in f.severities)]
+    return Signals({s.name: s for s in stored}.values())
+
+
+def _now(severities: Signals, fault: Fault | None) -> list[float]:
+    """Return their values under a fault or without one."""
+    values = {} if fault is None else fault.severity
+    return [values.get(s.name, s.default or 0.0) for s in severities]

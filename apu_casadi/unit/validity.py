@@ -36,7 +36,6 @@ from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.machine.loads.load import ConstantPowerLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import Governor
 from apu_casadi.unit.events import Event, LoadChange
@@ -167,13 +166,13 @@ def unserved(load: Load, events: Sequence[Event], t: np.ndarray, P_e: np.ndarray
     starts = [(0.0, load), *changes]
     for (start, x), end in zip(starts, [*(s for s, _ in changes), float(t[-1])], strict=True):
         k = int(np.searchsorted(t, end + 1e-9)) - 1
-        if not isinstance(x, ConstantPowerLoad) or end - start < SETTLED:
+        if end - start < SETTLED:
             continue
-        if P_e[k] < 0.9 * x.P:
+        if P_e[k] < 0.9 * x.demand:
             return (
                 f"the load asks for more than the generator can give: at t = {t[k]:.6g} s it gets "
-                f"{P_e[k] / 1e3:.1f} kW of the {x.P / 1e3:.1f} kW asked of each generator; the "
-                f"voltage has collapsed"
+                f"{P_e[k] / 1e3:.1f} kW of the {x.demand / 1e3:.1f} kW asked of each generator; "
+                f"the voltage has collapsed"
             )
     return None
 

@@ -30,8 +30,8 @@ from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.exchange import moved
 from estimators.apu.sensors import GAS_PATH, SensorSet
-from estimators.batch.fit import FitProblem, FitResult, quantile
-from estimators.information.intervals import share_interval
+from estimators.batch.fit import FitProblem, FitResult
+from estimators.information.consistency import coverage as shares_covered
 from estimators.models.filtermodel import FilterModel, biases, gains, measure, measured_inputs
 from estimators.models.lifting import Lifted, lift
 from estimators.models.recording import Recording, plain_numbers, record
@@ -49,25 +49,19 @@ __all__ = [
     "words",
 ]
 
-HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
-INPUTS = ("Wf", "PW")
+HEALTH = GasGenerator.THETA.names
+OUTPUTS = GAS_PATH.outputs
+INPUTS = tuple(n for n in GAS_PATH.names if n not in OUTPUTS)
 OPEN = 10.0  # standard deviation of an input that is not measured, of its magnitude: tells nothing
 SMOOTH = 0.4  # s; readings are averaged over this to find the noise that is relative to them
 MAX_DT = 0.2  # s; the model takes one step from sample to sample
-
-_WORDS = {
-    "f_eta_c": "compressor efficiency",
-    "f_W_c": "compressor flow",
-    "f_eta_t": "turbine efficiency",
-    "f_W_t": "turbine flow capacity",
-}
 
 
 def words(name: str) -> str:
     """Return what a parameter is, in words."""
     base = name.partition("[")[0]
-    if base in _WORDS:
-        return _WORDS[base]
+    if base in HEALTH:
+        return GasGenerator.THETA[base].doc.removesuffix(" factor")
     kind, _, sensor = base.partition("_")
     return {"gain": f"gain of the {sensor} sensor", "bias": f"bias of the {sensor} sensor"}[kind]
 
@@ -346,7 +340,6 @@ def fit_engine(
 
 # ------------------------------------------------------------------------------ coverage
 
-OUTPUTS = ("N", "P3", "T3", "T5")
 POWERS = (100e3, 175e3, 250e3, 325e3, 400e3)  # W; the steady points of the study
 READINGS = 25  # of each sensor at each steady point, half a second at 20 ms
 STEP = (150e3, 350e3)  # W; before and after the load step of the transient
@@ -407,11 +400,9 @@ def noisy(
     sensors: SensorSet = GAS_PATH,
 ) -> EngineData:
     """Return the data as sensors would read them; the noise is relative to the true reading."""
-    out = {}
-    for name, v in data.readings.items():
-        sigma = np.array([sensors.sigma(name, x) for x in v]) / np.sqrt(averaged)
-        out[name] = v * (1 + (gain or {}).get(name, 0.0)) + sigma * rng.standard_normal(v.size)
-    return dataclasses.replace(data, readings=out)
+    true = data.readings
+    read = sensors.measure(true, rng, gains=gain, averaged=averaged, noise_of="true")
+    return dataclasses.replace(data, readings=read)
 
 
 KINDS = ("steady", "transient", "steady, gains considered", "steady, gains ignored")
@@ -449,7 +440,7 @@ def coverage(
     began = time.perf_counter()
     gg = _engine()
     steady = kind != "transient"
-    gained = ("P3", "T3", "T5") if "gains" in kind else ()
+    gained = OUTPUTS[1:] if "gains" in kind else ()
     lifted = engine_model(gg, OUTPUTS, gain=gained, steady=steady)
     considered = {f"gain_{g}": GAS_PATH[g].gain for g in gained} if "considered" in kind else {}
     healths = _healths(seed0)
@@ -464,7 +455,7 @@ def coverage(
     for i in range(n):
         rng = np.random.default_rng([seed0, 1, i])
         who = i % ENGINES
-        gain = {g: GAS_PATH[g].gain * float(rng.standard_normal()) for g in gained}
+        gain = GAS_PATH.draw_gains(rng, gained)
         data = noisy(truth[who], rng, averaged=averaged, gain=gain)
         rec = to_recording(gg, lifted, data, averaged=averaged)
         try:
@@ -477,25 +468,11 @@ def coverage(
             freedom = r.freedom
         if progress is not None:
             progress(i + 1, n)
-    inside = np.abs(error) <= quantile(level) * sigma  # a failed fit covers nothing
-    rows = []
-    for j, name in enumerate(HEALTH):
-        k = int(inside[:, j].sum())
-        low, high = share_interval(k, n)
-        rows.append(
-            {
-                "name": name,
-                "covered": k / n,
-                "low": low,
-                "high": high,
-                "rms_error": float(np.sqrt(np.nanmean(error[:, j] ** 2))),
-                "mean_sigma": float(np.nanmean(sigma[:, j])),
-                "bias_over_its_error": float(
-                    np.nanmean(error[:, j])
-                    / (np.nanstd(error[:, j]) / np.sqrt(np.isfinite(error[:, j]).sum()))
-                ),
-            }
-        )
+    # a failed fit covers nothing
+    rows = [
+        {"name": name, **shares_covered(error[:, j], sigma[:, j], level)}
+        for j, name in enumerate(HEALTH)
+    ]
     return {
         "kind": kind,
         "n": n,

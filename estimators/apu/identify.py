@@ -21,9 +21,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import scipy.stats
 
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
+from apu_casadi.core.measuring import measure
 from apu_casadi.core.sharing import kept, last
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
@@ -31,9 +31,10 @@ from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
-from estimators.apu.sensors import ELECTRICAL, GAS_PATH, Sensor, SensorSet
+from apu_casadi.machine.loads.series import SeriesLoad
+from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from estimators.filters.belief import Belief
+from estimators.information import consistency
 from estimators.information.identifiability import (
     Identifiability,
     Sensitivities,
@@ -42,7 +43,8 @@ from estimators.information.identifiability import (
     steady_sensitivities,
     together,
 )
-from estimators.models.filtermodel import Unknown, augment, discretise, measure, noisy_inputs
+from estimators.models import filtermodel
+from estimators.models.filtermodel import Unknown, augment, discretise, noisy_inputs
 from estimators.models.recording import Recording
 
 __all__ = [
@@ -75,17 +77,10 @@ POINTS: dict[str, dict[str, float]] = {
 }
 
 #: What a gas-path filter has without the generators.
-BASE = ("N", "P3", "T3", "T5", "Wf")
+BASE = tuple(n for n in GAS_PATH.names if n != "PW")
 
 #: The sensors of the gas-path table, and some that could be added.
-CANDIDATES = SensorSet(
-    (
-        *GAS_PATH.sensors,
-        Sensor("W2", 0.01, True, 0.01, "kg/s", "assumed: bellmouth, 1 %"),
-        Sensor("P5", 0.005, True, 0.005, "Pa", "assumed: as P3"),
-        Sensor("T41", 0.01, True, 0.01, "K", "assumed: pyrometer, 1 %"),
-    )
-)
+CANDIDATES = GAS_PATH.add("W2", "P5", "T41")
 
 SAMPLES = 50  # of 20 ms: a snapshot of 1 s
 PRIOR = 0.02  # standard deviation of each health factor before the snapshot
@@ -176,6 +171,20 @@ def gas_path(
     return together(parts, shared=constant)
 
 
+def _readings(
+    gg: GasGenerator, sensors: SensorSet, at: OperatingPoint
+) -> tuple[np.ndarray, np.ndarray]:
+    """Readings of sensors at a steady point, where no lag shows, and their derivatives by Y."""
+    for s in sensors.sensors:
+        if not set(s.reads) <= set(gg.Y.names):
+            raise ParameterError(f"sensor {s.name!r} measures no output of the gas generator")
+    y = ca.SX.sym("y", len(gg.Y))
+    seen = ca.vertcat(*(s.of(gg.Y.unpack(y)) for s in sensors.sensors))
+    values = np.array([at[n] for n in gg.Y.names])
+    read, along = ca.Function("readings", [y], [seen, ca.jacobian(seen, y)])(values)
+    return read.full().ravel(), along.full()
+
+
 def _gas_path(
     point: str,
     gg: GasGenerator,
@@ -187,10 +196,7 @@ def _gas_path(
     gain_errors: bool,
 ) -> Sensitivities:
     at, H, _ = _derivatives(point, gg)
-    unknown = [n for n in sensors.names if n not in gg.Y]
-    if unknown:
-        raise ParameterError(f"sensor {unknown[0]!r} measures no output of the gas generator")
-    y = np.array([at[n] for n in sensors.names])
+    y, along = _readings(gg, sensors, at)
     sigma = np.array([sensors.sigma(n, v) for n, v in zip(sensors.names, y, strict=True)])
     sigma /= math.sqrt(samples)
     if "PW" in sensors.names:
@@ -202,7 +208,7 @@ def _gas_path(
         *(Signal(s.name, s.unit, s.doc) for s in gg.THETA),
     ]
     priors = dict.fromkeys(gg.THETA.names, prior)
-    columns = [H[gg.Y.indices(sensors.names)]]
+    columns = [along @ H]
     gains = {
         s.name: (eta_bias if s.name == "PW" else s.gain if gain_errors else 0.0)
         for s in sensors.sensors
@@ -262,7 +268,7 @@ def gas_path_transient(
     Wf = np.interp(PW, [from_power, to_power], [e["Wf"] for e in ends])
     noise = {"Wf": sensors["Wf"].noise * ends[1]["Wf"]}
     noise["PW"] = power_noise * to_power if power else UNKNOWN_PW
-    model = measure(discretise(ss), ["N", "P3", "T3", "T5"])
+    model = filtermodel.measure(discretise(ss), GAS_PATH.outputs)
     model = augment(noisy_inputs(model, noise), {n: Unknown() for n in gg.THETA.names})
     x = np.ones((len(model.x), K))
     x[0, 0] = ends[0]["N"]
@@ -533,7 +539,7 @@ def snapshot_trials(
         rng = np.random.default_rng(seed)
         true = start.copy()
         true[2:] += prior * rng.standard_normal(4)
-        y = read(true)[0][rows] + sigma * rng.standard_normal(len(rows))
+        y = measure(read(true)[0][rows], sigma, rng)
         y[power] += bias * rng.standard_normal()
         for label, use in (("before", without), ("after", list(range(len(rows))))):
             found, cov = _most_probable(read, start, y[use], [rows[i] for i in use],
@@ -554,7 +560,7 @@ def snapshot_trials(
     square = np.array([(e**2).sum(1) for e in (before, after)])
     drawn = 1 - np.sqrt(square[1][pick].sum(1) / square[0][pick].sum(1))
     low, high = (float(q) for q in np.quantile(drawn, [0.025, 0.975]))
-    band = scipy.stats.chi2.ppf([0.025, 0.975], 4 * n) / (4 * n)
+    band = consistency.band(n, 4)
     return Trials(
         seeds=n,
         rms_before=rms(before),
@@ -564,7 +570,7 @@ def snapshot_trials(
         reduction=1 - rms(after) / rms(before),
         interval=(low, high),
         nees=float(np.mean(nees)),
-        nees_band=(float(band[0]), float(band[1])),
+        nees_band=(band[0] / 4, band[1] / 4),
         null_before=rms(before @ null),
         null_after=rms(after @ null),
     )

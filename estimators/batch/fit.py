@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
-from scipy.special import ndtri
 
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
 from apu_casadi.core.sharing import Rebuilt, building
 from estimators.batch.transcription import Solution, Transcription
 from estimators.filters.belief import Belief
+from estimators.information.consistency import above, sigmas
 from estimators.models.filtermodel import FilterModel
 from estimators.models.lifting import Lifted, plain
 from estimators.models.recording import Recording
@@ -46,7 +46,6 @@ __all__ = [
     "Profile",
     "fit",
     "profile",
-    "quantile",
 ]
 
 #: Eigenvalue of the information, parameters scaled to unit information each, below which a
@@ -54,17 +53,6 @@ __all__ = [
 RANK_TOL = 1e-10
 WEAK_TOL = 1e-4
 _AT_BOUND = 1e-6  # of the parameter's magnitude
-
-
-def quantile(level: float) -> float:
-    """Return how many standard deviations on either side hold a share ``level`` of a Gaussian.
-
-    Raises:
-        ParameterError: a level outside (0, 1).
-    """
-    if not 0 < level < 1:
-        raise ParameterError(f"level = {level!r} must lie between 0 and 1")
-    return float(ndtri(0.5 + level / 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,15 +139,13 @@ class FitResult:
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval of one parameter, from its standard error."""
         m, s = self[name]
-        z = quantile(level)
+        z = sigmas(level)
         return m - z * s, m + z * s
 
     @cached_property
     def p_value(self) -> float:
         """Probability of a chi2 at least this large if model and sigmas are right."""
-        from scipy.stats import chi2
-
-        return float(chi2.sf(self.chi2, self.freedom)) if self.freedom > 0 else math.nan
+        return float(above(self.chi2, self.freedom)) if self.freedom > 0 else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -669,7 +655,7 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
     run, i = result._run, result._run.problem.free[j]
     program = run.problem.program
     scale = program.theta_scale[i]
-    best, target = run.solution, quantile(level)
+    best, target = run.solution, sigmas(level)
     at = best.z[i] * scale
     sigma = result.sigma[j] if np.isfinite(result.sigma[j]) and result.sigma[j] > 0 else None
     seen: dict[float, float] = {at: 0.0}

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, SignalError
 from apu_casadi.core.results import dataset
 from apu_casadi.core.sharing import Parametric, derived, kept
@@ -35,6 +36,7 @@ __all__ = [
     "STEP_OUT",
     "FilterResult",
     "FilterStep",
+    "StepMaker",
     "block_of",
     "narrow",
     "padded",
@@ -73,6 +75,22 @@ class FilterStep(Parametric):
     function: ca.Function
     root: bool = False
     wide: Callable[[], FilterStep] | None = None
+
+    def __post_init__(self) -> None:
+        f, (nx, nu, np_, _, ny) = self.function, self.model.sizes
+        want_in = (nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)
+        want_out = (nx, 1), (nx, nx), (nx, 1), (nx, nx), (nx, nx), (ny, 1), (ny, ny), (4, 1)
+        got_in = [f.size_in(i) for i in range(f.n_in())]
+        got_out = [f.size_out(i) for i in range(f.n_out())][: len(STEP_OUT)]
+        for what, names, got, want in (
+            ("inputs", STEP_IN, got_in, want_in),
+            ("outputs", STEP_OUT, got_out, want_out),
+        ):
+            if got != [*want]:
+                shown = ", ".join(f"{n} {s}" for n, s in zip(names, want, strict=True))
+                raise SignalError(
+                    f"step {f.name()} of {self.model.name}: {what} {shown} expected, got {got}"
+                )
 
     @property
     def gives_roots(self) -> bool:
@@ -178,6 +196,10 @@ class FilterResult:
             signals=signals,
             attrs={"loglik": float(self.loglik)},
         )
+
+
+#: Makes a filter's step for a model: ``ekf_step``, ``ukf_step``, or a function of one's own.
+StepMaker = Callable[[FilterModel], FilterStep]
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:

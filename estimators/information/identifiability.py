@@ -40,6 +40,7 @@ from apu_casadi.core.errors import EstimationError, ParameterError, SignalError,
 from apu_casadi.core.signals import Signal, Signals
 from estimators.filters.belief import Belief
 from estimators.information.bounds import linearisations
+from estimators.information.consistency import exceeded
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
@@ -405,7 +406,7 @@ def noncentrality(P_fa: float, P_d: float, dof: int = 1) -> float:
         raise ParameterError(
             f"0 < P_fa < P_d < 1 and dof >= 1 expected, got {P_fa!r}, {P_d!r}, {dof!r}"
         )
-    limit = float(scipy.stats.chi2.isf(P_fa, dof))
+    limit = float(exceeded(P_fa, dof))
 
     def missing(lam: float) -> float:
         return float(scipy.stats.ncx2.sf(limit, dof, lam)) - P_d

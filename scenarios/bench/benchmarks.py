@@ -208,7 +208,7 @@ def _plain_newton(gg: GasGenerator) -> Callable[..., tuple[np.ndarray, float, bo
 
 def deck(size: Size) -> list[Row]:
     """A performance deck on all cores, two at most."""
-    from apu_casadi.core.backend import available_threads
+    from apu_casadi.core.calling import available_threads
     from apu_casadi.gaspath.steady.steadypoint import Status
     from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
     from scenarios.studies import trim_study
@@ -246,7 +246,8 @@ def derivatives(size: Size) -> list[Row]:
     """F and g of the gas generator with Jacobians by state, inputs and health, compiled."""
     import casadi as ca
 
-    from apu_casadi.core.backend import Caller, compiled
+    from apu_casadi.core.backend import compiled
+    from apu_casadi.core.calling import Caller
     from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 
     gg = _apu().gas_generator
@@ -318,7 +319,7 @@ def _central(
 
 def linearisation(size: Size) -> list[Row]:
     """The joint model's linearisation at a trim."""
-    from apu_casadi.machine.loads.load import SeriesLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.averaged import joint_vectors
     from apu_casadi.unit.linearisation import linearise_joint
 
@@ -451,7 +452,7 @@ def _child_virtual_machine(case: dict[str, Any]) -> dict[str, Any]:
 
 def campaign(size: Size) -> list[Row]:
     """Many joint runs with random faults on two cores."""
-    from apu_casadi.core.backend import available_threads
+    from apu_casadi.core.calling import available_threads
     from apu_casadi.core.results import phase_summary
     from scenarios.campaigns import counts, random_faults, run_campaign
 
@@ -726,14 +727,14 @@ def estimation(size: Size) -> list[Row]:
     from estimators.apu.electrical.electricalfilter import electrical_filter
     from estimators.filters.ekf import extended_kalman_filter
     from estimators.filters.ukf import unscented_kalman_filter
-    from scenarios.studies import jointrun, timing
+    from scenarios.studies import jointrun
     from scenarios.studies.electrical.protocol import FULL
-    from scenarios.studies.electrical.speed import speed
+    from scenarios.studies.electrical.steptime import filterpy_step_us, speed
     from scenarios.studies.electrical.truth import generator_truth, samples_of
 
     steps = speed(repeat=size.repeats)
     name, fastest = next(iter(steps["rows"].items()))
-    peer = timing.filterpy_step_us(repeat=max(1, size.repeats // 2))
+    peer = filterpy_step_us(repeat=max(1, size.repeats // 2))
     samples = samples_of(generator_truth(FULL, 0.05), np.random.default_rng(0))
     filt = electrical_filter()
     data, prior = filt.recording(samples), filt.prior(samples)
@@ -749,7 +750,7 @@ def estimation(size: Size) -> list[Row]:
                 peer="filterpy's UKF, same functions" if other else "",
                 ratio=peer / fastest["ukf_us"] if other and peer is not None else None)
         )  # fmt: skip
-    joint = timing.joint_seconds(repeat=max(1, size.repeats // 2))
+    joint = jointrun.joint_seconds(repeat=max(1, size.repeats // 2))
     ends = jointrun.report(jointrun.estimate(jointrun.truth("joint"), 1))["phases"]
     error = max(
         abs(v["estimate"] - v["true"]) / (v["half_width"] / jointrun.Z95)

@@ -18,24 +18,21 @@ import os
 import sys
 from pathlib import Path
 
+from scenarios.commands import given
 from scenarios.shell import jsontext, usage
 
 NAME = "bench"
 HELP = "measure times and their accuracy (takes minutes)"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--only", metavar="A,B", help="parts to measure, comma separated")
-    parser.add_argument("--list", action="store_true", help="list the parts and stop")
-    parser.add_argument("--peers", action="store_true", help="also measure dpsim and pyCycle")
-    parser.add_argument(
-        "--pycycle-python", metavar="PYTHON", help="a Python that has pyCycle, for --peers"
-    )
-    parser.add_argument("--runs", type=int, help="joint runs of the campaign (default 1000)")
-    parser.add_argument("--json", action="store_true", help="print JSON only")
-    parser.add_argument("--page", metavar="FILE", help="also write the page, BENCHMARKS.md")
-    parser.add_argument("--quiet", action="store_true", help="do not say what is being measured")
+OPTIONS = """
+--only A,B              | parts to measure, comma separated
+--list                  | list the parts and stop
+--peers                 | also measure dpsim and pyCycle
+--pycycle-python PYTHON | a Python that has pyCycle, for --peers
+--runs int              | joint runs of the campaign (default 1000)
+--json                  | print JSON only
+--page FILE             | also write the page, BENCHMARKS.md
+--quiet                 | do not say what is being measured
+"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         size = dataclasses.replace(size, runs=args.runs)
     names = None
     if args.only is not None:
-        names = [n.strip() for n in args.only.split(",") if n.strip()]
+        names = given.names(args.only)
         names += [n for n in benchmarks.PEERS if args.peers and n not in names]
     if args.page:
         registry.prepare(Path(args.page).parent)
@@ -77,5 +74,5 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(benchmarks.table(report))
         if made:
-            print("\nwritten:", *(f"  {path}" for path in made), sep="\n")
+            given.written(made)
     return 0 if all(r.accurate for rows in report.rows.values() for r in rows) else 1

@@ -16,7 +16,8 @@ PACKAGES = ("apu-casadi", "casadi", "numpy", "scipy", "xarray")
 
 def machine() -> dict[str, Any]:
     """Return cores, processor, versions, backend, and how busy the machine is."""
-    from apu_casadi.core.backend import available_threads, backend_in_use
+    from apu_casadi.core.backend import backend_in_use
+    from apu_casadi.core.calling import available_threads
 
     model = platform.processor() or platform.machine()
     try:

@@ -33,7 +33,7 @@ from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Event, FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.monolithic import simulate_monolithic
@@ -279,7 +279,7 @@ def table(rows: Sequence[Measured]) -> str:
 
 def figure(rows: Sequence[Measured]) -> Any:
     """Draw errors over exchange step, a panel for each quantity; return a matplotlib Figure."""
-    from scenarios.figures import plotting
+    from scenarios.figures.exchangeplot import figure_exchange_error
 
     curves = {
         (case, ex): (
@@ -292,7 +292,7 @@ def figure(rows: Sequence[Measured]) -> Any:
     }
     if not curves:
         raise ScenarioError("nothing to draw: at least two exchange steps are needed")
-    return plotting.figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
+    return figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
 
 
 def write_figure(rows: Sequence[Measured], path: Path, dpi: float | None = None) -> Path:
@@ -330,7 +330,7 @@ def regulator_mode(generator: Generator | None = None) -> Mode:
 def fault_words() -> str:
     """Tell the severity of the study's stator fault in words."""
     event = CASES["TTSC fault"].event
-    assert isinstance(event, FaultChange) and event.fault is not None
+    assert isinstance(event, FaultChange) and isinstance(event.fault, Ttsc)
     f = event.fault
     return f"mu = {100 * f.mu:g} %, k_rf = {f.k_rf:g} (assumed), kappa = {f.kappa:g} = mu"
 

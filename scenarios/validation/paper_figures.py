@@ -28,7 +28,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from scenarios.validation.comparison import Row, relative, run, section
 
 if TYPE_CHECKING:
@@ -299,31 +299,32 @@ def write_figures(folder: str | os.PathLike[str], *, joint: bool = True) -> list
         DataError: the folder cannot be written.
     """
     from scenarios import registry
-    from scenarios.figures import plotting
+    from scenarios.figures import moduleplots, plotting
+    from scenarios.figures.figstyle import DPI
 
     out = registry.prepare(folder)
     draw = {
         key: partial(
-            plotting.figure_gas_generator,
+            moduleplots.figure_gas_generator,
             key,
             [_gas(sign, "discrete") for sign in HEALTH],
             [_gas(sign, "cvodes") for sign in HEALTH],
             T_STEP,
         )
-        for key in list(plotting.MODULE_FIGURES)[:3]
+        for key in list(moduleplots.MODULE_FIGURES)[:3]
     }
     draw["fig18_healthy_transient"] = partial(
-        plotting.figure_18, _machine("healthy", "cvodes"), _machine("healthy", "idas"), T_SWITCH
+        moduleplots.figure_18, _machine("healthy", "cvodes"), _machine("healthy", "idas"), T_SWITCH
     )
     draw["fig19_ttsc_currents"] = partial(
-        plotting.figure_19,
+        moduleplots.figure_19,
         {kind: _machine(kind, "cvodes") for kind in FAULTS},
         T_SWITCH,
         {k: f"µ = 5 %, $k_{{{{rf}}}}$ = {f.k_rf:g}, h = {f.h:.4f}" for k, f in FAULTS.items()},
     )
     made = []
     for key, figure in draw.items():
-        made.append(files.save_figure(figure(), out / f"{key}.png", dpi=plotting.DPI))
+        made.append(files.save_figure(figure(), out / f"{key}.png", dpi=DPI))
     if joint:
         made += plotting.save_figures(registry.run("joint"), out)
     return made

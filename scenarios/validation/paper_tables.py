@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 
 from apu_casadi.core.sharing import once
-from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator
+from apu_casadi.gaspath.designdata import RPM
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from scenarios.validation.comparison import Row, mean_row, reference, relative, section
 

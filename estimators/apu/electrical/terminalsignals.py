@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import INPUTS, OUTPUTS
 
 __all__ = [
@@ -24,9 +25,8 @@ __all__ = [
     "VOLTAGES",
 ]
 
-PHASES = ("a", "b", "c")
-PHASES_V = ("v_a", "v_b", "v_c")
-PHASES_I = ("i_a", "i_b", "i_c")
+PHASES_V = tuple(f"v_{k}" for k in PHASES)
+PHASES_I = tuple(f"i_{k}" for k in PHASES)
 VOLTAGES = (*PHASES_V, "V_fd")
 MEASURED = (*PHASES_I, "i_fd")
 GAIN_SENSORS = (*VOLTAGES, *MEASURED)

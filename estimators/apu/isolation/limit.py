@@ -11,7 +11,8 @@ from scipy import special
 
 from apu_casadi.core.sharing import kept
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.gaspath.steady.trimming import Limits, trim_gas_generator
+from apu_casadi.gaspath.steady.steadypoint import Limits
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu.isolation.evidence import class_evidence
 from estimators.apu.isolation.problem import CLASSES, DEFAULT, DT, FAULTS, OUTPUTS, Protocol
 from estimators.apu.isolation.scores import scores

@@ -26,9 +26,10 @@ __all__ = [
 
 DT = 0.02  # s
 HEALTH = GasGenerator.THETA.names
-GAINS = ("P3", "T3", "T5", "Wf", "PW")
-OUTPUTS = ("N", "P3", "T3", "T5", "h")
-FAULTS = (*HEALTH, "gain_P3", "gain_T3", "gain_T5", "loss")
+GAINS = (*GAS_PATH.uncertain, "PW")
+OUTPUTS = (*GAS_PATH.outputs, "h")
+READ = tuple(n for n in GAS_PATH.outputs if n in GAINS)  # sensors of which a fault is told
+FAULTS = (*HEALTH, *(f"gain_{n}" for n in READ), "loss")
 """Directions in which something may jump; ``loss`` is shaft power lost in the generators, over the
 design power."""
 
@@ -85,9 +86,7 @@ CLASSES = (
     Hypothesis("compressor pair", ("f_eta_c", "f_W_c"), ((LOSS,), (LOSS,))),
     Hypothesis("turbine pair", ("f_eta_t", "f_W_t"), ((LOSS,), EITHER)),
     Hypothesis("TTSC", ("loss",), ((GAIN,),)),
-    Hypothesis("P3 sensor", ("gain_P3",), (EITHER,)),
-    Hypothesis("T3 sensor", ("gain_T3",), (EITHER,)),
-    Hypothesis("T5 sensor", ("gain_T5",), (EITHER,)),
+    *(Hypothesis(f"{n} sensor", (f"gain_{n}",), (EITHER,)) for n in READ),
 )
 """The classes, equally likely a priori.  Efficiencies and compressor flow fall; turbine flow moves
 either way (fouling, erosion); a sensor errs either way."""

@@ -26,14 +26,14 @@ from estimators.apu.recordings.columns import Column, text_columns
 from estimators.apu.recordings.plausible import PLAUSIBLE, Limits
 from estimators.apu.recordings.timestamps import TIMES, is_time_name, looks_like_time, to_seconds
 from estimators.apu.recordings.units import UNITS, convert, split_unit, unit_of
+from estimators.apu.sensors import KNOWN
 
 __all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_mapping", "read_table"]
 
-_QUANTITIES = frozenset({*PLAUSIBLE, *GasGenerator.Y.names})
-
 
 def _known(name: str) -> bool:
-    return name in _QUANTITIES or is_time_name(name)
+    known = name in PLAUSIBLE or name in KNOWN or name in GasGenerator.Y
+    return known or is_time_name(name)
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,15 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import FLUXES
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES
+from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import FLUX_WALK, H_WALK, START_SIGMA
 from estimators.batch.relinearised import relinearised_filter
 from estimators.filters.belief import Belief
 from estimators.information.bounds import posterior_bound
+from estimators.information.consistency import in_band, nees, rms_interval
 from scenarios.studies.electrical.protocol import (
     CONSTANT,
     DETECT,
@@ -33,7 +35,6 @@ from scenarios.studies.electrical.protocol import (
     SHARE_IN_BAND,
     TWICE,
 )
-from scenarios.studies.electrical.scores import in_band, nees, rmse_interval
 from scenarios.studies.electrical.truth import (
     Truth,
     chances,
@@ -96,7 +97,7 @@ def _scored(
         "bound_h": {k: sigma[j].tolist() for j, k in enumerate(PHASES)},
         "bias_h": {k: (mean[j] / n_seeds).tolist() for j, k in enumerate(PHASES)},
         "ratio_end": end,
-        "ratio_end_interval": rmse_interval(end, 3 * n_seeds),
+        "ratio_end_interval": rms_interval(end, 3 * n_seeds),
         "ratio_worst": pooled,
         "nees_h": in_band(nees_h / n_seeds, n_seeds, 3),
         "nis": in_band(nis / n_seeds, n_seeds, len(MEASURED)),

@@ -9,10 +9,10 @@ import numpy as np
 
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import shunt_parameters
 from estimators.apu.electrical.electricalfilter import electrical_filter
 from estimators.apu.electrical.faults import leaky_fault, shunt_of
-from estimators.apu.electrical.terminalsignals import PHASES
 from estimators.filters.ekf import extended_kalman_filter
 from scenarios.studies.electrical.protocol import FULL, KAPPAS, LEAKY, SEED0
 from scenarios.studies.electrical.truth import generator_truth, samples_of

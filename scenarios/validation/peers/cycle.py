@@ -28,8 +28,9 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from typing import Any
 
+from apu_casadi.gaspath.designdata import RPM
 from apu_casadi.gaspath.gas import T_REF
-from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator

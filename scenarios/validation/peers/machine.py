@@ -21,7 +21,7 @@ import numpy as np
 from apu_casadi.core import simulation
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from scenarios.validation.comparison import Row, SkippedError, section
 from scenarios.validation.peers.process import run_script
