@@ -18,7 +18,7 @@ from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import Ambient, Event, FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.events import Ambient, Event, Holding
 from apu_casadi.unit.exchange import PAPER, governed_step
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
 from apu_casadi.unit.jointstep import BLOCK
@@ -65,14 +65,13 @@ class JointRun:
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
         start = asked.load.balanced_part
-        self.factors = dict(asked.health)
-        self.point = apu.steady_state(start, ambient=asked.ambient, health=self.factors)
+        self.now = Holding(asked.load, asked.fault, asked.health)
+        self.point = apu.steady_state(start, ambient=asked.ambient, health=self.now.factors)
         self.machine = MachineStep(apu, self.point.generator, start, settings, asked.phasors)
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)
         self.governor = apu.governor.start(float(gas["Wf"]))
-        self.load, self.fault = asked.load, asked.fault
         self.slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
         self._gas_step = gg.stepper if settings.fast else None
         by_blocks = settings.exact and asked.hook is None and not asked.noise.N
@@ -83,20 +82,14 @@ class JointRun:
         point = self.point.generator
         means = self.machine.means.at_rest(point)
         w = np.array([[point.y[n]] for n in WAVEFORMS])
-        return Row(self.y, means, self.factors, None, np.zeros(1), w)
+        return Row(self.y, means, self.now.factors, None, np.zeros(1), w)
 
     def switch(self, events: Sequence[Event], t: float) -> None:
         """Take the events of an instant, s, which are one switch, whatever their order."""
-        for event in events:
-            self.slope = None
-            if isinstance(event, HealthChange):
-                self.factors = {**self.factors, **event.factors}
-                self.theta = self.apu.gas_generator.THETA.pack(self.factors)
-            elif isinstance(event, LoadChange):
-                self.load = event.load
-            elif isinstance(event, FaultChange):
-                self.fault = event.fault
-        if self.machine.switch(self.load, self.fault, t):
+        before, self.now = self.now, self.now.after(events)
+        if self.now.factors is not before.factors:
+            self.theta = self.apu.gas_generator.THETA.pack(self.now.factors)
+        if self.machine.switch(self.now.load, self.now.fault, t) or events:
             self.slope = None
 
     def advance(self, k: int, until: float) -> tuple[int, Row]:
@@ -113,7 +106,7 @@ class JointRun:
         return BLOCK, self._row(done.y, made)
 
     def _row(self, y: np.ndarray, made: MachineMade) -> Row:
-        return Row(y, made.means, self.factors, self.machine.phase.fault, made.t, made.w)
+        return Row(y, made.means, self.now.factors, self.machine.phase.fault, made.t, made.w)
 
     def _step(self, k: int) -> tuple[int, Row]:
         noise, way, gg = self.asked.noise, self.settings.way, self.apu.gas_generator
@@ -175,6 +168,6 @@ class JointRun:
         Wf, PW = (float(v) for v in self.u[:2])
         asked: dict[str, Any] = {"ambient": dataclasses.asdict(self.asked.ambient)}
         asked["PW"] = PW if math.isfinite(PW) else float(self.y[gg.Y.index("PW")])
-        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.factors, **asked)
+        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.now.factors, **asked)
         words = words or f"{error}; {validity.before(gg, t, self.y)}"
         return SimulationError(f"at t = {end:.6g} s: {words}")
