@@ -19,16 +19,17 @@ from pathlib import Path
 from typing import Any
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.gaspath.health import HEALTH
 
 RUNS = "runs.jsonl"
 STATUS = ("done", "refused", "failed", "invalid", "crashed")
 """What became of a run: refused, no steady start; failed, the simulation stopped; invalid, a wrong
 scenario or parameter; crashed, an unforeseen error or the loss of the process."""
 
-_COLUMNS = """
+_COLUMNS = f"""
 start end window N_rpm PW_kW Wf SFC T3 P3_kPa T4 T5 SM_percent V_a_rms V_b_rms V_c_rms I_a_rms
-I_b_rms I_c_rms P_e P_loss_fault N_rpm_min N_rpm_max T4_max SM_percent_min f_eta_c f_W_c f_eta_t
-f_W_t mu k_rf kappa h
+I_b_rms I_c_rms P_e P_loss_fault N_rpm_min N_rpm_max T4_max SM_percent_min
+{" ".join(HEALTH)} mu k_rf kappa h
 """
 COLUMNS = tuple(_COLUMNS.split())
 """Numbers of :func:`apu_casadi.core.results.phase_summary` that are kept of each phase."""

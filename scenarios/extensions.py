@@ -47,13 +47,13 @@ def load(paths: Iterable[str | os.PathLike[str]]) -> None:
             _LOADED[absolute] = content
 
 
-def digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file's content.
+def digest(path: str | os.PathLike[str], what: str = "Python file") -> str:
+    """Return the SHA-256 of a file's content; ``what`` it is, for messages.
 
     Raises:
         ScenarioError: it cannot be read.
     """
-    return hashlib.sha256(_read(path)).hexdigest()
+    return hashlib.sha256(_read(path, what)).hexdigest()
 
 
 def execute(path: str | os.PathLike[str], name: str, what: str = "Python file") -> dict[str, Any]:
@@ -85,7 +85,7 @@ def execute(path: str | os.PathLike[str], name: str, what: str = "Python file") 
     return vars(module)
 
 
-def _read(path: str | os.PathLike[str], what: str = "Python file") -> bytes:
+def _read(path: str | os.PathLike[str], what: str) -> bytes:
     try:
         return files.read_bytes(path, what, LARGEST_FILE)
     except DataError as e:

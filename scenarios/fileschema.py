@@ -13,9 +13,10 @@ from typing import Any
 
 from apu_casadi.core.register import Key
 from apu_casadi.gaspath.conditions import CONDITIONS
+from apu_casadi.gaspath.health import HEALTH_FACTORS
 from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.loads.load import LOADS
-from apu_casadi.unit.events import HEALTH_FACTORS, HEALTH_HI, HEALTH_LO
+from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO
 from scenarios.reading import DEFAULT_FAULT, names_of
 from scenarios.schema import EXCHANGES, FILE_KEYS, Change, Phase, Scenario
 
@@ -93,8 +94,9 @@ def _fault() -> Table:
 
 
 def _health() -> Table:
-    factor = _number(HEALTH_LO, HEALTH_HI, open_lo=True)
-    return {"oneOf": [_object({n: factor for n in HEALTH_FACTORS}), _NONE]}
+    limits: Table = {"lo": HEALTH_LO, "hi": HEALTH_HI, "open_lo": True}
+    factors = {n: _number(**limits, doc=f.doc) for n, f in HEALTH_FACTORS.items()}
+    return {"oneOf": [_object(factors), _NONE]}
 
 
 def _numbers(cls: type) -> Table:

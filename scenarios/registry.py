@@ -11,7 +11,6 @@ import json
 import math
 import os
 from collections.abc import Callable
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,8 +121,9 @@ def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
 
     if path is None:
         return GasGenerator()
-    made: GasGenerator = import_module("apu_casadi.gaspath.engines").read_engine(path)
-    return made
+    from apu_casadi.gaspath.engines import read_engine
+
+    return read_engine(Path(path))
 
 
 @last(4)
@@ -146,7 +146,7 @@ def unit_of(parameters: str = "{}", engine: str | None = None, content: str = ""
 def unit_for(s: Scenario) -> Apu:
     """Return the unit that a scenario is about."""
     parameters = json.dumps(dict(s.parameters), sort_keys=True)
-    return unit_of(parameters, *([s.engine, digest(s.engine)] if s.engine else []))
+    return unit_of(parameters, *([s.engine, digest(s.engine, "engine file")] if s.engine else []))
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:

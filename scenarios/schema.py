@@ -44,10 +44,10 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from apu_casadi.core import files
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.events import (
-    HEALTH_FACTORS,
     Ambient,
     Event,
     FaultChange,
@@ -452,7 +452,7 @@ class Scenario(_Plain):
         """
         steps: list[tuple[float, _Change]] = [(p.start, p) for p in self.phases]
         steps += [(c.time, c) for c in self.changes]
-        health = healthy = dict.fromkeys(HEALTH_FACTORS, 1.0)
+        health = healthy = dict.fromkeys(HEALTH, 1.0)
         events: list[Event] = []
         for t, c in sorted(steps, key=lambda s: s[0]):
             if c.health is not None:

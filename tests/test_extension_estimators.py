@@ -1,11 +1,15 @@
 """A sensor and a filter step of one's own, from a user's file: no module of the package changes."""
 
+import json
+
 import casadi as ca
 import numpy as np
 import pytest
 
 from apu_casadi import Apu, HealthChange, SeriesLoad, simulate_joint
 from apu_casadi.core.errors import SignalError
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.identify import gas_path
 from estimators.apu.joint import estimate_joint
@@ -14,6 +18,7 @@ from estimators.apu.sensors import GAS_PATH, gas_path_table, load_sensors, unreg
 from estimators.detection.signatures import linearised
 from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterStep, run
 from estimators.filters.stepparts import step_symbols
+from scenarios.cli import main
 
 # ------------------------------------------------------------------ a user's files, as they stand
 
@@ -99,6 +104,23 @@ def test_a_sensor_of_ones_own(ds, mine, tmp_path):
     (tmp_path / "run.csv").write_text("time,T41_slow [degC],dP\n0,900,7e5\n1,905,7.1e5\n")
     table = read_table(tmp_path / "run.csv")
     assert table.get("T41_slow", "K") == pytest.approx([1173.15, 1178.15])
+
+
+def test_a_sensor_of_ones_own_in_commands(mine, tmp_path, capsys):
+    """``apu fit`` reads its column and its sigma; ``apu identify`` takes it by name."""
+    gg = GasGenerator()
+    points = [trim_gas_generator(gg, {"N": gg.parameters.N, "PW": P}) for P in (2e5, 3e5, 4e5)]
+    names = ("N", "P3", "T3", "T5", "Wf", "PW")
+    rows = [[p[n] for n in names] + [p["T41"] - 273.15, p["P3"] - p["P5"]] for p in points]
+    head = ",".join((*names, "T41_slow [degC]", "dP"))
+    text = "\n".join([head, *(",".join(f"{v:.9g}" for v in row) for row in rows)])
+    (tmp_path / "points.csv").write_text(text + "\n")
+    argv = ["fit", str(tmp_path / "points.csv"), "--steady", "--json", "--sigma", "dP=1kPa"]
+    assert main(argv) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert {"T41_slow", "dP"} <= set(json.dumps(report).replace('"', " ").split())
+    assert main(["identify", "--sensors", "N,dP,Wf,T41_slow", "--json", "--trials", "0"]) == 0
+    assert "T41_slow" in capsys.readouterr().out
 
 
 def test_a_filter_step_of_ones_own(ds):

@@ -1,12 +1,17 @@
 """Parts of a user's own, in a file beside the scenario: nothing of the package is changed."""
 
+import dataclasses
 import json
 import pickle
 import sys
 
 import pytest
 
+from apu_casadi.core import results
 from apu_casadi.core.errors import ScenarioError
+from apu_casadi.gaspath.engines import read_engine, write_engine
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.loads.load import LOADS
 from scenarios import campaigns, extensions, registry
@@ -199,3 +204,52 @@ def test_names_of_files_are_checked():
             Scenario.from_dict({**table, "extensions": value})
     with pytest.raises(ScenarioError, match="engine: a text is expected, got 3"):
         Scenario.from_dict({**table, "engine": 3})
+
+
+# ------------------------------------------------------------------------------ another engine
+
+
+@pytest.fixture
+def other_engine(tmp_path, monkeypatch):
+    """An engine with a worse compressor, in a file."""
+    path = tmp_path / "engine.toml"
+    poor = GasGenerator().parameters.change(eta_c=0.80)
+    write_engine(dataclasses.replace(GasGenerator(), parameters=poor), path)
+    monkeypatch.chdir(tmp_path)
+    return path, read_engine(path)
+
+
+def test_every_command_takes_another_engine(other_engine, capsys):
+    """The fuel that commands print is the other engine's."""
+    _, made = other_engine
+    fuel = trim_gas_generator(made, {"N": made.parameters.N, "PW": 2e5})["Wf"]
+    assert fuel > 1.03 * trim_gas_generator(GasGenerator(), {"N": 3775.147, "PW": 2e5})["Wf"]
+    assert main(["trim", "--engine", "engine.toml", "--power", "2e5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["outputs"]["Wf"] == pytest.approx(fuel, rel=1e-9)
+    deck = ["deck", "--altitude", "0", "--mach", "0", "--power", "2e5", "--engine", "engine.toml"]
+    assert main(deck) == 0
+    assert float(results.load("deck.nc")["Wf"].values.item()) == pytest.approx(fuel, rel=1e-9)
+    assert main(["maps", "--no-lines", "--engine", "engine.toml"]) == 0
+    assert main(["linearise", "--engine", "engine.toml", "--power", "80", "--json"]) == 0
+    capsys.readouterr()
+
+
+def test_a_scenario_names_its_engine(other_engine, monkeypatch):
+    """Seen from its file; a changed engine is another unit and another run of a campaign."""
+    path, made = other_engine
+    text = 'name = "own"\nduration = 0.1\nwaveform_dt = 0\nengine = "engine.toml"\n[[phase]]\n'
+    text += 'name = "a"\nstart = 0.0\nload = { kind = "R", power_kW = 80.0 }\n'
+    (path.parent / "own.toml").write_text(text)
+    monkeypatch.chdir("/")
+    s = registry.get(path.parent / "own.toml")
+    assert s.engine == str(path) and Scenario.from_dict(s.to_dict()) == s
+    assert registry.unit_for(s).gas_generator == made
+    assert registry.unit_for(s.change(engine=None)).gas_generator == GasGenerator()
+    key = campaigns._task(s, "propagator", None).key
+    path.write_text(path.read_text() + "\n")
+    assert campaigns._task(s, "propagator", None).key != key
+    path.unlink()
+    with pytest.raises(
+        ScenarioError, match=r"engine\.toml: engine file cannot be read: No such file"
+    ):
+        registry.unit_for(s)

@@ -11,6 +11,7 @@ from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.measuring import measure
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from estimators.apu.fitting import EngineData, fit_engine
 from estimators.apu.gaspath import gas_path_filter, samples
 from estimators.apu.recordings.plausible import PLAUSIBLE
 from estimators.apu.sensors import (
@@ -112,6 +113,25 @@ def test_another_sensor_tells_more(drop):
     base = spread(GAS_PATH)
     assert spread(GAS_PATH.add("P5")) < 0.999 * base
     assert spread(WITH_TC) < 0.99 * base
+
+
+def test_a_fit_takes_sensors_of_any_kind(drop):
+    """Through the load drop with the lag as a state, and at steady points, where it is over."""
+    t, rows = samples(drop)
+    k = slice(45, 105)
+    names = (*GAS_PATH.names, "T41")
+    there = {n: drop[n].values for n in names}
+    true = {n: v[rows][k] for n, v in WITH_TC.true(drop["time"].values, there).items()}
+    readings = WITH_TC.measure(true, np.random.default_rng(2))
+    transient = fit_engine([EngineData("drop", t[k], readings)], sensors=WITH_TC).result
+    assert transient.recordings[0].x.shape[0] == 2  # N and the lag
+    assert (np.abs(transient.estimate - 1) < 4 * transient.sigma).all()
+    assert transient.p_value > 1e-3
+    points = [trim_gas_generator(GG, {"N": GG.parameters.N, "PW": P}) for P in (2e5, 4e5)]
+    steady = {n: np.array([p[n] for p in points]) for n in names}
+    data = EngineData("steady", np.arange(2.0), steady | {"T41_tc": steady["T41"]})
+    found = fit_engine([data], steady=True, sensors=WITH_TC).result
+    assert found.estimate == pytest.approx(np.ones(4), abs=1e-5)
 
 
 def test_more_sensors_do_not_change_the_noise_of_the_others(drop):

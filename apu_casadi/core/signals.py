@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, overload
 
 import casadi as ca
 import numpy as np
@@ -73,7 +73,11 @@ class Signals(Sized):
     def __iter__(self) -> Iterator[Signal]:
         return iter(self._signals)
 
-    def __getitem__(self, key: Any) -> Any:
+    @overload
+    def __getitem__(self, key: str | int) -> Signal: ...
+    @overload
+    def __getitem__(self, key: slice) -> tuple[Signal, ...]: ...
+    def __getitem__(self, key: str | int | slice) -> Signal | tuple[Signal, ...]:
         """Return the signal of that name or position."""
         if isinstance(key, str):
             return self._signals[self.index(key)]

@@ -29,10 +29,18 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.exchange import moved
-from estimators.apu.sensors import GAS_PATH, SensorSet
-from estimators.batch.fit import FitProblem, FitResult
+from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
+from estimators.batch.fit import FitProblem
+from estimators.batch.fitresult import FitResult
 from estimators.information.consistency import coverage as shares_covered
-from estimators.models.filtermodel import FilterModel, biases, gains, measure, measured_inputs
+from estimators.models.filtermodel import (
+    FilterModel,
+    biases,
+    gains,
+    lagging,
+    measure,
+    measured_inputs,
+)
 from estimators.models.lifting import Lifted, lift
 from estimators.models.recording import Recording, plain_numbers, record
 
@@ -79,17 +87,24 @@ def engine_model(
     gain: tuple[str, ...] = (),
     bias: tuple[str, ...] = (),
     steady: bool = False,
+    sensors: tuple[Sensor, ...] = (),
 ) -> Lifted:
     """Return the lifted model of an engine for fits.
 
     Args:
         outputs: measured outputs besides fuel flow and power.
         gain, bias: those whose sensors have an unknown gain error or bias.
-        steady: every sample is an operating point.
+        steady: every sample is an operating point, where no lag shows.
+        sensors: those of the outputs that are no outputs of the engine themselves.
     """
+    own = {s.name: s for s in sensors}
+
+    def read(m: FilterModel) -> FilterModel:
+        of = [own.get(n) or Sensor(n, 0.0, False, 0.0, gg.Y[n].unit, "") for n in outputs]
+        return lagging(m, [(s.signal, s.expression, s.reads, 0.0 if steady else s.tau) for s in of])
 
     def build(m: FilterModel) -> FilterModel:
-        m = measured_inputs(measure(m, outputs), INPUTS)
+        m = measured_inputs(read(m) if own else measure(m, outputs), INPUTS)
         m = gains(m, gain) if gain else m
         return biases(m, bias) if bias else m
 
@@ -133,7 +148,7 @@ def _level(t: np.ndarray, v: np.ndarray, steady: bool) -> np.ndarray:
     there = np.isfinite(v)
     full = np.interp(t, t[there], v[there])
     if steady or t.size < 3:
-        return full
+        return np.asarray(full)
     half = max(1, round(SMOOTH / 2 / float(np.median(np.diff(t)))))
     sums = np.concatenate([[0.0], np.cumsum(full)])
     k = np.arange(t.size)
@@ -168,7 +183,7 @@ def to_recording(
         )
 
     def sigma(name: str, v: np.ndarray) -> np.ndarray:
-        return np.array([sensors.sigma(name, r) for r in _level(t, v, steady)]) / root
+        return np.asarray(sensors.sigma(name, _level(t, v, steady)) / root * np.ones(v.size))
 
     outputs, noise = {}, {}
     for name in lifted.model.y.names:
@@ -188,8 +203,10 @@ def to_recording(
         wide = np.full(t.size, OPEN * design)
         if there.any():
             inputs[name] = (t, np.interp(t, t[there], v[there]))
-            inputs[f"sigma_{name}"] = (t, np.where(there, np.maximum(sigma(name, v), 1e-9 * design),
-                                                   wide))  # fmt: skip
+            inputs[f"sigma_{name}"] = (
+                t,
+                np.where(there, np.maximum(sigma(name, v), 1e-9 * design), wide),
+            )
         else:
             inputs[name], inputs[f"sigma_{name}"] = (t, np.full(t.size, design)), (t, wide)
     for name, value in data.ambient.items():
@@ -198,13 +215,7 @@ def to_recording(
             raise DataError(f"{data.name}: {name} has gaps; ambient conditions are needed always")
         inputs[name] = float(a) if a.ndim == 0 else (t, a)
     p = dict.fromkeys(lifted.model.p.names, 0.0) | dict.fromkeys(HEALTH, 1.0)
-    return record(
-        lifted.model,
-        outputs=outputs,
-        sigma=noise,
-        inputs=inputs,
-        p=p,
-    )
+    return record(lifted.model, outputs=outputs, sigma=noise, inputs=inputs, p=p)
 
 
 def _read(lifted: Lifted, r: Recording, name: str) -> np.ndarray:
@@ -312,7 +323,10 @@ def fit_engine(
         )
     every = [*estimate, *own, *(consider or ())]
     gain, bias = split_names(every, outputs)
-    lifted = engine_model(gg, outputs, gain=tuple(gain), bias=tuple(bias), steady=steady)
+    own_model = tuple(s.model() for s in sensors.only(outputs).sensors if not s.direct)
+    lifted = engine_model(
+        gg, outputs, gain=tuple(gain), bias=tuple(bias), steady=steady, sensors=own_model
+    )
     recordings = [to_recording(gg, lifted, d, sensors, averaged=averaged) for d in data]
     values = dict(fixed or {})
     split_names(list(values), ())
@@ -325,11 +339,7 @@ def fit_engine(
         p[i] = list(values.values())
         recordings[k] = dataclasses.replace(r, p=p)
     problem = FitProblem(
-        lifted,
-        [r.size for r in recordings],
-        estimate,
-        own=own,
-        consider=tuple(consider or ()),
+        lifted, [r.size for r in recordings], estimate, own=own, consider=tuple(consider or ())
     )
     result = problem.solve(recordings, prior=prior, bounds=bounds, consider=consider)
     # an input left open is an unknown without a reading
@@ -359,7 +369,7 @@ def steady_truth(gg: GasGenerator, theta: np.ndarray) -> EngineData:
             gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, theta, strict=True))
         )
         for PW in POWERS
-    ]  # fmt: skip
+    ]
     readings = {n: np.array([p[n] for p in points]) for n in (*OUTPUTS, *INPUTS)}
     return EngineData("steady", np.arange(len(points), dtype=float), readings, dict(DEFAULT_DAY))
 
@@ -374,7 +384,7 @@ def transient_truth(
     ss, par = gg.state_space, GovernorParameters()
     start = trim_gas_generator(
         gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True))
-    )  # fmt: skip
+    )
     run = stepper(ss, 1, rtol=1e-9, atol=1e-11)
     x, x_gov = start.x.copy(), par.start(float(start["Wf"]))
     t, rows = np.arange(K) * dt, []
@@ -447,9 +457,12 @@ def coverage(
     truth = [(steady_truth if steady else transient_truth)(gg, th) for th in healths]
     averaged = READINGS if steady else 1
     problem = FitProblem(
-        lifted, [truth[0].t.size], HEALTH, consider=tuple(considered),
+        lifted,
+        [truth[0].t.size],
+        HEALTH,
+        consider=tuple(considered),
         build=(not steady) if build is None else build,
-    )  # fmt: skip
+    )
     error, sigma = np.full((n, 4), np.nan), np.full((n, 4), np.nan)
     chi2, freedom, failed = [], 0, 0
     for i in range(n):

@@ -107,7 +107,7 @@ class GasPathFilter(Parametric):
     @property
     def known_power(self) -> bool:
         """Whether the shaft power is measured."""
-        return "PW" in self.model.u
+        return "PW" in self.model.u.names
 
     @derived
     def lagging(self) -> tuple[Sensor, ...]:

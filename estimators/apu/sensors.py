@@ -53,6 +53,10 @@ __all__ = [
 ]
 
 
+def _itself(value: Any) -> Any:
+    return value
+
+
 @dataclass(frozen=True)
 class Sensor:
     """One sensor.
@@ -112,10 +116,14 @@ class Sensor:
         nominal = next((Y[n].nominal for n in self.reads if Y[n].unit == self.unit), 1.0)
         return Signal(self.name, self.unit, f"reading of {', '.join(self.reads)}", nominal=nominal)
 
+    @property
+    def expression(self) -> Callable[..., Any]:
+        """What it reads of the values of ``reads``, its lag left out."""
+        return _itself if self.value is None else self.value
+
     def of(self, y: Mapping[str, Any]) -> Any:
         """Return what it reads of outputs by name, its lag left out: numbers or expressions."""
-        values = [y[n] for n in self.reads]
-        return values[0] if self.value is None else self.value(*values)
+        return self.expression(*(y[n] for n in self.reads))
 
     def sigma(self, reading: Any) -> Any:
         """Return the standard deviation of the noise at a reading, in its unit."""
@@ -191,6 +199,10 @@ class SensorSet:
                 raise ParameterError(f"sensor {new.name!r} is in the set already")
             out.append(new)
         return SensorSet(tuple(out))
+
+    def including(self, *names: str) -> SensorSet:
+        """Return the set with those of :data:`KNOWN` that are named and not in it."""
+        return self.add(*(n for n in names if n in KNOWN and n not in self))
 
     def only(self, names: Sequence[str]) -> SensorSet:
         """Return the set of some of the sensors, in the order of the names.

@@ -98,7 +98,7 @@ class _Evaluated(Rebuilt):
                 f"{self.model.name}: inputs of shape ({len(self.model.u)},) or by name expected "
                 f"({', '.join(self.model.u.names)}), got shape {u.shape}"
             )
-        return u
+        return np.asarray(u)
 
     def _checked(self, out: tuple[np.ndarray, ...], what: str) -> tuple[np.ndarray, ...]:
         check = float(out[-1][0])
@@ -138,7 +138,7 @@ class _Evaluated(Rebuilt):
                 "whole or not at all (z = None): leave the others out by measure(), or use "
                 "estimators.filters.ekf or estimators.filters.ukf, where NaN is the normal case"
             )
-        return z
+        return np.asarray(z)
 
     def noise(self, sigma: Mapping[str, float]) -> np.ndarray:
         """R from standard deviations by name."""

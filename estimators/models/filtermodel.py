@@ -236,10 +236,7 @@ class FilterModel(Parametric):
 
 @remade
 def discretise(
-    ss: StateSpace,
-    *,
-    method: str = "midpoint",
-    walk: Mapping[str, float] | None = None,
+    ss: StateSpace, *, method: str = "midpoint", walk: Mapping[str, float] | None = None
 ) -> FilterModel:
     """Make a filter's model from a continuous one, inputs held over each step.
 
@@ -324,7 +321,7 @@ def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
             raise ParameterError(
                 f"noisy_inputs: sigma of {name} must be finite and >= 0, got {value!r}"
             )
-        if f"w_{name}" in model.w:
+        if f"w_{name}" in model.w.names:
             raise SignalError(f"{model.name}: input {name} is noisy already")
     x, u, p, _, dt = model.symbols()
     n = len(model.w)
@@ -432,7 +429,7 @@ def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """
     cols = model.u.indices(names)
     for name in names:
-        if f"w_{name}" in model.w:
+        if f"w_{name}" in model.w.names:
             raise SignalError(f"{model.name}: input {name} is noisy already")
     nu, nw = len(model.u), len(model.w)
     x, _, p, _, dt = model.symbols()

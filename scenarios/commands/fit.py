@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import AMBIENT, CONDITIONS, DEFAULT_DAY, day_words
+from apu_casadi.gaspath.health import HEALTH
 from scenarios.commands import given
 from scenarios.shell import jsontext, progress
 
@@ -37,13 +38,13 @@ if TYPE_CHECKING:
     from estimators.apu.fitting import EngineData, EngineFit
     from estimators.apu.recordings.recorded import Reading, Table
     from estimators.apu.sensors import SensorSet
-    from estimators.batch.fit import Profile
+    from estimators.batch.fitresult import Profile
 
 NAME = "fit"
 HELP = "fit health factors to recorded data (CSV, Parquet, netCDF)"
 OPTIONS = f"""
 files FILE +           | recorded data (see above)
---estimate A,B =f_eta_c,f_W_c,f_eta_t,f_W_t | health factors, gain_SENSOR, bias_SENSOR (default: the
+--estimate A,B ={",".join(HEALTH)} | health factors, gain_SENSOR, bias_SENSOR (default: the
                        | four health factors)
 {given.UNIT}
 --own A,B =            | gains or biases that each file has for itself
@@ -161,21 +162,22 @@ def _priors(items: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 def _sensors(items: Sequence[str], gg: GasGenerator) -> SensorSet:
     """The table of sensors, changed and extended by ``--sigma``."""
-    from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
+    from estimators.apu.sensors import KNOWN, Sensor, SensorSet, gas_path_table
 
-    known = {s.name: s for s in GAS_PATH.sensors}
+    known = {s.name: s for s in gas_path_table().sensors}
     for p in given.pairs(items, "--sigma"):
-        if p.name not in gg.Y:
+        if p.name not in gg.Y and p.name not in KNOWN:
             raise ParameterError(
                 f"--sigma {p.item!r}: unknown output {nearest(p.name, gg.Y.names)}"
             )
-        unit = gg.Y[p.name].unit
+        unit = KNOWN[p.name].unit if p.name in KNOWN else gg.Y[p.name].unit
         noise, relative = _deviation(p, unit)
+        new = Sensor(p.name, noise, relative, 0.0, unit, "given by the user")
         if p.name in known:
-            new = dataclasses.replace(known[p.name], noise=noise, relative=relative)
-            known[p.name] = dataclasses.replace(new, source="changed by the user")
-        else:
-            known[p.name] = Sensor(p.name, noise, relative, 0.0, unit, "given by the user")
+            new = dataclasses.replace(known[p.name], source="changed by the user")
+        elif p.name in KNOWN:
+            new = dataclasses.replace(KNOWN[p.name], gain=0.0, source=new.source)
+        known[p.name] = dataclasses.replace(new, noise=noise, relative=relative)
     return SensorSet(tuple(known.values()))
 
 
@@ -205,7 +207,9 @@ def _deviation(p: given.Pair, unit: str) -> tuple[float, bool]:
 
 
 def _known_targets(mapping: Mapping[str, Any], gg: GasGenerator) -> None:
-    valid = [*gg.Y.names, *AMBIENT, "time"]
+    from estimators.apu.sensors import KNOWN
+
+    valid = list(dict.fromkeys([*gg.Y.names, *KNOWN, *AMBIENT, "time"]))
     for name in mapping:
         if name not in valid:
             raise DataError(f"--column {name}=...: unknown quantity {nearest(name, valid)}")
@@ -227,7 +231,7 @@ def _data(
 
     from estimators.apu.fitting import INPUTS, EngineData
 
-    readings = {s: table.get(s, gg.Y[s].unit) for s in sensors.names if s in table}
+    readings = {s.name: table.get(s.name, s.unit) for s in sensors.sensors if s.name in table}
     measured = [n for n in readings if n not in INPUTS]
     if not measured:
         raise DataError(

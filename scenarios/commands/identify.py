@@ -15,17 +15,21 @@ import argparse
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import DEFAULT_DAY, day_words
 from scenarios.commands import given
 from scenarios.shell import jsontext, progress, usage
+from scenarios.shell.template import Template
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    from estimators.apu.identify import Severity, Trials
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from estimators.apu.identify import Trials
+    from estimators.apu.severity import Severity
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
@@ -65,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     sets, added = _sets(args, sensors)
     f = _found(args)
     if args.figure is not None:
-        files.save_figure(_figure(f.point, args.samples), args.figure)
+        files.save_figure(_figure(f.point, args.samples, _engine(args)), args.figure)
     if args.json:
         jsontext.show(_report(args, sensors, sets, added, f))
         return 0
@@ -87,13 +91,16 @@ def _sets(
     from estimators.information.identifiability import compare_sensors, which_to_add
 
     how: dict[str, Any] = {"prior": args.prior / 100, "samples": args.samples}
-    how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors}
-    if args.engine is not None:
-        how["gas_generator"] = given.engine(args)
+    how["sensors"] = study.CANDIDATES.including(*sensors)
+    how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors, **_engine(args)}
     g = study.gas_path(args.point, **how)
     more = [s for s in g.sensors if s not in sensors]
     sets = {"these": list(sensors), **{f"+ {s}": [*sensors, s] for s in more}}
     return compare_sensors(g, sets), which_to_add(g, sensors, more)
+
+
+def _engine(args: argparse.Namespace) -> dict[str, GasGenerator]:
+    return {} if args.engine is None else {"gas_generator": given.engine(args)}
 
 
 @dataclass(frozen=True)
@@ -124,15 +131,18 @@ class Found:
 
 def _found(args: argparse.Namespace) -> Found:
     from estimators.apu import identify as study
+    from estimators.apu.severity import severity_study
     from estimators.information.identifiability import identify
 
     first, prior = given.names(args.point)[0], args.prior / 100
-    options = {"prior": prior, "samples": args.samples}
+    engine = _engine(args)
+    options: dict[str, Any] = {"prior": prior, "samples": args.samples, **engine}
     variants, seeds = study.VARIANTS, range(10_000, 10_000 + args.trials)
     snapshot, needed = study.shaft_power_snapshot, study.needed_samples
     power = {n: snapshot(first, **{**options, **v}) for n, v in variants.items()}
-    at = {"swept": {"samples": args.samples}}
-    aims = {n: needed(a, first, prior=prior, **variants[n]) for n, a in study.AIMS.items()}
+    at = {"swept": {"samples": args.samples, **engine}}
+    how: dict[str, Any] = {"prior": prior, **engine}
+    aims = {n: needed(a, first, **how, **variants[n]) for n, a in study.AIMS.items()}
     trials = {}
     if args.trials:
         progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
@@ -142,15 +152,15 @@ def _found(args: argparse.Namespace) -> Found:
     if args.transient:
         powers = {"without PW": False, "with PW": True}
         transient = study.gas_path_transient
-        ramp = {n: identify(transient(power=p, prior=prior)) for n, p in powers.items()}
+        ramp = {n: identify(transient(power=p, **how)) for n, p in powers.items()}
     return Found(
         first,
         power,
         study.snapshot_sweep(first, priors=SWEPT, variants=at),
         study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
-        study.limiting_noises(first, prior=prior),
+        study.limiting_noises(first, **how),
         aims,
-        study.severity_study(),
+        severity_study(),
         trials,
         ramp,
     )
@@ -201,6 +211,17 @@ def _wrap(text: str, first: str = "- ") -> list[str]:
     import textwrap
 
     return textwrap.wrap(text, 98, initial_indent=first, subsequent_indent=" " * len(first))
+
+
+@cache
+def _template() -> Template:
+    return Template.of("identify.md")
+
+
+def _say(block: str, **values: Any) -> list[str]:
+    """Return the paragraphs of a block of the template, wrapped."""
+    paragraphs = _template().text(block, **values).split("\n\n")
+    return [line for p in paragraphs for line in _wrap(p)]
 
 
 def _pct(value: float) -> str:
@@ -259,23 +280,14 @@ def _confounded(r: Identifiability) -> list[str]:
     lines = ["", "What is taken for what"]
     done: set[frozenset[str]] = set()
     for p in r.pairs:
-        if not p.confounded or frozenset((p.first, p.second)) in done:
-            continue
-        done.add(frozenset((p.first, p.second)))
-        told = (
-            f"told apart, if one alone is there, from {p.first} {100 * p.size:.2f} %"
-            if math.isfinite(p.size)
-            else "not told apart at any size"
-        )
-        lines += _wrap(
-            f"{p.first} and {p.second}: signatures {p.angle:.0f} degrees apart, estimates "
-            f"correlated {p.correlation:+.3f}; {told}."
-        )
+        if p.confounded and frozenset((p.first, p.second)) not in done:
+            done.add(frozenset((p.first, p.second)))
+            lines += _say("pair" if math.isfinite(p.size) else "pair at no size", p=p)
     for m in r.mimics:
         size = r.given.size[r.given.theta.index(m.fault)]
         by = " and ".join(f"{n} {100 * a:+.2f} %" for n, a in m.by)
         how = "exactly" if m.share < 1e-6 else f"but for {100 * m.share:.0f} % of its signature"
-        lines += _wrap(f"{m.fault} {100 * size:+.2f} % is imitated by {by}, {how}.")
+        lines += _say("mimic", fault=m.fault, size=size, by=by, how=how)
     if len(lines) == 2:
         lines.append("- no fault is imitated by others")
     return lines
@@ -290,19 +302,15 @@ def _sensors(c: SensorComparison, added: list[dict[str, Any]]) -> list[str]:
         )
         lines.append(f"  {label:<10}{r.rank:>5}  {cells}")
     for row in added:
-        if row["add"] is None:
-            text = f"{row['fault']}: no sensor of these helps by 1 % or more"
-        else:
-            text = (
-                f"{row['fault']}: add {row['add']}; visible from {100 * row['after']:.2f} % "
-                f"instead of {100 * row['before']:.2f} %"
-            )
-            others = [
-                f"{n} {100 * v:.2f} %" for n, v in row["ranking"][1:] if v < 0.99 * row["before"]
-            ]
-            text += f" (then {', '.join(others)})" if others else ""
-        lines += _wrap(f"{text}.")
+        better = [(n, v) for n, v in row["ranking"][1:] if v < 0.99 * row["before"]]
+        others = ", ".join(f"{n} {100 * v:.2f} %" for n, v in better)
+        then = f" (then {others})" if others else ""
+        lines += _say("add nothing" if row["add"] is None else "add", **row, then=then)
     return lines
+
+
+def _shares(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{n} {100 * v:.0f} %" for n, v in values.items())
 
 
 def _power(f: Found) -> list[str]:
@@ -327,30 +335,13 @@ def _power(f: Found) -> list[str]:
             f"  {label:<18}{aim:>6}{100 * r['reduction']:7.1f}{cells}"
             f"   {100 * r['null_before']:.2f} -> {100 * r['null_after']:.2f}"
         )
-    lines += _wrap(
-        f"1 % power noise, not averaged; bias: efficiency known to {100 * ETA_BIAS:g} %, "
-        f"considered. Null direction, unit length: {null}."
-    )
+    lines += _say("bias", eta=ETA_BIAS, null=null)
     for label, n in f.needed.items():
-        text = f"{label}: a reduction of {100 * AIMS[label]:.0f} % "
-        text += (
-            f"needs {n} averaged samples of 20 ms or more" if n else "is not reached by averaging"
-        )
-        lines += _wrap(f"{text}.")
+        lines += _say("needed" if n else "never reached", label=label, aim=AIMS[label], n=n)
     for label in AIMS:
         if aimed and f.power[label]["reduction"] < AIMS[label]:
-            lines += _wrap(f"{label}: the aim is MISSED with these samples; see below.")
-    parts = ", ".join(f"{n} {100 * v:.0f} %" for n, v in f.why.items())
-    lines += _wrap(
-        "With gain errors every gain opens a direction of its own, in which shaft power says "
-        f"little: one alone leaves a reduction of {parts}. A healthy baseline removes them."
-    )
-    parts = ", ".join(f"{n} {100 * v:.0f} %" for n, v in f.noise.items())
-    lines += _wrap(
-        "With one sample the noise leaves all directions wide, and shaft power narrows only one: "
-        f"without the noise of one sensor the reduction is {parts}. Averaging is the remedy."
-    )
-    return lines
+            lines += _say("missed", label=label)
+    return [*lines, *_say("limits", why=_shares(f.why), noise=_shares(f.noise))]
 
 
 def _swept(sweep: list[dict[str, Any]]) -> list[str]:
@@ -372,14 +363,8 @@ def _swept(sweep: list[dict[str, Any]]) -> list[str]:
 def _trials(trials: dict[str, Trials]) -> list[str]:
     lines = []
     for label, t in trials.items():
-        low, high = t.interval
-        lines += _wrap(
-            f"{label}, {t.seeds} random snapshots of the nonlinear engine: rms error "
-            f"{100 * t.rms_before:.2f} -> {100 * t.rms_after:.2f} % (bounds "
-            f"{100 * t.bound_before:.2f} -> {100 * t.bound_after:.2f} %), reduction "
-            f"{100 * t.reduction:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f} %); NEES/4 "
-            f"{t.nees:.3f}, 95 % band {t.nees_band[0]:.3f} to {t.nees_band[1]:.3f}."
-        )
+        before, bound = 100 * t.rms_before, 100 * t.bound_before
+        lines += _say("trials", label=label, t=t, before=before, bound=bound)
     return lines
 
 
@@ -425,47 +410,22 @@ def _electrical(rows: list[Severity]) -> list[str]:
             f"{number(s.sigma_mu)}{number(s.sigma_k_rf)}{number(s.sigma_h)}{corr}"
             f"{abs(s.ratio):7.2f}"
         )
-    lines += _wrap(
-        "kappa = mu: mu and k_rf move the current along one and the same direction; only h = "
-        "mu/(k_rf + 1 - mu) can be known, and (mu, k_rf) is a ridge of constant h."
-    )
-    lines += _wrap(
-        "kappa > mu, and known: the shunt's reactance tells mu from k_rf. With wL/R far below one "
-        "the ridge comes back; far above one mu is known, k_rf hardly."
-    )
-    lines += _wrap(
-        "kappa unknown: (mu, k_rf, kappa) again has a ridge, for the terminals show two numbers, "
-        "R = r_s/h and L = (kappa - mu) L_ls/mu."
-    )
-    lines += _wrap(
-        "Bounds, and optimistic ones: voltages, speed and the healthy machine are taken as known, "
-        "the current's gain to 0.5 %."
-    )
-    return lines
+    return [*lines, *_say("severity")]
 
 
-def _figure(point: str, samples: int) -> Any:
+def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
     from estimators.apu import identify as study
+    from estimators.apu.sensors import GAS_PATH
     from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 
-    noise = study.GAS_PATH["PW"].noise
+    noise = GAS_PATH["PW"].noise
     priors = list(study.PRIORS)
     curves = {}
+    keys = ("reduction", "null_before", "null_after")
     for label, variant in study.VARIANTS.items():
-        rows = study.snapshot_sweep(
-            point, power_noises=[noise], variants={label: {"samples": samples, **variant}}
-        )
-        curves[label] = {
-            k: [r[k] for r in rows] for k in ("reduction", "null_before", "null_after")
-        }
-    return plot_gain_of_a_sensor(
-        priors,
-        curves,
-        aims={label: (study.PRIOR, aim) for label, aim in study.AIMS.items()},
-        note=(
-            f"Bound on the four health factors at {point} from N, P3, T3, T5 and Wf, without and "
-            f"with shaft power of {100 * noise:g} % noise; {samples} samples of 20 ms averaged "
-            f"unless said otherwise. Efficiency bias {100 * study.ETA_BIAS:g} %, considered; gain "
-            "errors as in the sensor table. Error: rms of the four standard deviations."
-        ),
-    )
+        variants = {label: {"samples": samples, **engine, **variant}}
+        rows = study.snapshot_sweep(point, power_noises=[noise], variants=variants)
+        curves[label] = {k: [r[k] for r in rows] for k in keys}
+    aims = {label: (study.PRIOR, aim) for label, aim in study.AIMS.items()}
+    told = {"point": point, "power": noise, "samples": samples, "eta": study.ETA_BIAS}
+    return plot_gain_of_a_sensor(priors, curves, aims=aims, note=_template().text("figure", **told))

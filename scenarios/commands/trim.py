@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.errors import SignalError, nearest
 from apu_casadi.core.version import installed
-from apu_casadi.unit.events import HEALTH_FACTORS
+from apu_casadi.gaspath.health import HEALTH
 from scenarios.commands import given
 from scenarios.shell import jsontext
 
@@ -47,7 +47,7 @@ OPTIONS = f"""
 --fix NAME=VALUE ... | fix an output, twice; PW=cube is a load like speed cubed through the design
                      | point
 --max-power T4=K     | highest shaft power at a temperature (T4 or T5)
---health NAME=VALUE ... | health factor, 1 is healthy: {", ".join(HEALTH_FACTORS)}
+--health NAME=VALUE ... | health factor, 1 is healthy: {", ".join(HEALTH)}
 --limit NAME=VALUE ...  | off_map (table spans), SM_min, T4_max, T5_max (K)
 {given.UNIT}
 --all                | print every output

@@ -34,7 +34,5 @@ def machine() -> dict[str, Any]:
         except PackageNotFoundError:
             versions[p] = "from its folder"
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
-    return {
-        "processor": model, "cores": available_threads(), "system": platform.system(),
-        "backend": backend_in_use(), "load_before": round(load, 2), "versions": versions,
-    }  # fmt: skip
+    made = {"processor": model, "cores": available_threads(), "system": platform.system()}
+    return made | {"backend": backend_in_use(), "load_before": round(load, 2), "versions": versions}

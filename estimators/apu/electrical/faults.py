@@ -58,7 +58,7 @@ def faulty_phase(belief: Belief | FilterResult, *, level: float = FAULT_LEVEL) -
     """
     b = belief.final if isinstance(belief, FilterResult) else belief
     names = [f"h_{k}" for k in PHASES]
-    if any(n not in b.x for n in names):
+    if any(n not in b.x.names for n in names):
         raise EstimationError(
             f"faulty_phase needs {', '.join(names)}; the belief has {', '.join(b.x.names)}"
         )

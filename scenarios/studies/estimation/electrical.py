@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.apu import identify
+from estimators.apu.severity import severity_study
 from scenarios.figures.studyplot import plot_consistency
 from scenarios.studies.electrical.efficiency import efficiency
 from scenarios.studies.electrical.leaky import leaky
@@ -184,7 +184,7 @@ def _leaky(n: int, seed0: int, tell: Tell) -> Any:
 @STUDY.part("ridge", start=2, share=None)
 def _ridge(n: int, seed0: int, tell: Tell) -> Any:
     rows = []
-    for s in identify.severity_study():
+    for s in severity_study():
         fault = {"mu": s.fault.mu, "k_rf": s.fault.k_rf, "kappa": s.fault._kappa}
         rows.append({**dataclasses.asdict(s), "fault": fault})
     return {"rows": rows}
