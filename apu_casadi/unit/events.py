@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
@@ -151,6 +151,26 @@ class FaultChange:
 
 
 Event = LoadChange | HealthChange | FaultChange
+
+
+class Holding(NamedTuple):
+    """What holds at an instant: load, fault, and all health factors by name."""
+
+    load: Any
+    fault: Fault | None
+    factors: Mapping[str, float]
+
+    def after(self, events: Iterable[Event]) -> Holding:
+        """Return what holds after events."""
+        now = self
+        for event in events:
+            if isinstance(event, HealthChange):
+                now = now._replace(factors={**now.factors, **event.factors})
+            elif isinstance(event, LoadChange):
+                now = now._replace(load=event.load)
+            else:
+                now = now._replace(fault=event.fault)
+        return now
 
 
 def _refuse_second(i: int, e: Event, other: Event) -> None:
