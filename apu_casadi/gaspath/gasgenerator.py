@@ -42,7 +42,7 @@ __all__ = [
     "MapChoice",
 ]
 
-_MACH8 = stations.Y.index("Mach8")
+_MACH8, _RESIDUAL = stations.Y.indices(("Mach8", "residual"))
 RESIDUAL_TOL = 1e-9  # largest residual (dimensionless) with which any result is used
 
 
@@ -172,7 +172,13 @@ class GasGenerator(Parametric):
 
     def full(self, theta: Any) -> np.ndarray:
         """Return the family's theta: the health factors, shape (4,), and this engine's numbers."""
-        return np.concatenate([theta, self.numbers])
+        full = self._healthy.copy()
+        full[: len(self.THETA)] = theta
+        return full
+
+    @derived
+    def _healthy(self) -> np.ndarray:
+        return np.concatenate([np.ones(len(self.THETA)), self.numbers])
 
     # ------------------------------------------------------------------ equations
 
@@ -340,7 +346,7 @@ class GasGenerator(Parametric):
         th = self.full(theta)
         start = self._similar(x, u, th) if z0 is None else z0
         y, z = self._g_call(x, u, th, start)
-        self._check(float(y[self.Y.index("residual")]), x, u, theta, "output")
+        self._check(float(y[_RESIDUAL]), x, u, theta, "output")
         self._check_exit(y)
         return y, z
 
