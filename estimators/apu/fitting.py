@@ -48,7 +48,7 @@ __all__ = [
     "words",
 ]
 
-HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
+HEALTH = GasGenerator.THETA.names
 INPUTS = ("Wf", "PW")
 OPEN = 10.0  # standard deviation of an input that is not measured, of its magnitude: tells nothing
 SMOOTH = 0.4  # s; readings are averaged over this to find the noise that is relative to them

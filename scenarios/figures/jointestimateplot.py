@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
+from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
 
 if TYPE_CHECKING:
@@ -18,10 +19,7 @@ __all__ = ["NAMES", "plot_joint_estimate"]
 
 SEVERITIES = ("h_a", "h_b", "h_c")
 _PANELS: tuple[tuple[str, str, str, float], ...] = (
-    ("f_eta_c", "compressor efficiency", "change [%]", 100.0),
-    ("f_W_c", "compressor flow", "change [%]", 100.0),
-    ("f_eta_t", "turbine efficiency", "change [%]", 100.0),
-    ("f_W_t", "turbine flow", "change [%]", 100.0),
+    *((n, f"{f.component} {f.quantity}", "change [%]", 100.0) for n, f in HEALTH_FACTORS.items()),
     ("N", "shaft speed", "r/min", 30 / np.pi),
     ("P_total", "mechanical power of both generators", "kW", 1e-3),
 )

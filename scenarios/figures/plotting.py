@@ -18,6 +18,7 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import RPM, phases
+from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures.figstyle import drawing, new_figure
 from scenarios.figures.runwords import fault_phase, made_with
 
@@ -324,7 +325,7 @@ def figure_20(ds: xr.Dataset) -> Figure:
         DataError: a variable is missing.
     """
 
-    factors = {"f_eta_c": "$η_c$", "f_W_c": "$W_c$", "f_eta_t": "$η_t$", "f_W_t": "$W_t$"}
+    factors = {n: f.symbol for n, f in HEALTH_FACTORS.items()}
     _need(ds, [*factors, "mu", "k_rf", "kappa", "P_e"])
     rows = phases(ds)
     t = ds["time"].values
