@@ -64,12 +64,12 @@ class CycleFunctions(Parametric):
         return x, z, u, theta
 
     def _split(self, theta: Any) -> tuple[Any, Any, Any]:
-        """Return health factors, numbers, and the residual of the design point, of theta."""
+        """Return of theta health factors, numbers, and the residual of a design point solved."""
         if self.numbers is not None:
-            return theta, ca.MX(ca.DM(self.numbers)), 0.0
+            return theta, ca.MX(ca.DM(self.numbers)), None
         health, rest = theta[:_NT], theta[_NT:]
         if self.cycle.held:
-            return health, rest, 0.0
+            return health, rest, None
         more, residual = self.cycle.derivation(rest)
         return health, ca.vertcat(rest, more), residual
 
@@ -85,10 +85,11 @@ class CycleFunctions(Parametric):
         x, z, u, theta = self.symbols()
         health, c, design = self._split(theta)
         out = dict(zip(fun.name_out(), fun.call([x, z, u, health, c], True, False), strict=True))
-        if "y" in out:  # the verdict on the design point goes with that on the cycle
-            out["y"][Y.index("residual")] += design
-        elif "residual" in out:
-            out["residual"] += design
+        if design is not None:  # the verdict on the design point goes with that on the cycle
+            if "y" in out:
+                out["y"][Y.index("residual")] += design
+            elif "residual" in out:
+                out["residual"] += design
         names = ["x", "z", "u", "theta"], list(out)
         return ca.Function(fun.name(), [x, z, u, theta], [*out.values()], *names)
 
