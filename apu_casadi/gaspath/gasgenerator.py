@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.backend import Caller, compiled
-from apu_casadi.core.errors import OperatingPointError, SimulationError
+from apu_casadi.core.errors import OperatingPointError, ParameterError, SimulationError, nearest
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
@@ -206,6 +206,23 @@ class GasGenerator(Parametric):
         Exact derivatives by every parameter, the shift of the design point included.
         """
         return CycleFunctions(self._equations(held=False))
+
+    @kept
+    def with_free(self, *names: str) -> CycleFunctions:
+        """Return the functions of this engine with some parameters behind the health factors.
+
+        The way to estimate a parameter: it is an entry of theta like a health factor, with this
+        engine's value as default, and its effect on the design point is in all derivatives.
+
+        Raises:
+            ParameterError: an unknown name, or one given twice; the nearest is named.
+        """
+        for n in names:
+            if n not in unitnumbers.GIVEN:
+                raise ParameterError(f"no parameter {n!r} {nearest(n, unitnumbers.GIVEN.names)}")
+        if len(set(names)) < len(names) or not names:
+            raise ParameterError(f"free parameters: {', '.join(names) or 'none'}; each once")
+        return CycleFunctions(self._equations(held=False), tuple(self.numbers.tolist()), names)
 
     @property
     def z(self) -> Signals:
