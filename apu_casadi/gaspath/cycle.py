@@ -26,6 +26,7 @@ from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.atmosphere import Ambient, ambient
 from apu_casadi.gaspath.components.inlet import inlet
 from apu_casadi.gaspath.components.shaft import power_balance, rotor_acceleration
+from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gas import Gas
 from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.maps.scaledmaps import N_CELL, N_SURGE_CELL, surface_cell, surge_cell
@@ -139,7 +140,7 @@ class Cycle(Parametric):
         """Function u -> (T0, P0, T1, P1)."""
         us = ca.SX.sym("u", _NU)
         v = U.unpack(us)
-        air = {n: v[n] for n in ("altitude", "Mach", "dT_isa", "war")}
+        air = {n: v[n] for n in AMBIENT}
         amb = ambient(**air, gas=Gas(data=self.gas_data))  # no fuel in it
         return ca.Function("ambient", [us], [ca.vertcat(amb.T0, amb.P0, amb.T1, amb.P1)])
 

@@ -21,14 +21,13 @@ from apu_casadi.gaspath.health import HEALTH_FACTORS
 
 # ------------------------------------------------------------------------------ signals
 
-_NOMINAL = {"altitude": 1e4, "Mach": 1.0, "dT_isa": 30.0, "war": 0.01}
 X = Signals([Signal("N", "rad/s", "rotor speed", nominal=3775.0)])
 U = Signals(
     [
         Signal("Wf", "kg/s", "fuel flow", nominal=0.05),
         Signal("PW", "W", "shaft power to the load", nominal=5e5),
         *(
-            Signal(n, c.unit, c.doc, default=c.default, nominal=_NOMINAL[n])
+            Signal(n, c.unit, c.doc, default=c.default, nominal=c.nominal)
             for n, c in CONDITIONS.items()
         ),
     ]
