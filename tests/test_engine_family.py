@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from apu_casadi.core import backend
-from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.errors import OperatingPointError, ParameterError
+from apu_casadi.gaspath.design import solve_design
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimbatch import trim_batch
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
@@ -141,12 +142,17 @@ def test_derived_numbers_by_function_are_those_of_the_unit(gg):
     assert len(NUMBERS) == gg.numbers.size
 
 
-def test_a_design_point_that_does_not_exist_is_told_by_the_residual(gg, state):
-    """T4 below T3 leaves no solution: the form by parameters must not call it solved."""
+@pytest.mark.parametrize(("T4", "PR_c"), [(620.0, 40.0), (850.0, 26.0)])
+def test_a_design_point_that_does_not_exist_is_told_by_the_residual(gg, state, T4, PR_c):
+    """T4 below T3 leaves no solution but one of negative fuel flow: it must not be called one."""
     x, u, theta, z = state
+    with pytest.raises(OperatingPointError, match="design point not solved"):
+        solve_design(gg.parameters.change(T4=T4, PR_c=PR_c, eta_c=0.7))
     given = gg.numbers[: len(GIVEN)].copy()
-    given[GIVEN.index("gas_generator.T4")] = 620.0
-    given[GIVEN.index("gas_generator.PR_c")] = 40.0
+    given[GIVEN.index("gas_generator.T4")] = T4
+    given[GIVEN.index("gas_generator.PR_c")] = PR_c
+    given[GIVEN.index("gas_generator.eta_c")] = 0.7
+    assert not float(gg.by_parameters.cycle.derivation(given)[1]) <= 1e-9
     y, _ = gg.by_parameters.g(x, u, np.concatenate([theta, given]), z)
     assert not float(y[gg.Y.index("residual")]) <= 1e-9
 

@@ -171,5 +171,7 @@ def derivation(data: str, compressor: MapTable, turbine: MapTable) -> ca.Functio
     more = ca.Function("references", [c], [last])
     derived = ca.vertcat(most, more(ca.vertcat(given, most, ca.DM.zeros(last.numel()))))
     names = ["given"], ["derived", "residual"]
-    residual = ca.norm_inf(eq.residual(w, own))
+    # a root below the bounds, such as one of negative fuel flow, is none
+    bounds = ca.if_else(ca.mmin(w - ca.DM(eq.newton.lower)) > 0, 0.0, 1.0)
+    residual = ca.norm_inf(eq.residual(w, own)) + bounds
     return ca.Function("derivation", [given], [derived, residual], *names)
