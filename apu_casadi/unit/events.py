@@ -13,22 +13,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
 from apu_casadi.core.runloop import SAME_INSTANT
+from apu_casadi.gaspath import health
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
 
 if TYPE_CHECKING:
     from apu_casadi.machine.faults.fault import Fault
 
 HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
-    {
-        "f_eta_c": "compressor efficiency factor",
-        "f_W_c": "compressor flow capacity factor",
-        "f_eta_t": "turbine efficiency factor",
-        "f_W_t": "turbine flow capacity factor",
-    }
+    {n: f.doc for n, f in health.HEALTH_FACTORS.items()}
 )
 """The health factors of the gas path, one when healthy, with their meaning."""
 
-HEALTH_LO, HEALTH_HI = 0.5, 1.5
+HEALTH_LO, HEALTH_HI = health.RUN_RANGE
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
 
 
