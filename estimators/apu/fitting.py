@@ -455,13 +455,8 @@ def coverage(
     healths = _healths(seed0)
     truth = [(steady_truth if steady else transient_truth)(gg, th) for th in healths]
     averaged = READINGS if steady else 1
-    problem = FitProblem(
-        lifted,
-        [truth[0].t.size],
-        HEALTH,
-        consider=tuple(considered),
-        build=(not steady) if build is None else build,
-    )
+    build, size = (not steady) if build is None else build, [truth[0].t.size]
+    problem = FitProblem(lifted, size, HEALTH, consider=tuple(considered), build=build)
     error, sigma = np.full((n, 4), np.nan), np.full((n, 4), np.nan)
     chi2, freedom, failed = [], 0, 0
     for i in range(n):

@@ -23,8 +23,8 @@ from scenarios.shell import jsontext, progress, usage
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from estimators.apu.identify import Trials
     from estimators.apu.severity import Severity
+    from estimators.apu.trials import Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.core.errors import ParameterError
     from estimators.apu import identify as study
     from estimators.apu.severity import severity_study
+    from estimators.apu.trials import snapshot_trials
     from estimators.information.identifiability import compare_sensors, which_to_add
 
     usage.count("--trials", args.trials, least=0)
@@ -103,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     if args.trials:
         progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
         for label in study.AIMS:
-            trials[label] = study.snapshot_trials(
+            trials[label] = snapshot_trials(
                 first, seeds=range(10_000, 10_000 + args.trials), **options, **study.VARIANTS[label]
             )
     ramp = None

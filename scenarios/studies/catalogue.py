@@ -256,11 +256,11 @@ def _power_snapshot(n: int, seed0: int, tell: Tell) -> Any:
 
 
 def _power_trials(n: int, seed0: int, tell: Tell) -> Any:
-    from estimators.apu import identify
+    from estimators.apu import identify, trials
 
     return {
         label: dataclasses.asdict(
-            identify.snapshot_trials(seeds=range(seed0, seed0 + n), **identify.VARIANTS[label])
+            trials.snapshot_trials(seeds=range(seed0, seed0 + n), **identify.VARIANTS[label])
         )
         for label in identify.AIMS
     }
