@@ -254,7 +254,7 @@ class SensorSet:
         out = {}
         for name, v in true.items():
             gain = (gains or {}).get(name, 0.0)
-            size = v if noise_of == "true" else (1.0 + gain) * v
+            size = v if noise_of == "true" or not gain else (1.0 + gain) * v
             sigma = self.sigma(name, size)
             out[name] = measure(v, sigma / math.sqrt(averaged), rng, gain=gain)
         return out
