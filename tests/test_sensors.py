@@ -61,6 +61,19 @@ def test_the_response_to_a_step_is_exponential():
     assert ramp == pytest.approx(late, abs=1e-12)
 
 
+def test_a_run_gets_measured_copies(drop):
+    """Beside the truth, with units; the thermocouple's follows with its lag."""
+    ds = WITH_TC.copies(drop, None, gains={"P3": 0.01})
+    assert ds["P3_meas"].values == pytest.approx(1.01 * drop["P3"].values, rel=1e-15)
+    t, late = drop["time"].values, ds["T41_tc_meas"]
+    assert np.array_equal(late.values, respond(t, drop["T41"].values, THERMOCOUPLE.tau))
+    assert late.attrs["units"] == "K"
+    assert late.attrs["long_name"] == "measured: reading of T41"
+    noisy = WITH_TC.copies(drop, 1)["T41_tc_meas"].values
+    assert np.std(noisy / late.values - 1) == pytest.approx(THERMOCOUPLE.noise, rel=0.2)
+    assert "T41_tc_meas" not in drop
+
+
 def test_the_filter_carries_the_lag_exactly():
     """At a steady point the state goes to T41 by the exponential, for any step."""
     filt = gas_path_filter(GG, WITH_TC, gains=False, inertia=None)

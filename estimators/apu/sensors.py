@@ -27,7 +27,7 @@ import runpy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,9 @@ from apu_casadi.core.measuring import measure
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.park import PHASES
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "ELECTRICAL",
@@ -265,6 +268,24 @@ class SensorSet:
         """Draw the constant gain errors of some sensors (all by default), Gaussian."""
         names = self.names if names is None else names
         return {n: self[n].gain * float(rng.standard_normal()) for n in names}
+
+    def copies(
+        self, ds: xr.Dataset, seed: int | None, *, gains: Mapping[str, float] | None = None
+    ) -> xr.Dataset:
+        """Return a run with a measured copy ``<name>_meas`` for each sensor, on its ``time``.
+
+        Args:
+            ds: from :func:`apu_casadi.unit.multirate.simulate_joint`.
+            seed: of the noise; None for none.
+            gains: actual relative gain errors by sensor.
+        """
+        time = np.asarray(ds["time"].values, float)
+        there = {n: np.asarray(ds[n].values, float) for s in self.sensors for n in s.reads}
+        rng = None if seed is None else np.random.default_rng(seed)
+        read = self.measure(self.true(time, there), rng, gains=gains)
+        docs = {n: f"measured: {self[n].signal.doc}" for n in read}
+        told = {n: {"units": self[n].unit, "long_name": docs[n]} for n in read}
+        return ds.assign({f"{n}_meas": ("time", v, told[n]) for n, v in read.items()})
 
 
 def respond(t: np.ndarray, v: np.ndarray, tau: float) -> np.ndarray:
