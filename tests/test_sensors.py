@@ -24,6 +24,7 @@ from estimators.apu.sensors import (
     KNOWN,
     THERMOCOUPLE,
     Sensor,
+    SensorSet,
     gas_path_table,
     load_sensors,
     register,
@@ -197,6 +198,9 @@ def test_impossible_sensors_are_refused(tmp_path):
         gas_path_filter(GG, GAS_PATH.add(Sensor("SFC", 0.01, True, 0.0, "kg/J", "")))
     with pytest.raises(ParameterError, match="takes PW as an input"):
         gas_path_filter(GG, GAS_PATH.only(("N", "P3", "T3", "T5", "Wf")))
+    late = [dataclasses.replace(s, tau=0.1 * (s.name == "Wf")) for s in GAS_PATH.sensors]
+    with pytest.raises(ParameterError, match="Wf: the lag of a measured input"):
+        gas_path_filter(GG, SensorSet(tuple(late)))
     (tmp_path / "empty.py").write_text("x = 1\n")
     with pytest.raises(DataError, match="registers no sensor"):
         load_sensors(tmp_path / "empty.py")
