@@ -19,10 +19,13 @@ if TYPE_CHECKING:
     from apu_casadi.gaspath.steady.trimbatch import trim_batch
     from apu_casadi.machine.faults.ttsc import Ttsc
     from apu_casadi.machine.generator import Generator
-    from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+    from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+    from apu_casadi.machine.loads.open import OpenLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu, trim
     from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
-    from apu_casadi.unit.multirate import Noise, simulate_joint
+    from apu_casadi.unit.multirate import simulate_joint
+    from apu_casadi.unit.noise import Noise
 
     __version__: str
 
@@ -54,16 +57,16 @@ _HOME = {
     "Ambient": "apu_casadi.unit.events",
     "Apu": "apu_casadi.unit.apu",
     "ApuError": "apu_casadi.core.errors",
-    "ConstantPowerLoad": "apu_casadi.machine.loads.load",
+    "ConstantPowerLoad": "apu_casadi.machine.loads.constantpower",
     "FaultChange": "apu_casadi.unit.events",
     "GasGenerator": "apu_casadi.gaspath.gasgenerator",
     "Generator": "apu_casadi.machine.generator",
     "HealthChange": "apu_casadi.unit.events",
     "LoadChange": "apu_casadi.unit.events",
-    "Noise": "apu_casadi.unit.multirate",
-    "OpenLoad": "apu_casadi.machine.loads.load",
+    "Noise": "apu_casadi.unit.noise",
+    "OpenLoad": "apu_casadi.machine.loads.open",
     "OperatingPoint": "apu_casadi.gaspath.steady.steadypoint",
-    "SeriesLoad": "apu_casadi.machine.loads.load",
+    "SeriesLoad": "apu_casadi.machine.loads.series",
     "Signal": "apu_casadi.core.signals",
     "Signals": "apu_casadi.core.signals",
     "StateSpace": "apu_casadi.core.statespace",
@@ -74,20 +77,10 @@ _HOME = {
 }
 
 
-def _version() -> str:
-    """Return the installed version; "unknown" in a checkout that is not installed."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("apu-casadi")
-    except PackageNotFoundError:
-        return "unknown"
-
-
 def __getattr__(name: str) -> Any:
     """Load a public name from its module, once."""
     if name == "__version__":
-        value: Any = _version()
+        value: Any = import_module("apu_casadi.core.version").installed()
     elif name in _HOME:
         value = getattr(import_module(_HOME[name]), name)
     else:

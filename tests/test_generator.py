@@ -16,9 +16,12 @@ from phase_coordinates import independent_machine
 from apu_casadi.core import simulation
 from apu_casadi.core.errors import OperatingPointError, ParameterError, SignalError
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.generator import Generator, MeasurementNoise
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
+from apu_casadi.machine.measurement import MeasurementNoise
 
 P = MachineParameters()
 GEN = Generator()
@@ -503,7 +506,7 @@ def test_second_feedback_lag_is_carried():
         (lambda: GEN.state_space("resistive", "leaki"), r"did you mean 'leaky'.*or None"),
         (lambda: ISOLATED.state_space("resistive", "coupled"), r"state for every kappa"),
         (lambda: GEN.simulate(KW225, 1e-6), r"shorter than dt_out"),
-        (lambda: GEN.simulate(KW225, 0.1, switches=[(0.05, 3.0)]), r"a load, a Ttsc, None"),
+        (lambda: GEN.simulate(KW225, 0.1, switches=[(0.05, 3.0)]), r"a load, a fault, None"),
     ],
 )
 def test_misuse_is_refused(call, message):

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from apu_casadi.core.errors import ParameterError, SignalError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from estimators.apu import identify as study
 from estimators.apu import severity, trials
 from estimators.information.identifiability import identify

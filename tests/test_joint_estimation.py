@@ -10,7 +10,7 @@ import pytest
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint

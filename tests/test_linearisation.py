@@ -9,7 +9,8 @@ from apu_casadi.core import simulation
 from apu_casadi.core.errors import ApuError, OperatingPointError, SignalError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import ConstantPowerLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.unit import linearisation
 from apu_casadi.unit.apu import Apu

@@ -9,7 +9,9 @@ from numpy.testing import assert_allclose
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.machine import exciter, wrsg
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from apu_casadi.machine.park import (
     PHASE_ANGLE,

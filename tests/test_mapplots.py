@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import DataError, MapError, SignalError
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.linearisation import linearise_gas_generator, linearise_joint
 from apu_casadi.unit.multirate import simulate_joint

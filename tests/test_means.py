@@ -14,7 +14,9 @@ from apu_casadi.core.errors import ApuWarning, SignalError
 from apu_casadi.core.means import PARTS, RMS, Term, as_dict, settled, wanted, window
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu

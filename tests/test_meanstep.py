@@ -12,9 +12,10 @@ from apu_casadi.core.means import PARTS, RMS, Term, as_dict, settled, wanted, wi
 from apu_casadi.machine import meanstep
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import ConstantPowerLoad, SeriesLoad
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.meanstep import MeanStep
-from apu_casadi.unit.machinestep import MEANS
+from apu_casadi.unit.stepmeans import MEANS
 
 GEN = Generator()
 W = GEN.machine.w_rated

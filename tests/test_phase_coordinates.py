@@ -12,7 +12,7 @@ from phase_coordinates import coupled_windings, krause_inductance, split_phase
 from apu_casadi.core import simulation
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 
 FROZEN = ExciterParameters(T_E=1e9)

@@ -11,7 +11,9 @@ from apu_casadi.core import simulation
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import ConstantPowerLoad, OpenLoad, SeriesLoad, fineness
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from scenarios import registry
 from scenarios.schema import Scenario
 
@@ -122,7 +124,7 @@ def test_a_phase_more_than_open_is_refused(R):
 def test_tolerances_follow_the_resistance():
     """Nothing below 1 kohm, in proportion above it, 1e-2 at least."""
     loads = (KW225, ConstantPowerLoad(1e5), OpenLoad(1e3), OpenLoad(1e4), OpenLoad(1e6))
-    assert [fineness(load) for load in loads] == [1.0, 1.0, 1.0, 0.1, 0.01]
+    assert [load.fineness for load in loads] == [1.0, 1.0, 1.0, 0.1, 0.01]
 
 
 @pytest.mark.parametrize("neutral", ["grounded", "isolated"])

@@ -17,7 +17,7 @@ from apu_casadi.core.errors import ParameterError
 from apu_casadi.machine import terminals as tm
 from apu_casadi.machine.faults.ttsc import Ttsc, fault_loss
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.park import Abc
 
 GEN = Generator()

@@ -8,12 +8,13 @@ are taken.
 
 from __future__ import annotations
 
+import math
 import numbers
 from typing import Any
 
 import numpy as np
 
-from apu_casadi.core.errors import ApuError, SignalError
+from apu_casadi.core.errors import ApuError, ScenarioError, SignalError
 
 
 def number(name: str, value: Any, *, error: type[ApuError] = SignalError) -> float:
@@ -32,6 +33,36 @@ def number(name: str, value: Any, *, error: type[ApuError] = SignalError) -> flo
     return float(a.reshape(()))
 
 
+def bounded(
+    value: Any,
+    what: str,
+    *,
+    lo: float = -math.inf,
+    hi: float = math.inf,
+    open_lo: bool = False,
+    unit: str = "",
+) -> float:
+    """Return ``value`` as a float when it is a finite number in [lo, hi], or in (lo, hi].
+
+    Raises:
+        ScenarioError: not a number (booleans are none), not finite, or outside the interval.
+    """
+    u = f" {unit}" if unit else ""
+    try:
+        x = number(what, value, error=ScenarioError)
+    except ScenarioError:
+        raise ScenarioError(f"{what}: a number is expected, got {value!r}") from None
+    if not math.isfinite(x):
+        raise ScenarioError(f"{what}: must be finite, got {x!r}")
+    if x < lo or x > hi or (open_lo and x <= lo):
+        if math.isinf(hi):
+            must = f"must be {'>' if open_lo else '>='} {lo:g}{u}"
+        else:
+            must = f"must lie in {'(' if open_lo else '['}{lo:g}, {hi:g}]{u}"
+        raise ScenarioError(f"{what}: {must}, got {x:g}")
+    return x
+
+
 def array(
     name: str, value: Any, *, what: str = "a number", error: type[ApuError] = SignalError
 ) -> np.ndarray:
@@ -43,7 +74,9 @@ def array(
     if type(value) is float:
         return np.asarray(value)
     if isinstance(value, np.ma.MaskedArray) and np.any(np.ma.getmaskarray(value)):
-        raise error(f"{name}: {int(np.ma.count_masked(value))} of {value.size} values are masked")
+        raise error(
+            f"{name}: {int(np.ma.getmaskarray(value).sum())} of {value.size} values are masked"
+        )
     wrong = _no_number(value)
     if wrong is not None:
         raise error(f"{name} must be {what}, got {_shown(wrong)}")

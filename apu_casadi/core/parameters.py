@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError, nearest
+from apu_casadi.core.signals import Signal, Signals
 
 
 def par(
@@ -61,6 +63,37 @@ class Parameters:
             if n not in names:
                 raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
         return dataclasses.replace(self, **values)
+
+    def signals(self, prefix: str, names: Iterable[str] | None = None) -> Signals:
+        """Return the values as signals with dotted names, as ``machine.r_s``.
+
+        Args:
+            prefix: what stands before the dot.
+            names: which, and in which order; default all.
+        """
+        by_name = {f.name: f for f in dataclasses.fields(self) if "unit" in f.metadata}
+        signals = []
+        for f in by_name.values() if names is None else [by_name[n] for n in names]:
+            size: Any = f.default
+            meta = f.metadata
+            signals.append(
+                Signal(f"{prefix}.{f.name}", meta["unit"], meta["doc"], nominal=abs(size) or 1.0)
+            )
+        return Signals(signals)
+
+    def symbolic(self, **values: Any) -> Self:
+        """Return a copy with some values replaced by symbols or expressions, unchecked.
+
+        Raises:
+            ParameterError: unknown name.
+        """
+        names = [f.name for f in dataclasses.fields(self)]
+        for n in values:
+            if n not in names:
+                raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
+        new = object.__new__(type(self))
+        new.__dict__.update({n: values.get(n, getattr(self, n)) for n in names})
+        return new
 
     def table(self) -> list[tuple[str, float, str, str, str]]:
         """Return rows (name, value, unit, meaning, source), for printing and for file headers."""

@@ -8,7 +8,7 @@ and missing names, wrong shapes and values that are not finite.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, overload
@@ -47,10 +47,10 @@ class Signal:
             raise SignalError(f"signal {self.name}: nominal must be > 0, got {self.nominal!r}")
 
 
-class Signals(Sequence[Signal]):
+class Signals(Sized):
     """An ordered set of :class:`Signal`, with packing and unpacking by name."""
 
-    def __init__(self, signals: Sequence[Signal] = ()) -> None:
+    def __init__(self, signals: Iterable[Signal] = ()) -> None:
         """Keep the signals; a name given twice is a :class:`SignalError`."""
         self._signals = tuple(signals)
         names = [s.name for s in self._signals]

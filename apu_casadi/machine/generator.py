@@ -1,18 +1,9 @@
 """The starter/generator: machine, turn-to-turn short circuit, exciter and load in one model.
 
-Written in the effective current ibar = i - T(:,k) mu i_fault, in which the machine is healthy.
-Flux linkages are the states and terminal voltages the algebraic unknowns; the latter enter
-linearly, so that the explicit right-hand side follows from the DAE by elimination.  The healthy
-model has no fault state at all: a fault brings its loop in, and takes it out again when cleared.
-
-A *variant* of the model is a load kind (``"resistive"``, ``"inductive"``, ``"constant_power"``)
-with a fault kind:
-
-* ``None`` : healthy;
-* ``"coupled"`` : kappa = mu with i_fault algebraic; grounded neutral, no load inductance in the
-  faulty phase; theta = (mu, k_rf, phase_angle);
-* ``"leaky"`` : i_fault is a state; kappa > mu, or kappa = mu with an isolated neutral or an
-  inductance in the faulty phase's load; theta = (mu, k_rf, kappa, phase_angle).
+What the equations are, :mod:`apu_casadi.machine.generatormodel` says.  A *variant* of the model
+belongs to a kind of load (:mod:`apu_casadi.machine.loads`) and a kind of fault
+(:mod:`apu_casadi.machine.faults`), or none: a fault brings its loop in, and takes it out again
+when cleared.
 
 At a switch the machine's flux linkages, the rotor angle and the exciter are continuous, and so
 are the effective currents.
@@ -22,45 +13,26 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from apu_casadi.core import simulation
 from apu_casadi.core.checked import number
-from apu_casadi.core.errors import OperatingPointError, ParameterError, SignalError, nearest
-from apu_casadi.core.measuring import measure
+from apu_casadi.core.errors import OperatingPointError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, derived, kept
-from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import wrsg
-from apu_casadi.machine.faults import ttsc
-from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.loads.load import (
-    KINDS,
-    V_MIN,
-    ConstantPowerLoad,
-    Load,
-    OpenLoad,
-    SeriesLoad,
-    fineness,
-)
+from apu_casadi.machine.faults.fault import FAULTS, Fault, FaultStructure
+from apu_casadi.machine.generatormodel import GeneratorModel, Structure, variant
+from apu_casadi.machine.loads.load import LOADS, Load, LoadStructure
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
-from apu_casadi.machine.park import (
-    Abc,
-    Qd0,
-    abc_to_qd0,
-    phase_selector,
-    qd0_to_abc,
-    speed_voltage,
-)
 from apu_casadi.machine.wrsg import Windings
 
-FAULTS = (None, "coupled", "leaky")
 NEUTRALS = ("grounded", "isolated")
 
 SAME_INSTANT = 1e-9  # s; switches closer than this are one
@@ -85,57 +57,13 @@ class GeneratorPoint:
         residual: largest state rate over nominal value (rotor angle apart), 1/s.
     """
 
-    ss: StateSpace
+    ss: GeneratorModel
     x: np.ndarray
     u: np.ndarray
     V_ref: float
     V_t: float
     y: dict[str, float]
     residual: float
-
-
-@dataclass(frozen=True)
-class MeasurementNoise:
-    """The measurement equation (10): white Gaussian noise on terminal quantities.
-
-    Args:
-        sigma_i: standard deviation of v_i, phase currents, A.
-        sigma_v: standard deviation of v_v, phase voltages, V.
-        sigma_V_fd: standard deviation of v_v, field voltage, V.
-    """
-
-    sigma_i: float = 0.0
-    sigma_v: float = 0.0
-    sigma_V_fd: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse standard deviations that are negative or not finite."""
-        for name in ("sigma_i", "sigma_v", "sigma_V_fd"):
-            value = number(f"MeasurementNoise.{name}", getattr(self, name), error=ParameterError)
-            if not (math.isfinite(value) and value >= 0):
-                raise ParameterError(f"MeasurementNoise.{name} must be >= 0, got {value!r}")
-
-    def measure(self, y: Mapping[str, Any], rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Return noisy i_a, i_b, i_c, v_a, v_b, v_c, V_fd, each of the shape it has in ``y``.
-
-        Args:
-            y: true values by name; a Dataset, or ``ss.y.unpack(step.y)``.
-            rng: the caller's generator; nothing is seeded here.
-        """
-        return dict(self.each(y, rng))
-
-    def each(
-        self, y: Mapping[str, Any], rng: np.random.Generator
-    ) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield name and noisy values of :meth:`measure` one after the other."""
-        sigmas = dict.fromkeys(("i_a", "i_b", "i_c"), self.sigma_i)
-        sigmas |= dict.fromkeys(("v_a", "v_b", "v_c"), self.sigma_v)
-        sigmas["V_fd"] = self.sigma_V_fd
-        missing = [n for n in sigmas if n not in y]
-        if missing:
-            raise SignalError(f"to be measured but absent: {', '.join(missing)}")
-        for n, sigma in sigmas.items():
-            yield n, measure(y[n], sigma, rng)
 
 
 @dataclass(frozen=True)
@@ -161,40 +89,37 @@ class Generator(Parametric):
 
     # -- variants ---------------------------------------------------------------------------
 
-    def state_space(self, load_kind: str = "resistive", faulted: str | None = None) -> StateSpace:
+    def state_space(
+        self, load: Load | str = "resistive", fault: Fault | str | None = None
+    ) -> GeneratorModel:
         """Return the model variant, built once.
 
         Args:
-            load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"`` (``load.kind``).
-            faulted: None, ``"coupled"`` or ``"leaky"``; see the module's text.
+            load: a load, or its kind.
+            fault: a fault, or its kind, or None.
 
         Raises:
-            ParameterError: unknown kinds, or ``"coupled"`` with an isolated neutral.
+            ParameterError: unknown kinds, or a kind of fault that this neutral does not allow.
         """
-        if load_kind not in KINDS:
-            raise ParameterError(f"load kind {load_kind!r} {nearest(str(load_kind), KINDS)}")
-        if faulted not in FAULTS:
-            raise ParameterError(
-                f"fault kind {faulted!r} {nearest(str(faulted), ('coupled', 'leaky'))}, or None"
-            )
-        if faulted == "coupled" and self.neutral == "isolated":
-            raise ParameterError(
-                "with an isolated neutral i_fault is a state for every kappa: use 'leaky'"
-            )
-        return _build(self, load_kind, faulted)
+        beside = load_of_kind(load) if isinstance(load, str) else load
+        if isinstance(fault, str):
+            example = _of_kind("fault", FAULTS.classes, fault, ", or None")
+            found: FaultStructure | None = FaultStructure.of(example, fault)
+        else:
+            kind = self.fault_kind(beside, fault)
+            found = FaultStructure.of(fault, kind) if fault and kind else None
+        return _variant(self, self._structure(beside, found))
 
-    def fault_kind(self, load: Load, fault: Ttsc | None) -> str | None:
-        """Return which variant a fault needs beside this load: None, "coupled" or "leaky"."""
-        if fault is None:
-            return None
-        inductive = isinstance(load, SeriesLoad) and load.L["abc".index(fault.phase)] > 0
-        if fault.kappa == fault.mu and self.neutral == "grounded" and not inductive:
-            return "coupled"
-        return "leaky"
+    def _structure(self, load: Load, fault: FaultStructure | None = None) -> Structure:
+        return Structure(LoadStructure.of(load), fault, self.neutral, self.exciter.absent)
 
-    def variant(self, load: Load, fault: Ttsc | None = None) -> StateSpace:
+    def fault_kind(self, load: Load, fault: Fault | None) -> str | None:
+        """Return which equations a fault needs beside this load."""
+        return None if fault is None else fault.kind(load, self.neutral)
+
+    def variant(self, load: Load, fault: Fault | None = None) -> GeneratorModel:
         """Return the model variant for a load and a fault."""
-        return self.state_space(load.kind, self.fault_kind(load, fault))
+        return self.state_space(load, fault)
 
     def inputs(
         self,
@@ -215,23 +140,20 @@ class Generator(Parametric):
             "w_r": self.machine.w_rated if w_r is None else w_r,
             "V_ref": self.V_ref_default if V_ref is None else V_ref,
         }
-        return _inputs(load.kind).pack({**values, **load.inputs, **noise})
+        return self._structure(load).inputs.pack({**values, **load.inputs, **noise})
 
-    def fault_vector(self, load: Load, fault: Ttsc | None) -> np.ndarray:
+    def fault_vector(self, load: Load, fault: Fault | None) -> np.ndarray:
         """Return the parameters theta of :meth:`variant` for this load and fault."""
-        kind = self.fault_kind(load, fault)
         if fault is None:
             return np.zeros(0)
-        values = {"mu": fault.mu, "k_rf": fault.k_rf, "phase_angle": fault.phase_angle}
-        if kind == "leaky":
-            values["kappa"] = fault._kappa
-        return _fault_signals(kind).pack(values)
+        kind = fault.kind(load, self.neutral)
+        return Signals(fault.own(kind, self.neutral).theta).pack(fault.parameters(kind))
 
     def transfer(
         self,
         x: Any,
-        source: StateSpace,
-        target: StateSpace,
+        source: GeneratorModel,
+        target: GeneratorModel,
         *,
         u: Any,
         theta: Any,
@@ -240,9 +162,8 @@ class Generator(Parametric):
     ) -> np.ndarray:
         """Return the state of ``target`` just after a switch, from that of ``source`` before it.
 
-        States carry over by name: flux linkages, rotor angle, exciter.  A new i_fault starts from
-        the algebraic i_fault of the source if it had a fault in that phase, else from zero; a new
-        load conductance starts where it draws its power from the source's terminal voltage.
+        States carry over by name: flux linkages, rotor angle, exciter.  Load and fault say where
+        their own states start (:meth:`Load.start`, :meth:`Fault.start`).
 
         Args:
             x, u, theta: state, inputs and parameters of the source at the switch.
@@ -250,23 +171,20 @@ class Generator(Parametric):
                 ``theta_target`` is taken to be in the phase it was in.
         """
         values = source.x.unpack(np.asarray(x, dtype=float))
-        angles = [
-            s.theta.unpack(np.asarray(t, dtype=float))["phase_angle"]
-            for s, t in ((source, theta), (target, theta_target))
-            if len(s.theta) and np.size(t)
-        ]
-        moved = len(angles) == 2 and angles[0] != angles[1]
-        if moved:  # another branch: the one that was there is gone, with its current
-            values.pop("i_fault", None)
-        new = [n for n in target.x.names if n not in values]
-        if new:
-            z = source.z.unpack(source.z_of(x, u, theta).full().ravel())
+        assert target.load is not None
+        load, fault = target.load.load, target.fault
+        own = fault.fault.own(fault.kind, self.neutral).states if fault else ()
+        if own or load.own.states:
             y = source.y.unpack(source.g(x, u, theta).full().ravel())
-            start = {"i_fault": 0.0 if moved else z.get("i_fault", 0.0)}
-            if "G_load" in new:
-                V_2 = max(3.0 * y["V_t"] ** 2, 3.0 * (V_MIN * self.machine.V_rated_rms) ** 2)
-                start["G_load"] = target.u.unpack(np.asarray(u_target))["P_load"] / V_2
-            values |= {n: start[n] for n in new}
+            before = {**y, **values}
+            V_rated = self.machine.V_rated_rms
+            values |= load.start(before, target.u.unpack(np.asarray(u_target, float)), V_rated)
+            if fault:
+                was, now = (
+                    s.theta.unpack(np.asarray(t, dtype=float)) if np.size(t) else {}
+                    for s, t in ((source, theta), (target, theta_target))
+                )
+                values |= fault.fault.start(before, was, now, tuple(s.name for s in own))
         return target.x.pack({n: values[n] for n in target.x.names})
 
     def spike(
@@ -309,22 +227,22 @@ class Generator(Parametric):
         p = self.machine
         R = 3.0 * p.V_rated_rms**2 / p.P_rated
         V_t = V_TABLE_7 * p.V_rated_rms / 230.0
-        E_fd = self._field(V_t, R, 0.0, p.w_rated)[0] / p.V_fd_base
+        E_fd = self._field(V_t, complex(R), p.w_rated)[0] / p.V_fd_base
         V_ref = ac5a.exciter_steady(self.exciter, E_fd=E_fd, V_t=V_t / p.V_rated_rms)[1]
         return float(V_ref)
 
-    def _field(self, V_t: float, R: float, L: float, w_r: float) -> tuple[float, Windings]:
-        """Return V_fd (V) and the steady currents for a terminal voltage (V rms) and R-L load.
+    def _field(self, V_t: float, Z: complex, w_r: float) -> tuple[float, Windings]:
+        """Return V_fd (V) and the steady currents for a terminal voltage (V rms) and impedance.
 
-        (5)-(7) at rest are linear in i_fd:
-            (R + r_s) i_q + w_r (L + L_d) i_d = w_r L_md i_fd,   (R + r_s) i_d = w_r (L + L_q) i_q.
+        (5)-(7) at rest with Z = R + j X are linear in i_fd:
+            (R + r_s) i_q + (X + w_r L_d) i_d = w_r L_md i_fd,  (R + r_s) i_d = (X + w_r L_q) i_q.
         """
         p = self.machine
-        X_d, X_q = w_r * (L + p.L_md + p.L_ls), w_r * (L + p.L_mq + p.L_ls)
-        R_t = R + p.r_s
+        X_d, X_q = Z.imag + w_r * (p.L_md + p.L_ls), Z.imag + w_r * (p.L_mq + p.L_ls)
+        R_t = Z.real + p.r_s
         i_q = R_t / (R_t**2 + X_d * X_q)  # for w_r L_md i_fd = 1 V
         i_d = X_q * i_q / R_t
-        V_unit = math.hypot(R, w_r * L) * math.hypot(i_q, i_d)
+        V_unit = abs(Z) * math.hypot(i_q, i_d)
         scale = math.sqrt(2.0) * V_t / V_unit
         i_fd = scale / (w_r * p.L_md)
         return p.r_fd * i_fd, Windings(scale * i_q, scale * i_d, 0.0, i_fd, 0.0, 0.0)
@@ -368,7 +286,7 @@ class Generator(Parametric):
             )
 
         def at(V: float) -> tuple[float, Windings, ac5a.ExciterState, float]:
-            V_fd, i = self._field(V, *_star(load, V), w_r)
+            V_fd, i = self._field(V, load.impedance(w_r, V), w_r)
             E_fd = V_fd / p.V_fd_base
             states, ref = ac5a.exciter_steady(e, E_fd=E_fd, V_t=V / p.V_rated_rms)
             return V_fd, i, states, ref
@@ -400,13 +318,12 @@ class Generator(Parametric):
                 f"holding {V_t:.5g} V with {load!r} at w_r = {w_r:.5g} rad/s needs "
                 f"V_R = {states.V_R:.4g}, outside [{e.V_R_min:g}, {e.V_R_max:g}]"
             )
-        ss = self.state_space(load.kind)
+        ss = self.state_space(load)
         lam = wrsg.flux_linkages(p, i)
         values: dict[str, Any] = {f"lam_{n}": v for n, v in lam._asdict().items()}
         values |= {n: v for n, v in states._asdict().items() if v is not None}
         values["theta_e"] = theta_e
-        if isinstance(load, ConstantPowerLoad):
-            values["G_load"] = 1.0 / _star(load, V_t)[0]
+        values |= load.steady(w_r, V_t, i.stator)
         x = ss.x.pack({n: values[n] for n in ss.x.names})
         u = self.inputs(load, w_r=w_r, V_ref=ref)
         rate = ss.f(x, u, []).full().ravel() / ss.x.nominals
@@ -415,8 +332,8 @@ class Generator(Parametric):
         if not abs(rate[worst]) < 1e-6:
             raise OperatingPointError(
                 f"steady state of {ss.name} with {load!r}: {ss.x.names[worst]} changes by "
-                f"{rate[worst]:.2e} of its nominal value per second, 1e-6 allowed; a constant-"
-                f"power load is a conductance below {V_MIN:g} of rated voltage"
+                f"{rate[worst]:.2e} of its nominal value per second, 1e-6 allowed"
+                + (f"; {load.caveat}" if load.caveat else "")
             )
         y = ss.y.unpack(ss.g(x, u, []).full().ravel())
         return GeneratorPoint(ss, x, u, ref, V_t, y, float(abs(rate[worst])))
@@ -428,11 +345,11 @@ class Generator(Parametric):
         load: Load,
         t_end: float,
         *,
-        switches: Sequence[tuple[float, Load | Ttsc | Mapping[str, float] | None]] = (),
+        switches: Sequence[tuple[float, Load | Fault | Mapping[str, float] | None]] = (),
         w_r: float | None = None,
         V_ref: float | None = None,
         dt_out: float = 50e-6,
-        solver: str = "cvodes",
+        solver: str = "auto",
         rtol: float = simulation.RTOL,
         atol: float = simulation.ATOL,
     ) -> Any:
@@ -441,7 +358,7 @@ class Generator(Parametric):
         Args:
             load: balanced load at the start.
             t_end: end, s.
-            switches: pairs (instant in s, what comes): a load replaces the load, a :class:`Ttsc`
+            switches: pairs (instant in s, what comes): a load replaces the load, a fault
                 replaces the fault, None clears it, a mapping changes inputs (``w_r``, ``V_ref``,
                 process noise).  Several that share an instant are one switch, whatever their order.
             w_r, V_ref: as for :meth:`steady_state`.
@@ -459,22 +376,22 @@ class Generator(Parametric):
         grid = np.arange(n + 1) * dt_out
         if t_end - grid[-1] > 1e-9 * dt_out:
             grid = np.append(grid, t_end)
-        fault: Ttsc | None = None
+        fault: Fault | None = None
         other: dict[str, float] = {"w_r": point.u[0], "V_ref": point.V_ref}
         plan, ss, u, theta = [], point.ss, point.u, np.zeros(0)
-        loads, told = [load], list[str]()
+        fed, told = [load], list[str]()
         for t, changes in _instants(switches):
             fault = changes.get("fault", fault)
             load = changes.get("load", load)
             other = {**other, **changes.get("inputs", {})}
-            loads.append(load)
+            fed.append(load)
             new = self.variant(load, fault)
             u_new = self.inputs(load, **other)
             theta_new = self.fault_vector(load, fault)
             transfer = _Transfer(self, ss, new, u, theta, u_new, theta_new, t, load, told)
             plan.append(simulation.Switch(t, u_new, theta_new, new, transfer))
             ss, u, theta = new, u_new, theta_new
-        fine = min(fineness(each) for each in loads)
+        fine = min(each.fineness for each in fed)
         rtol, atol = fine * rtol, fine * atol
         data = simulation.simulate(
             point.ss, point.x, grid, point.u, switches=plan, solver=solver, rtol=rtol, atol=atol
@@ -493,8 +410,8 @@ class _Transfer:
     """The state map of one switch, as a function of the state before it."""
 
     generator: Generator
-    source: StateSpace
-    target: StateSpace
+    source: GeneratorModel
+    target: GeneratorModel
     u: np.ndarray
     theta: np.ndarray
     u_target: np.ndarray
@@ -528,9 +445,9 @@ def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[s
         if not grouped or t - grouped[-1][0] > SAME_INSTANT:
             grouped.append((float(t), {}))
         now = grouped[-1][1]
-        if change is None or isinstance(change, Ttsc):
+        if change is None or isinstance(change, Fault):
             kind, twice = "fault", "fault" in now
-        elif isinstance(change, SeriesLoad | ConstantPowerLoad | OpenLoad):
+        elif isinstance(change, Load):
             kind, twice = "load", "load" in now
         elif isinstance(change, Mapping):
             kind, before = "inputs", now.get("inputs", {})
@@ -538,7 +455,7 @@ def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[s
             change = {**before, **change}
         else:
             raise ParameterError(
-                f"switch at t = {t:g} s: a load, a Ttsc, None or a mapping of inputs is "
+                f"switch at t = {t:g} s: a load, a fault, None or a mapping of inputs is "
                 f"needed, got {change!r}"
             )
         if twice and now[kind] != change:
@@ -549,258 +466,23 @@ def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[s
     return grouped
 
 
-def _star(load: Load, V: float) -> tuple[float, float]:
-    """Return a balanced load's R (ohm) and L (H) per phase at a voltage (V rms)."""
-    if isinstance(load, ConstantPowerLoad):
-        return 3.0 * V**2 / load.P, 0.0
-    if isinstance(load, SeriesLoad):
-        return load.R[0], load.L[0]
-    return load.R, 0.0
-
-
-def _inputs(load_kind: str) -> Signals:
-    signals = [
-        Signal("w_r", "rad/s", "electrical rotor speed", nominal=2500.0),
-        Signal("V_ref", "1", "voltage reference, per unit"),
-    ]
-    if load_kind == "constant_power":
-        signals += [
-            Signal("P_load", "W", "power of the constant-power load", nominal=2e5),
-            Signal("tau_load", "s", "lag of the constant-power load", nominal=2e-3),
-        ]
-    else:
-        signals += [Signal(f"R_{k}", "ohm", f"load resistance, phase {k}") for k in "abc"]
-    if load_kind == "inductive":
-        signals += [
-            Signal(f"L_{k}", "H", f"load inductance, phase {k}", nominal=1e-4) for k in "abc"
-        ]
-    signals += [
-        Signal(f"w1_{a}", "V", f"process noise w1 of (5), {a} axis", default=0.0) for a in "qd0"
-    ]
-    signals += [
-        Signal(f"w2_{a}", "V", f"process noise w2 of (6), {a} winding", default=0.0)
-        for a in ("fd", "kd", "kq")
-    ]
-    return Signals(signals)
-
-
-def _fault_signals(kind: str | None) -> Signals:
-    if kind is None:
-        return Signals()
-    signals = [
-        Signal("mu", "1", "fraction of the phase's turns that is shorted", nominal=0.05),
-        Signal("k_rf", "1", "fault over shorted-turn resistance (4)"),
-        Signal("phase_angle", "rad", "axis of the faulty phase; 0 for phase a"),
-    ]
-    if kind == "leaky":
-        signals.insert(2, Signal("kappa", "1", "leakage partition, mu <= kappa <= 1"))
-    return Signals(signals)
-
-
-def _states(e: ExciterParameters, *, grounded: bool, load_kind: str, leaky: bool) -> Signals:
-    signals = [
-        Signal("lam_sq", "Wb", "stator flux linkage, q axis", nominal=0.1),
-        Signal("lam_sd", "Wb", "stator flux linkage, d axis", nominal=0.1),
-        Signal("lam_s0", "Wb", "stator flux linkage, zero sequence", nominal=0.1),
-        Signal("lam_fd", "Wb", "field flux linkage", nominal=0.1),
-        Signal("lam_kd", "Wb", "d damper flux linkage", nominal=0.1),
-        Signal("lam_kq", "Wb", "q damper flux linkage", nominal=0.1),
-    ]
-    if not grounded:
-        del signals[2]
-    if leaky:
-        signals.append(Signal("i_fault", "A", "current of the fault branch", nominal=1e3))
-    signals.append(Signal("theta_e", "rad", "rotor angle, phase-a axis to q axis, unwrapped"))
-    signals += list(ac5a.exciter_signals(e))
-    if load_kind == "constant_power":
-        signals.append(Signal("G_load", "S", "conductance of the constant-power load"))
-    return Signals(signals)
-
-
-_OUTPUTS = Signals(
-    [
-        *(Signal(f"v_{k}", "V", f"terminal voltage of phase {k} to the machine's neutral",
-                 nominal=300.0) for k in "abc"),
-        *(Signal(f"i_{k}", "A", f"terminal current of phase {k}", nominal=300.0) for k in "abc"),
-        Signal("V_fd", "V", "field voltage, referred to the stator", nominal=50.0),
-        Signal("i_fd", "A", "field current, referred to the stator", nominal=1e3),
-        Signal("i_kd", "A", "d damper current", nominal=100.0),
-        Signal("i_kq", "A", "q damper current", nominal=100.0),
-        Signal("i_fault", "A", "current of the fault branch", nominal=1e3),
-        Signal("E_fd", "1", "exciter output, per unit"),
-        Signal("V_t", "V", "terminal voltage: rms of the space vector", nominal=200.0),
-        Signal("v_n", "V", "load star point to machine neutral", nominal=100.0),
-        Signal("T_e", "N m", "electromagnetic torque of one machine", nominal=200.0),
-        Signal("P_e", "W", "electrical output of one machine", nominal=2e5),
-        Signal("P_loss_fault", "W", "extra loss of the fault in (8), one machine", nominal=1e4),
-        Signal("P_total", "W", "mechanical power of both machines (8)", nominal=4e5),
-    ]
-)  # fmt: skip
-
-
-def solve_linear(M: ca.SX, b: ca.SX) -> ca.SX:
-    """Return M^-1 b by elimination in the given order, spending nothing on structural zeros.
-
-    No pivoting: the caller orders the unknowns so that the pivots cannot vanish.
-    """
-    n = M.shape[0]
-    A = [[M[i, j] for j in range(n)] for i in range(n)]
-    r = [b[i] for i in range(n)]
-    for k in range(n):
-        for i in range(k + 1, n):
-            if A[i][k].is_zero():
-                continue
-            factor = A[i][k] / A[k][k]
-            A[i][k] = ca.SX(0)
-            for j in range(k + 1, n):
-                if not A[k][j].is_zero():
-                    A[i][j] = A[i][j] - factor * A[k][j]
-            r[i] = r[i] - factor * r[k]
-    x: list[Any] = [None] * n
-    for i in reversed(range(n)):
-        total = r[i]
-        for j in range(i + 1, n):
-            if not A[i][j].is_zero():
-                total = total - A[i][j] * x[j]
-        x[i] = total / A[i][i]
-    return ca.vertcat(*x)
-
-
 @kept
-def _build(gen: Generator, load_kind: str, faulted: str | None) -> StateSpace:
-    """Write the semi-explicit DAE once, and eliminate its algebraic unknowns."""
-    p, e = gen.machine, gen.exciter
-    grounded, leaky = gen.neutral == "grounded", faulted == "leaky"
-    X = _states(e, grounded=grounded, load_kind=load_kind, leaky=leaky)
-    U, TH = _inputs(load_kind), _fault_signals(faulted)
-    algebraic = [
-        Signal(f"v_{k}", "V", f"terminal voltage of phase {k}", nominal=300.0) for k in "abc"
-    ]
-    if not grounded:
-        # a difference of phase voltages: megavolts when a switch opens, so the nominal is large
-        algebraic.append(Signal("v_n", "V", "load star point to machine neutral", nominal=1e4))
-    if faulted == "coupled":
-        algebraic.append(Signal("i_fault", "A", "current of the fault branch", nominal=1e3))
-    if leaky:
-        algebraic.append(Signal("di_fault", "A/s", "rate of i_fault", nominal=1e8))
-    Z = Signals(algebraic)
-    (xv, x), (zv, z), (uv, u), (tv, th) = X.sx(), Z.sx(), U.sx(), TH.sx()
+def _variant(gen: Generator, structure: Structure) -> GeneratorModel:
+    return variant(structure, gen.machine, gen.exciter)
 
-    # fault
-    zero = ca.SX(0)
-    mu, k_rf = th.get("mu", zero), th.get("k_rf", zero)
-    kappa = th.get("kappa", mu)
-    i_fault = x["i_fault"] if leaky else z.get("i_fault", zero)
-    di_fault = z.get("di_fault", zero)
-    theta_e, w_r = x["theta_e"], u["w_r"]
-    select = phase_selector(th["phase_angle"]) if faulted else Abc(zero, zero, zero)
 
-    # machine
-    lam = Windings(
-        x["lam_sq"],
-        x["lam_sd"],
-        x["lam_s0"] if grounded else p.L_ls * mu * i_fault / 3.0,  # i_0 = 0
-        x["lam_fd"],
-        x["lam_kd"],
-        x["lam_kq"],
-    )
-    ibar = wrsg.currents(p, lam)
-    v = Abc(z["v_a"], z["v_b"], z["v_c"])
-    v_qd0 = abc_to_qd0(theta_e, v)
-    w1 = Qd0(u["w1_q"], u["w1_d"], u["w1_0"])
-    V_fd = p.V_fd_base * x["E_fd"]
-    dlam = wrsg.flux_rates(
-        p,
-        lam=lam,
-        i=ibar,
-        v=v_qd0,
-        V_fd=V_fd,
-        w_r=w_r,
-        w1=w1,
-        w2=(u["w2_fd"], u["w2_kd"], u["w2_kq"]),
-    )
-    i = Abc(*(
-        ib + s * mu * i_fault
-        for ib, s in zip(qd0_to_abc(theta_e, ibar.stator), select, strict=True)
-    ))  # fmt: skip
+def load_of_kind(kind: str) -> Load:
+    """Return a typical load of a kind."""
+    return _of_kind("load", LOADS.classes, kind)
 
-    # load
-    v_n = z.get("v_n", zero)
-    v_load = Abc(*(vk - v_n for vk in v))
-    if load_kind == "constant_power":
-        drop = [ik / x["G_load"] for ik in i]
-    else:
-        drop = [u[f"R_{k}"] * ik for k, ik in zip("abc", i, strict=True)]
-    if load_kind == "inductive":
-        rates = dlam if grounded else dlam._replace(s0=p.L_ls * mu * di_fault / 3.0)
-        dibar = wrsg.currents(p, rates).stator
-        turn = speed_voltage(w_r, ibar.stator)
-        dbar = qd0_to_abc(theta_e, Qd0(*(a + b for a, b in zip(dibar, turn, strict=True))))
-        drop = [
-            d + u[f"L_{k}"] * (di + s * mu * di_fault)
-            for k, d, di, s in zip("abc", drop, dbar, select, strict=True)
-        ]
-    alg = [vk - d for vk, d in zip(v_load, drop, strict=True)]
-    if not grounded:  # (5), zero sequence: what v_0 must be for i_0 to stay zero
-        v_0 = p.L_ls * mu * di_fault / 3.0 - p.r_s * ibar.s0 + w1.zero
-        alg.append(v_qd0.zero - v_0)
-    w1_abc = qd0_to_abc(theta_e, w1)
-    if faulted:
-        v_k = sum((s * (vk - wk) for s, vk, wk in zip(select, v, w1_abc, strict=True)), zero)
-        alg.append(
-            ttsc.loop_residual(
-                p, mu=mu, k_rf=k_rf, kappa=kappa, v_k=v_k, i_fault=i_fault, di_fault=di_fault
-            )
-        )
 
-    # exciter
-    V_space = ca.sqrt(v_qd0.q**2 + v_qd0.d**2 + (1e-6 * p.V_rated_rms) ** 2)
-    V_t = V_space / math.sqrt(2.0)
-    ex = ac5a.ExciterState(*(x.get(n) for n in ac5a.ExciterState._fields))
-    dex = ac5a.exciter_rates(e, ex, V_t=V_t / p.V_rated_rms, V_ref=u["V_ref"])
+def fault_of_kind(kind: str) -> Fault:
+    """Return a typical fault of a kind."""
+    return _of_kind("fault", FAULTS.classes, kind)
 
-    ode = {f"lam_{n}": d for n, d in dlam._asdict().items() if f"lam_{n}" in X}
-    ode |= {n: d for n, d in dex._asdict().items() if n in X}
-    ode["theta_e"] = w_r
-    if leaky:
-        ode["i_fault"] = di_fault
-    if load_kind == "constant_power":
-        V_2 = sum((vk**2 for vk in v_load), zero)
-        floor = 3.0 * (V_MIN * p.V_rated_rms) ** 2
-        ode["G_load"] = (u["P_load"] / ca.fmax(V_2, floor) - x["G_load"]) / u["tau_load"]
 
-    P_e = sum((vk * ik for vk, ik in zip(v, i, strict=True)), zero)
-    i_k = sum((s * ik for s, ik in zip(select, i, strict=True)), zero)
-    P_loss = ttsc.fault_loss(p, mu=mu, k_rf=k_rf, i_k=i_k, i_fault=i_fault) if faulted else zero
-    y = {
-        **{f"v_{k}": vk for k, vk in zip("abc", v, strict=True)},
-        **{f"i_{k}": ik for k, ik in zip("abc", i, strict=True)},
-        "V_fd": V_fd,
-        "i_fd": ibar.fd,
-        "i_kd": ibar.kd,
-        "i_kq": ibar.kq,
-        "i_fault": i_fault,
-        "E_fd": x["E_fd"],
-        "V_t": V_t,
-        "v_n": v_n,
-        "T_e": wrsg.torque(p, lam=lam, i=ibar),
-        "P_e": P_e,
-        "P_loss_fault": P_loss,
-        "P_total": 2.0 * (P_e + P_loss) / p.eta_sg,
-    }
-
-    ode_v, alg_v, y_v = X.stack(ode), ca.vertcat(*alg), _OUTPUTS.stack(y)
-    z_expr = solve_linear(ca.jacobian(alg_v, zv), -ca.substitute(alg_v, zv, ca.SX.zeros(len(Z))))
-    f_v, g_v = ca.substitute([ode_v, y_v], [zv], [z_expr])
-    name = "_".join(["generator", load_kind, faulted or "healthy"])
-    name += "" if grounded else "_isolated"
-    return StateSpace.of(
-        name,
-        (X, Z, U, TH, _OUTPUTS),
-        (xv, zv, uv, tv),
-        dae=(ode_v, alg_v),
-        f=f_v,
-        g=g_v,
-        z=z_expr,
-        cse=True,
-    )
+def _of_kind(what: str, classes: Sequence[Any], kind: str, more: str = "") -> Any:
+    examples = {k: v for cls in classes for k, v in cls.examples().items()}
+    if kind not in examples:
+        raise ParameterError(f"{what} kind {kind!r} {nearest(str(kind), examples)}{more}")
+    return examples[kind]

@@ -22,6 +22,7 @@ load and machine.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -35,27 +36,20 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.machine.generator import Generator, GeneratorPoint
+from apu_casadi.machine.generator import Generator, GeneratorPoint, load_of_kind
+from apu_casadi.machine.generatormodel import DRIVES
 from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.unit.apu import Apu, JointPoint
-from apu_casadi.unit.control import governor
+from apu_casadi.unit.exchange import coupled
 
 # The angle enters f and g, and their derivatives by h at h = 0, through its first and second
 # harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.
 _ANGLES = 6
 
-_SEVERITY = Signals(
-    [
-        Signal(
-            "h", "1", "severity mu/(k_rf + 1 - mu) of a TTSC of one phase with kappa = mu",
-            default=0.0, nominal=0.01,
-        )
-    ]
-)  # fmt: skip
+_H = "severity mu/(k_rf + 1 - mu) of a TTSC of one phase with kappa = mu"
+_SEVERITY = Signals([Signal("h", "1", _H, default=0.0, nominal=0.01)])
 
-_KEPT = (
-    "V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"
-)  # fmt: skip
+_KEPT = ["V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"]
 _AXES = Signals(
     [
         Signal("v_q", "V", "terminal voltage, q axis", nominal=300.0),
@@ -74,16 +68,25 @@ def has_severity(gen: Generator, load_kind: str) -> bool:
     neutral, no inductance in the load.  Elsewhere that current is a state of its own, whose time
     constant vanishes with h, and there is no derivative by h at h = 0 at the instant of a step.
     """
-    return gen.neutral == "grounded" and load_kind != "inductive"
+    return gen.neutral == "grounded" and not load_of_kind(load_kind).inductive("a")
 
 
-def _balanced_inputs(ss: StateSpace) -> Signals:
+def _by_phase(load_kind: str) -> tuple[str, ...]:
+    """Return the names of a load's inputs that have a value for each phase, without ``_a``."""
+    names = [s.name for s in load_of_kind(load_kind).own.inputs]
+    return tuple(n[:-2] for n in names if n.endswith("_a") and f"{n[:-2]}_c" in names)
+
+
+def _balanced_inputs(load_kind: str) -> Signals:
     """Inputs of the averaged model: one value for all three phases."""
-    kept = [ss.u[n] for n in ("w_r", "V_ref", "P_load", "tau_load") if n in ss.u]
-    if "R_a" in ss.u:
-        kept.append(Signal("R", "ohm", "load resistance of each phase"))
-    if "L_a" in ss.u:
-        kept.append(Signal("L", "H", "load inductance of each phase", nominal=1e-4))
+    kept: list[Signal] = list(DRIVES)
+    for s in load_of_kind(load_kind).own.inputs:
+        base, phase = s.name[:-2], s.name[-2:]
+        if base not in _by_phase(load_kind):
+            kept.append(s)
+        elif phase == "_a":
+            doc = s.doc.replace(", phase a", " of each phase")
+            kept.append(dataclasses.replace(s, name=base, doc=doc))
     return Signals(kept)
 
 
@@ -91,24 +94,24 @@ def _balanced_inputs(ss: StateSpace) -> Signals:
 def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpace:
     """Return one generator, averaged over an electrical period, under a balanced load.
 
-    States are the generator's without the rotor angle; inputs w_r, V_ref and the load's R (and L),
-    or P_load and tau_load; theta is the severity h where :func:`has_severity`, else empty; outputs
+    States are the generator's without the rotor angle; inputs w_r, V_ref and the load's, one value
+    for all phases; theta is the severity h where :func:`has_severity`, else empty; outputs
     are field, magnitudes, power, torque and the voltages and currents on the rotor's axes.
 
     Args:
         gen: the generator.
-        load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"``.
+        load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
     """
     faulty = has_severity(gen, load_kind)
     full = gen.state_space(load_kind, "coupled" if faulty else None)
     X = Signals([s for s in full.x if s.name != "theta_e"])
-    U, TH = _balanced_inputs(full), _SEVERITY if faulty else Signals()
+    U, TH = _balanced_inputs(load_kind), _SEVERITY if faulty else Signals()
     Y = Signals([*(full.y[n] for n in _KEPT), *_AXES])
     (xv, x), (uv, u), (tv, th) = X.sx(), U.sx(), TH.sx()
 
     inputs = dict.fromkeys(full.u.names, ca.SX(0))
     inputs |= {n: u[n] for n in U.names if n in full.u}
-    inputs |= {f"{n}_{k}": u[n] for n in ("R", "L") if n in u for k in "abc"}
+    inputs |= {f"{n}_{k}": u[n] for n in _by_phase(load_kind) for k in "abc"}
     u_full = full.u.stack(inputs)
     fault = ca.SX(0, 1)
     if faulty:  # with k_rf = 0, h = mu/(1 - mu); only h matters if kappa = mu
@@ -116,7 +119,7 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
         fault = full.theta.stack(values)
     angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES if faulty else np.zeros(1)
     rate: Any = 0
-    mean: dict[str, Any] = dict.fromkeys((*_KEPT, "v_q", "v_d", "i_q", "i_d"), ca.SX(0))
+    mean: dict[str, Any] = dict.fromkeys([*_KEPT, "v_q", "v_d", "i_q", "i_d"], ca.SX(0))
     for angle in angles:
         x_full = full.x.stack({**x, "theta_e": ca.SX(float(angle))})
         rate += full.f(x_full, u_full, fault) / angles.size
@@ -132,20 +135,15 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
     f, g = X.stack({n: rates[n] for n in X.names}), Y.stack(mean)
 
     name = f"averaged_generator_{load_kind}" + ("" if gen.neutral == "grounded" else "_isolated")
-    no_z = ca.SX.sym("z", 0)
+    signals, symbols = (X, Signals(), U, TH, Y), (xv, ca.SX.sym("z", 0), uv, tv)
     none = ca.SX(0, 1)
-    return StateSpace.of(
-        name,
-        (X, Signals(), U, TH, Y),
-        (xv, no_z, uv, tv),
-        dae=(f, none), f=f, g=g, z=none, cse=True,
-    )  # fmt: skip
+    return StateSpace.of(name, signals, symbols, dae=(f, none), f=f, g=g, z=none, cse=True)
 
 
 def load_kind(point: GeneratorPoint) -> str:
     """Return the kind of load of a steady point."""
-    names = point.ss.u.names
-    return "constant_power" if "P_load" in names else "inductive" if "L_a" in names else "resistive"
+    assert point.ss.load is not None
+    return point.ss.load.kind
 
 
 def generator_vectors(
@@ -160,9 +158,7 @@ def generator_vectors(
     ss = averaged_generator(gen, load_kind(point))
     x_full = point.ss.x.unpack(point.x)
     values = {n: u_full[n] for n in ss.u.names if n in u_full}
-    for n in ("R", "L"):
-        if n not in ss.u:
-            continue
+    for n in _by_phase(load_kind(point)):
         phases = [u_full[f"{n}_{k}"] for k in "abc"]
         if not np.allclose(phases, phases[0], rtol=1e-9, atol=0):
             raise SignalError(
@@ -177,12 +173,10 @@ def generator_vectors(
 def _joint_signals(apu: Apu, load_kind: str) -> tuple[Signals, Signals, Signals, Signals]:
     """Return x, u, theta and y of the averaged unit."""
     gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
-    X = Signals([*gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x])
-    U = Signals([
-        *(gg.U[n] for n in AMBIENT),
-        Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0),
-        *(s for s in gen.u if s.name != "w_r"),
-    ])  # fmt: skip
+    X = Signals([*gg.X, *apu.governor.X, *gen.x])
+    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
+    own = [s for s in gen.u if s.name != "w_r"]
+    U = Signals([*(gg.U[n] for n in AMBIENT), N_ref, *own])
     return X, U, Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
 
@@ -193,25 +187,18 @@ def _joint(apu: Apu, load_kind: str) -> tuple[ca.Function, ca.Function]:
     X, U, TH, _ = _joint_signals(apu, load_kind)
     x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
     u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
-    N, Wf_I, x_gen = x[0], x[1], x[2:]
+    N, x_gov, x_gen = ca.vertsplit(x, [0, 1, 1 + len(apu.governor.X), len(X)])
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
     health, h = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
-    u_gen = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
-    y_gen = gen.g(x_gen, u_gen, h)
-    fuel = governor(N=N, N_ref=inputs["N_ref"], Wf_I=Wf_I, par=apu.governor)
-    PW = apu.PW(y_gen[gen.y.index("P_total")])
-    u_gg = ca.vertcat(fuel.Wf, PW, *(inputs[n] for n in AMBIENT))
+    link = dataclasses.replace(apu.link, N_ref=inputs["N_ref"])
+    u_gg, rates, y_gen = coupled(link, gen, N=N, x=x_gov, x_gen=x_gen, inputs=inputs, fault=h)
     N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
-    ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_gen, u_gen, h))
+    ode = ca.vertcat(N_dot, rates)
     z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
-    name = f"joint_averaged_{load_kind}"
-    return (
-        ca.Function(
-            f"{name}_equations", [x, z, u, theta], [ode, alg, ca.vertcat(y_gg, y_gen)],
-            ["x", "z", "u", "theta"], ["ode", "alg", "y"],
-        ),
-        ca.Function(f"{name}_z", [x, u, theta], [z_sol], ["x", "u", "theta"], ["z"]),
-    )  # fmt: skip
+    name, y = f"joint_averaged_{load_kind}", ca.vertcat(y_gg, y_gen)
+    names = ["x", "z", "u", "theta"], ["ode", "alg", "y"]
+    equations = ca.Function(f"{name}_equations", [x, z, u, theta], [ode, alg, y], *names)
+    return equations, ca.Function(f"{name}_z", [x, u, theta], [z_sol], ["x", "u", "theta"], ["z"])
 
 
 def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
@@ -223,7 +210,7 @@ def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
 def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
     """Return the whole unit with averaged generators, continuous in time.
 
-    States are the rotor speed N, the governor's integrator Wf_I and those of the averaged
+    States are the rotor speed N, those of the governor (Wf_I) and those of the averaged
     generator; inputs the ambient conditions, N_ref, V_ref and the load of each generator; theta
     the health factors and h, which stands for the same fault in both machines, as (8) counts
     them; outputs those of both models.  Shaft power is that of the very instant, (1), and the
@@ -231,7 +218,7 @@ def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
 
     Args:
         apu: the unit.
-        load_kind: ``"resistive"``, ``"inductive"`` or ``"constant_power"``.
+        load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
     """
     X, U, TH, Y = _joint_signals(apu, load_kind)
     Z = apu.gas_generator.z
@@ -261,6 +248,6 @@ def joint_vectors(
         "N_ref": apu.N_ref,
         **{n: v for n, v in gen_ss.u.unpack(u_gen).items() if n != "w_r"},
     }
-    x = np.concatenate([point.gas.x, [gas["Wf"]], x_gen])
+    x = np.concatenate([point.gas.x, apu.governor.start(gas["Wf"]), x_gen])
     theta = np.concatenate([point.gas.theta, np.zeros(len(gen_ss.theta))])
     return ss, x, ss.u.pack(values), theta

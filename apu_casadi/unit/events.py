@@ -5,18 +5,18 @@ An event takes effect at its instant ``t`` [s] and holds until the next one of i
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.core import checked
+from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
 
 if TYPE_CHECKING:
-    from apu_casadi.machine.faults.ttsc import Ttsc
+    from apu_casadi.machine.faults.fault import Fault
 
 HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
     {
@@ -30,36 +30,6 @@ HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
 
 HEALTH_LO, HEALTH_HI = 0.5, 1.5
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
-
-
-def number(
-    value: Any,
-    what: str,
-    *,
-    lo: float = -math.inf,
-    hi: float = math.inf,
-    open_lo: bool = False,
-    unit: str = "",
-) -> float:
-    """Return ``value`` as a float when it is a finite number in [lo, hi], or in (lo, hi].
-
-    Raises:
-        ScenarioError: not a number (booleans are none), not finite, or outside the interval.
-    """
-    u = f" {unit}" if unit else ""
-    try:
-        x = checked.number(what, value, error=ScenarioError)
-    except ScenarioError:
-        raise ScenarioError(f"{what}: a number is expected, got {value!r}") from None
-    if not math.isfinite(x):
-        raise ScenarioError(f"{what}: must be finite, got {x!r}")
-    if x < lo or x > hi or (open_lo and x <= lo):
-        if math.isinf(hi):
-            must = f"must be {'>' if open_lo else '>='} {lo:g}{u}"
-        else:
-            must = f"must lie in {'(' if open_lo else '['}{lo:g}, {hi:g}]{u}"
-        raise ScenarioError(f"{what}: {must}, got {x:g}")
-    return x
 
 
 def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
@@ -78,7 +48,9 @@ def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
     return checked
 
 
-SAME_INSTANT = 1e-9  # s; events closer than this are at one instant
+def all_factors(factors: Mapping[str, float] | None) -> dict[str, float]:
+    """Return every health factor by name: the checked ones that are given, one for the others."""
+    return {**dict.fromkeys(HEALTH_FACTORS, 1.0), **health_factors(factors or {})}
 
 
 @dataclass(frozen=True)
@@ -161,14 +133,14 @@ class HealthChange:
 
 @dataclass(frozen=True)
 class FaultChange:
-    """From ``t`` [s] on, the stator has ``fault`` (a ``machine.ttsc.Ttsc``); None: it is healthy.
+    """From ``t`` [s] on, the machine has ``fault``, such as a ``Ttsc``; None: it is healthy.
 
     Raises:
         ScenarioError: ``t`` negative or not finite, or a fault that is a bare number or text.
     """
 
     t: float
-    fault: Ttsc | None
+    fault: Fault | None
 
     def __post_init__(self) -> None:
         _time(self.t, "FaultChange")

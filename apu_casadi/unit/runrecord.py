@@ -8,28 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from apu_casadi.core.sharing import once
-from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.loads.load import ConstantPowerLoad, Load, OpenLoad
+from apu_casadi.core.version import installed
+from apu_casadi.machine.faults.fault import Fault
+from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.events import Ambient, Event, FaultChange, LoadChange
 
-__all__ = ["asked", "installed", "load_words"]
-
-_V, _W = 230.0, 2 * math.pi * 400.0  # V rms and rad/s at which the power of a load is told
-
-
-@once
-def installed() -> str:
-    """Return the installed version; "unknown" in a checkout that is not installed."""
-    try:
-        return version("apu-casadi")
-    except PackageNotFoundError:
-        return "unknown"
+__all__ = ["asked", "load_words"]
 
 
 def load_words(load: Load) -> str:
@@ -38,23 +25,13 @@ def load_words(load: Load) -> str:
     >>> load_words(SeriesLoad.from_power(225e3))
     '225 kW'
     """
-    if isinstance(load, OpenLoad):
-        return "open"
-    if isinstance(load, ConstantPowerLoad):
-        return f"{load.P / 1e3:g} kW, constant power"
-    Z = [complex(R, _W * L) for R, L in zip(load.R, load.L, strict=True)]
-    S = [_V**2 / z.conjugate() for z in Z]
-    P, pf = sum(s.real for s in S), sum(s.real for s in S) / abs(sum(S))
-    words = f"{P / 1e3:.5g} kW" + ("" if pf > 1 - 1e-9 else f", power factor {pf:.3g}")
-    if load.balanced:
-        return words
-    return f"{words}, unbalanced ({', '.join(f'{s.real / 1e3:.4g}' for s in S)} kW)"
+    return load.label
 
 
 def asked(
     *,
     load: Load,
-    fault: Ttsc | None,
+    fault: Fault | None,
     ambient: Ambient,
     events: Iterable[Event] = (),
     seed: int | None = None,
@@ -67,17 +44,22 @@ def asked(
     events = tuple(events)
     loads: list[tuple[float, Load]] = [(0.0, load)]
     loads += [(e.t, e.load) for e in events if isinstance(e, LoadChange)]
-    faults: list[tuple[float, Ttsc | None]] = [(0.0, fault)]
+    faults: list[tuple[float, Fault | None]] = [(0.0, fault)]
     faults += [(e.t, e.fault) for e in events if isinstance(e, FaultChange)]
     return {
         "ambient": json.dumps(dataclasses.asdict(ambient)),
         "loads": json.dumps(
-            [{"t": t, "load": load_words(x), **dataclasses.asdict(x)} for t, x in loads]
+            [{"t": t, "load": load_words(x), **_fields(x)} for t, x in loads]
         ),
         "faults": json.dumps(
-            [{"t": t, **({"phase": None} if f is None else dataclasses.asdict(f))}
+            [{"t": t, **({"phase": None} if f is None else _fields(f))}
              for t, f in faults]
         ),
         "seed": "none" if seed is None else seed,
         "apu_casadi_version": installed(),
     }  # fmt: skip
+
+
+def _fields(part: Any) -> dict[str, Any]:
+    """Return the fields of a load or fault, which are dataclasses."""
+    return dataclasses.asdict(part)

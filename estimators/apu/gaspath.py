@@ -30,7 +30,7 @@ from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor
 from estimators.apu.gaspathmodel import (
     DT,
     GOVERNOR,
@@ -65,7 +65,7 @@ __all__ = [
     "window_means",
 ]
 
-# Tuned on the seeds TUNED of gaspath_study.
+# Tuned on the seeds TUNED of scenarios.studies.gaspath.course.
 HEALTH_SIGMA = 0.02  # prior of each health factor: new to worn engine
 HEALTH_WALK = 2e-4  # 1/sqrt(s); 0.1 % in 25 s: slow against a flight, so wear is followed
 N_SIGMA = 20.0  # rad/s; prior of speed, 0.5 %
@@ -76,8 +76,8 @@ MODEL_ERROR = 0.003  # relative; other maps and gas data shift P3 and P5 by 0.1 
 J_SIGMA = 0.1  # relative; the paper gives no inertia
 # Gauss-Newton iterations of an update, and what moves in them.  One is not enough: fuel enters with
 # the very error of its reading, so derivatives and innovations of the plain filter are correlated,
-# the same way at each sample.  Mean error over sigma at 14 s, known to 0.03 (seeds TUNED_LONG of
-# gaspath_study): plain, gain_T5 +0.66, f_W_c +0.29, f_eta_t +0.26; two iterations of state and
+# the same way at each sample.  Mean error over sigma at 14 s, known to 0.03 (seeds TUNED_LONG):
+# plain, gain_T5 +0.66, f_W_c +0.29, f_eta_t +0.26; two iterations of state and
 # error, gain_T5 -0.07, f_W_c -0.22, f_W_t -0.27, since health is then linearised where its own
 # sample took it; two of the error alone, none of these beyond 0.09.  Mean NEES at 14 s beyond that
 # of an exact filter: 0.45, 0.13, 0.08 of 4; unscented filters, 0.4.  gain_J keeps +0.3 sigma: the
@@ -254,7 +254,7 @@ def gas_path_filter(
     consider_eta: bool = True,
     health_sigma: float = HEALTH_SIGMA,
     walk: Mapping[str, float] | None = None,
-    governed: GovernorParameters | None = GOVERNOR,
+    governed: Governor | None = GOVERNOR,
     power_jumps: bool = False,
 ) -> GasPathFilter:
     """Make a gas-path filter.

@@ -233,6 +233,7 @@ def gas_path_transient(
     prior: float = PRIOR,
     sensors: SensorSet = GAS_PATH,
     backend: str | None = None,
+    gas_generator: GasGenerator | None = None,
 ) -> Sensitivities:
     """Return what a recording through a load ramp tells of the four health factors.
 
@@ -247,11 +248,12 @@ def gas_path_transient(
         prior: standard deviation of each health factor before.
         sensors: the sensor table.
         backend: see :func:`apu_casadi.core.backend.compiled`.
+        gas_generator: the engine; the paper's by default.
 
     Raises:
         OperatingPointError, EstimationError: the engine does not run, or is lost, on the way.
     """
-    gg = _DEFAULT
+    gg = gas_generator or _DEFAULT
     ss = gg.state_space
     dt, K = 0.02, round(seconds / 0.02)
     t = dt * np.arange(K)
@@ -294,6 +296,7 @@ def shaft_power_snapshot(
     eta_bias: float = 0.0,
     samples: int = SAMPLES,
     gain_errors: bool = False,
+    gas_generator: GasGenerator | None = None,
 ) -> dict[str, Any]:
     """Return how much measured shaft power reduces the health factors' standard deviations.
 
@@ -309,6 +312,7 @@ def shaft_power_snapshot(
         ParameterError: numbers out of range.
     """
     how: dict[str, Any] = {"sensors": GAS_PATH, "samples": samples, "prior": prior}
+    how["gas_generator"] = gas_generator
     errors: dict[str, Any] = {"power_noise": power_noise, "eta_bias": eta_bias}
     g = gas_path(point, **how, **errors, gain_errors=gain_errors)
     without = g.only(BASE)

@@ -34,9 +34,10 @@ import numpy as np
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
+from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, PHASES
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples, window_means

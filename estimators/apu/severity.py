@@ -19,7 +19,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from estimators.apu.sensors import ELECTRICAL
 from estimators.information.identifiability import identify
 from estimators.information.sensitivities import Sensitivities

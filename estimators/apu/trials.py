@@ -95,6 +95,7 @@ def snapshot_trials(
     power_noise: float = GAS_PATH["PW"].noise,
     eta_bias: float = 0.0,
     samples: int = SAMPLES,
+    gas_generator: GasGenerator | None = None,
 ) -> Trials:
     """Estimate the health factors from random snapshots of the nonlinear engine.
 
@@ -105,7 +106,7 @@ def snapshot_trials(
     Raises:
         EstimationError: a draw has no steady readings, or the iteration does not converge.
     """
-    gg = GasGenerator()
+    gg = GasGenerator() if gas_generator is None else gas_generator
     at, names = steady_point(point, gg), GAS_PATH.names
     read, rows = _Reader(gg, at), gg.Y.indices(names)
     nominal = np.array([at[n] for n in names])
@@ -142,9 +143,10 @@ def snapshot_trials(
         prior=prior,
         power_noise=power_noise,
         eta_bias=eta_bias,
+        gas_generator=gg,
     )
     least, best = (float(np.sqrt(np.trace(b.covariance()) / 4)) for b in (g.only(BASE), g))
-    null = shaft_power_snapshot(point, samples=samples, prior=prior)["null"]
+    null = shaft_power_snapshot(point, samples=samples, prior=prior, gas_generator=gg)["null"]
     along = np.array(list(null.values()))
     e0, e1 = np.array(before), np.array(after)
     of_null = _rms(e0 @ along), _rms(e1 @ along)

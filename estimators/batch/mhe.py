@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
 from apu_casadi.core.sharing import Rebuilt, building, kept
 from estimators.batch.transcription import Solution, Transcription

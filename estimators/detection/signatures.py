@@ -13,7 +13,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled, mapped
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import mapped
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.core.sharing import keep
 from estimators.filters.filtering import FilterResult

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, SignalError
 from apu_casadi.core.results import dataset
 from apu_casadi.core.sharing import Parametric, derived, kept

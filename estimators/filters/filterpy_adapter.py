@@ -29,7 +29,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import DataError, EstimationError, SignalError
 from apu_casadi.core.sharing import Rebuilt, building
 from estimators.filters.belief import Belief

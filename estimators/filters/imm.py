@@ -26,7 +26,8 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signals

@@ -28,7 +28,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, SignalError
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals

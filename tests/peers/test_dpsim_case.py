@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.loads.load import SeriesLoad
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import MachineParameters
 from scenarios.validation.peers import machine
 

@@ -26,17 +26,31 @@ healthy one with R_shunt and L_shunt in series from terminal k to the machine ne
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from apu_casadi.core.checked import number
+from apu_casadi.core.checked import bounded, number
 from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.register import Key, read_table
+from apu_casadi.core.results import CHANNELS
+from apu_casadi.core.signals import Signal
+from apu_casadi.machine.faults.fault import FAULTS, AtFault, Branch, Fault, Own
+from apu_casadi.machine.loads.load import Load
 from apu_casadi.machine.machinedata import MachineParameters
-from apu_casadi.machine.park import PHASE_ANGLE
+from apu_casadi.machine.park import PHASE_ANGLE, Abc, phase_selector
+
+_I_FAULT = Signal("i_fault", "A", "current of the fault branch", nominal=1e3)
+_DI_FAULT = Signal("di_fault", "A/s", "rate of i_fault", nominal=1e8)
+_MU = Signal("mu", "1", "fraction of the phase's turns that is shorted", nominal=0.05)
+_K_RF = Signal("k_rf", "1", "fault over shorted-turn resistance (4)")
+_KAPPA = Signal("kappa", "1", "leakage partition, mu <= kappa <= 1")
+_PHASE = Signal("phase_angle", "rad", "axis of the faulty phase; 0 for phase a")
 
 
+@FAULTS.add("ttsc")
 @dataclass(frozen=True)
-class Ttsc:
+class Ttsc(Fault):
     """A turn-to-turn short circuit.
 
     Args:
@@ -53,6 +67,19 @@ class Ttsc:
     k_rf: float
     kappa: float | None = None
     phase: str = "a"
+
+    word = "ttsc"
+    keys = (
+        Key("mu", "1", "shorted fraction of the turns of the phase", 0.0, 0.99, open_lo=True),
+        Key("k_rf", "1", "fault resistance over that of the shorted turns", 0.0),
+        Key("kappa", "1", "leakage partition, mu (full coupling) to 1", 0.0, 1.0, default=None),
+        Key("phase", "1", "faulty phase", default="a", choices=tuple(PHASE_ANGLE)),
+    )
+    reversing = ("i_fault",)
+    severities = tuple(
+        Signal(name, *CHANNELS[name], default=healthy)
+        for name, healthy in (("mu", 0.0), ("k_rf", math.nan), ("kappa", math.nan))
+    )
 
     def __post_init__(self) -> None:
         """Check the ranges; put mu for an absent kappa."""
@@ -91,6 +118,100 @@ class Ttsc:
         """Electrical angle of the faulty phase's axis, rad."""
         return PHASE_ANGLE[self.phase]
 
+    # -- structure ------------------------------------------------------------------------------
+
+    def kind(self, load: Load, neutral: str) -> str:
+        """Return ``"coupled"`` where i_fault is algebraic, else ``"leaky"``.
+
+        It is algebraic if kappa = mu, with a grounded neutral and no load inductance in the phase.
+        """
+        tied = self.kappa == self.mu and neutral == "grounded"
+        return "coupled" if tied and not load.inductive(self.phase) else "leaky"
+
+    def own(self, kind: str, neutral: str) -> Own:
+        """Return mu, k_rf, (kappa,) phase_angle; i_fault is a state or an unknown."""
+        if kind == "leaky":
+            return Own((_MU, _K_RF, _KAPPA, _PHASE), (_I_FAULT,), (_DI_FAULT,))
+        if neutral == "isolated":
+            raise ParameterError(
+                "with an isolated neutral i_fault is a state for every kappa: use 'leaky'"
+            )
+        return Own((_MU, _K_RF, _PHASE), (), (_I_FAULT,))
+
+    @classmethod
+    def examples(cls) -> dict[str, Fault]:
+        """Return 5 % of the turns, with kappa = mu and kappa = 1."""
+        return {"coupled": cls(0.05, 1.0), "leaky": cls(0.05, 1.0, 1.0)}
+
+    def branch(self, at: AtFault) -> Branch:
+        """Return mu i_fault in the faulty phase."""
+        mu, i_fault, di_fault = at.theta["mu"], *_current(at)
+        select = phase_selector(at.theta["phase_angle"])
+        current, rate = (Abc(*(s * mu * i for s in select)) for i in (i_fault, di_fault))
+        return Branch(current, rate, mu * i_fault / 3.0, mu * di_fault / 3.0)
+
+    def residuals(self, at: AtFault) -> list[Any]:
+        """Return that of the loop (:func:`loop_residual`)."""
+        th = at.theta
+        select = phase_selector(th["phase_angle"])
+        v_k = sum(s * (v - w) for s, v, w in zip(select, at.v, at.w1, strict=True))
+        i_fault, di_fault = _current(at)
+        severity = {"mu": th["mu"], "k_rf": th["k_rf"], "kappa": th.get("kappa", th["mu"])}
+        return [loop_residual(at.p, **severity, v_k=v_k, i_fault=i_fault, di_fault=di_fault)]
+
+    def rates(self, at: AtFault) -> dict[str, Any]:
+        """Return that of i_fault where it is a state."""
+        return {"i_fault": at.z["di_fault"]} if at.kind == "leaky" else {}
+
+    def loss(self, at: AtFault) -> Any:
+        """Return the extra loss (:func:`fault_loss`)."""
+        assert at.i is not None
+        select = phase_selector(at.theta["phase_angle"])
+        i_k = sum(s * i for s, i in zip(select, at.i, strict=True))
+        mu, k_rf, i_fault = at.theta["mu"], at.theta["k_rf"], _current(at)[0]
+        return fault_loss(at.p, mu=mu, k_rf=k_rf, i_k=i_k, i_fault=i_fault)
+
+    def outputs(self, at: AtFault, y: dict[str, Any]) -> dict[str, Any]:
+        """Return i_fault."""
+        return {"i_fault": _current(at)[0]}
+
+    # -- numbers --------------------------------------------------------------------------------
+
+    def parameters(self, kind: str) -> dict[str, float]:
+        """Return mu, k_rf and the phase's angle, and kappa where it counts."""
+        values = {"mu": self.mu, "k_rf": self.k_rf, "phase_angle": self.phase_angle}
+        return values if kind == "coupled" else {**values, "kappa": self._kappa}
+
+    def start(
+        self,
+        before: Mapping[str, float],
+        theta_before: Mapping[str, float],
+        theta: Mapping[str, float],
+        states: tuple[str, ...],
+    ) -> dict[str, float]:
+        """Return the i_fault that was there if it is in the same phase, else zero."""
+        was, now = theta_before.get("phase_angle"), theta.get("phase_angle")
+        moved = was is not None and now is not None and was != now
+        return {n: 0.0 if moved else before.get(n, 0.0) for n in states}
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Fault:
+        """Make the fault from mu, k_rf, kappa and phase."""
+        values = read_table("a 'ttsc' fault", cls.keys, table)
+        if values["kappa"] is not None:
+            bounded(values["kappa"], "kappa", lo=values["mu"], hi=1.0)
+        return cls(**values)
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table, without the kind, which is the default."""
+        table = super().to_table()
+        del table["kind"]
+        if self.kappa == self.mu:
+            del table["kappa"]
+        return table
+
+    # -- seen from outside -----------------------------------------------------------------------
+
     def r_fault(self, p: MachineParameters) -> float:
         """Resistance of the fault branch (4), ohm."""
         return self.k_rf * self.mu * p.r_s
@@ -102,6 +223,13 @@ class Ttsc:
     def L_shunt(self, p: MachineParameters) -> float:
         """Inductance of the equivalent shunt, H; zero for kappa = mu."""
         return (self._kappa - self.mu) * p.L_ls / self.mu
+
+
+def _current(at: AtFault) -> tuple[Any, Any]:
+    """i_fault and its rate, which is zero where i_fault is algebraic."""
+    if at.kind == "leaky":
+        return at.x["i_fault"], at.z["di_fault"]
+    return at.z["i_fault"], 0.0
 
 
 def loop_residual(

@@ -1,29 +1,248 @@
-"""Electrical loads of one generator: series R-L per phase, constant power, open.
+"""What an electrical load is to the generator.
 
-A load knows its *kind*, which decides the equations, and the *inputs* that go with it, which are
-numbers and can change without a new model.  All are in star; the generator decides whether the
-star point is joined to the machine's neutral.
+A load is one class in one file, derived from :class:`Load` and entered in ``LOADS``; the generator
+assembles what it contributes and knows no kind by name.  All loads are in star; the generator
+decides whether the star point is joined to the machine's neutral.
+
+Equations and signals of a load depend on its ``kind`` alone: loads of equal kind share them and
+the code compiled of them.  Its numbers are ``inputs``, which may change without a new model.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 from apu_casadi.core.checked import number
-from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.errors import ParameterError, ScenarioError
+from apu_casadi.core.register import Key, Register, read_table
+from apu_casadi.core.signals import Signal
+from apu_casadi.machine.park import Abc, Qd0
 
-KINDS = ("resistive", "inductive", "constant_power")
-
-#: Largest resistance, ohm, of a phase.  Its voltage is R i, with a current that is a difference of
-#: flux linkages: the larger R, the more of the voltage is the integrator's error.
-R_MAX = 1e6
 #: Resistance, ohm, beyond which the tolerances of an integrator are tightened in proportion.
 R_FINE = 1e3
+#: V rms and rad/s at which powers are meant: the rated phase voltage and frequency.
+V_RATED, W_RATED = 230.0, 2.0 * math.pi * 400.0
 
 
-def _check(where: str, value: object, *, above: float | None = None) -> None:
+class Own(NamedTuple):
+    """The signals that a load or a fault brings into the model: inputs, states, unknowns."""
+
+    inputs: tuple[Signal, ...] = ()
+    states: tuple[Signal, ...] = ()
+    unknowns: tuple[Signal, ...] = ()
+
+
+class AtLoad(NamedTuple):
+    """What the generator's equations offer a load: symbols, in SI units.
+
+    Args:
+        x, z, u: states, algebraic unknowns and inputs of the model by name.
+        v: voltages across the load, phase terminal to star point, V.
+        i, di: phase currents into the load, A, and their rates, A/s.
+        theta_e, w_r: rotor angle, rad, and electrical speed, rad/s.
+        V_rated: rated phase voltage, V rms.
+    """
+
+    x: dict[str, Any]
+    z: dict[str, Any]
+    u: dict[str, Any]
+    v: Abc
+    i: Abc
+    di: Abc
+    theta_e: Any
+    w_r: Any
+    V_rated: Any
+
+
+class Load(ABC):
+    """Base of all loads; a subclass is a frozen dataclass of SI values that checks itself.
+
+    Needed: ``kind``, ``inputs``, ``own``, ``drop``, ``balanced``, ``impedance``, ``label`` and
+    ``examples``.  The rest has defaults: no states, linear, nothing to start, no stiffness.
+    """
+
+    #: Words for it in a scenario file, each with the keys that it takes.
+    tables: ClassVar[Mapping[str, tuple[Key, ...]]] = {}
+    #: Whether drop and rates are linear in states and currents at constant speed (propagator).
+    linear: ClassVar[bool] = True
+    #: Own states that change their sign when the rotor has turned by half a turn: what belongs to
+    #: phases or to the zero sequence, as opposed to the rotor's axes.
+    reversing: ClassVar[tuple[str, ...]] = ()
+
+    #: Where the load is not what its name says, for messages.
+    caveat: ClassVar[str] = ""
+
+    # -- structure: depends on ``kind`` alone ---------------------------------------------------
+
+    @property
+    @abstractmethod
+    def kind(self) -> str:
+        """Names the equations; a Python identifier."""
+
+    @property
+    @abstractmethod
+    def own(self) -> Own:
+        """Inputs, states and algebraic unknowns."""
+
+    @abstractmethod
+    def drop(self, at: AtLoad) -> Abc:
+        """Return the voltage across each phase, V, from currents, their rates and own states."""
+
+    def rates(self, at: AtLoad) -> dict[str, Any]:
+        """Return d/dt of the own states by name."""
+        return {}
+
+    def residuals(self, at: AtLoad) -> list[Any]:
+        """Return what must vanish for the own unknowns, linear in all unknowns, in their order."""
+        return []
+
+    def inductive(self, phase: str) -> bool:
+        """Whether ``drop`` of the phase takes the rate of its current, which then cannot jump."""
+        return False
+
+    @classmethod
+    @abstractmethod
+    def examples(cls) -> dict[str, Load]:
+        """Return a typical load of each kind that the class brings, by kind."""
+
+    # -- numbers --------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def inputs(self) -> dict[str, float]:
+        """Values of the own inputs by name."""
+
+    @property
+    @abstractmethod
+    def balanced(self) -> bool:
+        """Whether the three phases are equal."""
+
+    @property
+    def balanced_part(self) -> Load:
+        """A balanced load to start from; the load itself if it is balanced."""
+        if self.balanced:
+            return self
+        raise ParameterError(f"{self!r} is not balanced and names no balanced load to start from")
+
+    @abstractmethod
+    def impedance(self, w_r: float, V_t: float) -> complex:
+        """Return the impedance of each phase of a balanced load at rest, ohm.
+
+        Args:
+            w_r: electrical speed, rad/s.
+            V_t: terminal voltage, V rms.
+        """
+
+    def steady(self, w_r: float, V_t: float, i: Qd0) -> dict[str, float]:
+        """Return the own states of a balanced load at rest, with its current ``i``, A."""
+        return {}
+
+    def start(self, before: Mapping[str, float], u: Mapping[str, float], V_rated: float
+              ) -> dict[str, float]:  # fmt: skip
+        """Return the own states just after a switch; equal names are continued, others zero.
+
+        Args:
+            before: outputs and states just before it, by name.
+            u: inputs from then on, by name.
+            V_rated: rated phase voltage, V rms.
+        """
+        return {s.name: before.get(s.name, 0.0) for s in self.own.states}
+
+    @property
+    def fineness(self) -> float:
+        """Factor, at most 1, on an integrator's tolerances."""
+        return 1.0
+
+    @property
+    def demand(self) -> float:
+        """Power that the load sees to get, W; 0 where it takes what the voltage gives."""
+        return 0.0
+
+    @property
+    @abstractmethod
+    def label(self) -> str:
+        """The load in a few words."""
+
+    # -- scenario files -------------------------------------------------------------------------
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Load:
+        """Make the load from a scenario's table with ``kind`` and the keys of ``tables``.
+
+        Raises:
+            ScenarioError: a key or value that is wrong; the text starts with the key.
+        """
+        word = table["kind"]
+        rest = {k: v for k, v in table.items() if k != "kind"}
+        return cls.from_keys(word, read_table(f"a {word!r} load", cls.tables[word], rest))
+
+    @classmethod
+    def from_keys(cls, word: str, values: dict[str, Any]) -> Self:
+        """Make the load from the checked keys of one of its words."""
+        return cls(**values)
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table that :meth:`from_table` reads."""
+        raise ScenarioError(f"a {type(self).__name__} has no words in a scenario file")
+
+    def is_told_by(self, table: Mapping[str, Any]) -> bool:
+        """Whether the table, read, gives this very load."""
+        try:
+            return self.from_table(table) == self
+        except ScenarioError:
+            return False
+
+
+LOADS: Register[type[Load]] = Register("load", "apu_casadi.machine.loads")
+
+
+def load_from_table(table: Mapping[str, Any]) -> Load:
+    """Return the load that a scenario's table describes.
+
+    Raises:
+        ScenarioError: no kind or an unknown one, or a wrong key or value; starts with the key.
+    """
+    if "kind" not in table:
+        raise ScenarioError(f"kind: missing: one of {', '.join(LOADS)}")
+    try:
+        cls = LOADS[table["kind"]]
+    except ParameterError as error:
+        raise ScenarioError(f"kind: {error}") from None
+    return cls.from_table(table)
+
+
+@dataclass(frozen=True)
+class LoadStructure:
+    """What a model is built of: equal for all loads of one kind of one class.
+
+    Args:
+        kind: of the load.
+        owner: the class that writes ``drop``.
+        load: any load of that kind.
+    """
+
+    kind: str
+    owner: type
+    load: Load = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, load: Load) -> LoadStructure:
+        """Return the structure of a load."""
+        owner = next(c for c in type(load).__mro__ if "drop" in vars(c))
+        return cls(load.kind, owner, load)
+
+
+def by_phase(name: str, unit: str, doc: str, nominal: float = 1.0) -> tuple[Signal, ...]:
+    """Return the signals ``name_a``, ``name_b``, ``name_c``; ``{}`` in ``doc`` is the letter."""
+    return tuple(Signal(f"{name}_{k}", unit, doc.format(k), nominal=nominal) for k in "abc")
+
+
+def in_range(where: str, value: object, *, above: float | None = None) -> None:
+    """Refuse what is no finite number, or not >= 0 or > ``above``."""
     value = number(where, value, error=ParameterError)
     if not math.isfinite(value):
         raise ParameterError(f"{where} must be a finite number, got {value!r}")
@@ -33,176 +252,74 @@ def _check(where: str, value: object, *, above: float | None = None) -> None:
         raise ParameterError(f"{where} = {value:g} must be > {above:g}")
 
 
-def _check_R(where: str, value: object) -> None:
-    _check(where, value, above=0.0)
-    if float(value) > R_MAX:  # type: ignore[arg-type]
-        raise ParameterError(
-            f"{where} = {value:g} is beyond {R_MAX:g} ohm, where the voltage of an open phase "
-            f"would be rounding times resistance; give an open phase {R_MAX:g} ohm or less: at "
-            "230 V that draws 0.23 mA, which moves no voltage by 1e-5"
-        )
-
-
-def _three(where: str, values: object) -> None:
+def three(where: str, values: object) -> None:
+    """Refuse what is no tuple of three values."""
     if not isinstance(values, tuple) or len(values) != 3:
         raise ParameterError(f"{where} needs a tuple of three values (a, b, c), got {values!r}")
 
 
-@dataclass(frozen=True)
-class SeriesLoad:
-    """A resistance and an inductance in series in each phase.
+def all_equal(*values: tuple[float, float, float]) -> bool:
+    """Whether the phases are equal to rounding."""
+    return all(math.isclose(x, v[0], rel_tol=1e-12, abs_tol=0.0) for v in values for x in v)
 
-    Args:
-        R: ohm by phase, > 0, at most ``R_MAX``: an open phase is 1e5 or 1e6 ohm.
-        L: H by phase, >= 0.
+
+def stiffness(R: float) -> float:
+    """Return the factor on tolerances that a largest resistance of a phase, ohm, asks for.
+
+    ``R_FINE`` over it, but not below 1e-2, where rounding begins: 1e-10 and 1e-12 beside the
+    defaults.  An open phase's voltage is then right to 1e-5 up to the largest resistance allowed.
+    """
+    return min(1.0, max(1e-2, R_FINE / R))
+
+
+def split_power(
+    where: str,
+    P: float,
+    power_factor: float,
+    V_rms: float,
+    f: float,
+    unbalance: tuple[float, float, float],
+) -> list[complex]:
+    """Return |R + jX| per phase, ohm, X >= 0, that draw a power from a balanced rated voltage.
 
     Raises:
-        ParameterError: a value that is not finite or out of range.
+        ParameterError: a value out of range; ``where`` begins the text.
     """
-
-    R: tuple[float, float, float]
-    L: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        _three("SeriesLoad.R [ohm]", self.R)
-        _three("SeriesLoad.L [H]", self.L)
-        for k, r, l in zip("abc", self.R, self.L, strict=True):
-            _check_R(f"SeriesLoad.R_{k} [ohm]", r)
-            _check(f"SeriesLoad.L_{k} [H]", l)
-
-    @classmethod
-    def from_power(
-        cls,
-        P: float,
-        power_factor: float = 1.0,
-        *,
-        V_rms: float = 230.0,
-        f: float = 400.0,
-        unbalance: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    ) -> Self:
-        """Make the load that draws ``P`` from a balanced rated voltage.
-
-        Args:
-            P: power of all three phases at ``V_rms`` and ``f``, W, > 0.  The paper's 225 kW is
-                meant so: R = 3 * 230^2 / 225e3 draws Table 7's 325.66 A at its 229.68 V.
-            power_factor: 0 < power_factor <= 1, lagging.
-            V_rms, f: rated phase voltage (V) and frequency (Hz).
-            unbalance: shares of the phases in ``P``, > 0; only their ratios count.
-        """
-        _check("SeriesLoad.from_power: P [W] (an open generator is OpenLoad)", P, above=0.0)
-        _check("SeriesLoad.from_power: V_rms [V]", V_rms, above=0.0)
-        _check("SeriesLoad.from_power: f [Hz]", f, above=0.0)
-        _check("SeriesLoad.from_power: power_factor", power_factor, above=0.0)
-        if power_factor > 1:
-            raise ParameterError(
-                f"SeriesLoad.from_power: power_factor = {power_factor:g} is outside (0, 1]"
-            )
-        _three("SeriesLoad.from_power: unbalance", unbalance)
-        R, L = [], []
-        for k, share in zip("abc", unbalance, strict=True):
-            _check(f"SeriesLoad.from_power: unbalance of phase {k}", share, above=0.0)
-            Z = V_rms**2 * power_factor / (P * share / sum(unbalance))
-            R.append(Z * power_factor)
-            L.append(Z * math.sqrt(1.0 - power_factor**2) / (2.0 * math.pi * f))
-        return cls(R=(R[0], R[1], R[2]), L=(L[0], L[1], L[2]))
-
-    @property
-    def kind(self) -> str:
-        """``"inductive"`` if any phase has an inductance, else ``"resistive"``."""
-        return "inductive" if any(self.L) else "resistive"
-
-    @property
-    def inputs(self) -> dict[str, float]:
-        """The model inputs of this load, by name."""
-        values = dict(zip(("R_a", "R_b", "R_c"), self.R, strict=True))
-        if self.kind == "inductive":
-            values |= dict(zip(("L_a", "L_b", "L_c"), self.L, strict=True))
-        return values
-
-    @property
-    def balanced(self) -> bool:
-        """Whether the three phases are equal to rounding."""
-        return all(
-            math.isclose(x, v[0], rel_tol=1e-12, abs_tol=0.0) for v in (self.R, self.L) for x in v
-        )
+    in_range(f"{where}: P [W] (an open generator is OpenLoad)", P, above=0.0)
+    in_range(f"{where}: V_rms [V]", V_rms, above=0.0)
+    in_range(f"{where}: f [Hz]", f, above=0.0)
+    in_range(f"{where}: power_factor", power_factor, above=0.0)
+    if power_factor > 1:
+        raise ParameterError(f"{where}: power_factor = {power_factor:g} is outside (0, 1]")
+    three(f"{where}: unbalance", unbalance)
+    Z = []
+    for k, share in zip("abc", unbalance, strict=True):
+        in_range(f"{where}: unbalance of phase {k}", share, above=0.0)
+        size = V_rms**2 * power_factor / (P * share / sum(unbalance))
+        Z.append(complex(size * power_factor, size * math.sqrt(1.0 - power_factor**2)))
+    return Z
 
 
-@dataclass(frozen=True)
-class ConstantPowerLoad:
-    """Three equal conductances G that follow the voltage so as to draw a constant power.
-
-        tau dG/dt = P / (v_a^2 + v_b^2 + v_c^2) - G
-
-    An ideal constant-power load has no consistent start beside flux states; the lag gives it one.
-    Below ``V_MIN`` of the rated voltage the conductance is held, as undervoltage does.
-
-    Args:
-        P: power of all three phases, W, > 0.
-        tau: lag, s, > 0.
-    """
-
-    P: float
-    tau: float = 2e-3
-    kind: str = field(default="constant_power", init=False)
-
-    def __post_init__(self) -> None:
-        _check("ConstantPowerLoad.P [W] (an open generator is OpenLoad)", self.P, above=0.0)
-        _check("ConstantPowerLoad.tau [s]", self.tau, above=0.0)
-
-    @property
-    def inputs(self) -> dict[str, float]:
-        """The model inputs of this load, by name."""
-        return {"P_load": self.P, "tau_load": self.tau}
-
-    @property
-    def balanced(self) -> bool:
-        """Always true."""
-        return True
+def power_words(Z: list[complex], balanced: bool) -> str:
+    """Return in words what impedances, ohm, draw at rated voltage: power, power factor, phases."""
+    S = [V_RATED**2 / z.conjugate() for z in Z]
+    total = sum(S)
+    P, pf = total.real, total.real / abs(total)
+    words = f"{P / 1e3:.5g} kW"
+    if pf <= 1 - 1e-9:
+        words += f", power factor {pf:.3g}" + ("" if total.imag > 0 else " leading")
+    if balanced:
+        return words
+    return f"{words}, unbalanced ({', '.join(f'{s.real / 1e3:.4g}' for s in S)} kW)"
 
 
-#: Fraction of the rated voltage below which a constant-power load is a constant conductance.
-V_MIN = 0.3
-
-
-@dataclass(frozen=True)
-class OpenLoad:
-    """No load: a bleed resistance per phase stands for the voltmeter.
-
-    Terminal voltage is then a small current times a large resistance, and an integrator sees the
-    current only: :func:`fineness` tightens its tolerances.
-
-    Args:
-        R: ohm per phase, > 0, at most ``R_MAX``; 1e4 ohm draws 16 W in all at rated voltage, 7e-5
-            of the rating.
-    """
-
-    R: float = 1e4
-    kind: str = field(default="resistive", init=False)
-
-    def __post_init__(self) -> None:
-        _check_R("OpenLoad.R [ohm]", self.R)
-
-    @property
-    def inputs(self) -> dict[str, float]:
-        """The model inputs of this load, by name."""
-        return {"R_a": self.R, "R_b": self.R, "R_c": self.R}
-
-    @property
-    def balanced(self) -> bool:
-        """Always true."""
-        return True
-
-
-Load = SeriesLoad | ConstantPowerLoad | OpenLoad
-
-
-def fineness(load: Load) -> float:
-    """Return the factor, at most 1, on an integrator's tolerances that this load asks for.
-
-    ``R_FINE`` over the largest resistance, but not below 1e-2, where rounding begins: 1e-10 and
-    1e-12 beside the defaults.  An open phase's voltage is then right to 1e-5 up to ``R_MAX``.
-    """
-    if isinstance(load, ConstantPowerLoad):
-        return 1.0
-    R = max(load.R) if isinstance(load, SeriesLoad) else load.R
-    return min(1.0, max(1e-2, R_FINE / R))
+def power_keys(Z: list[complex]) -> dict[str, Any]:
+    """Return power_kW, power_factor and unbalance that describe impedances, ohm, near rounding."""
+    S = [V_RATED**2 / z.conjugate() for z in Z]
+    P = sum(s.real for s in S)
+    keys: dict[str, Any] = {"power_kW": round(P / 1e3, 9)}
+    keys["power_factor"] = round(P / abs(sum(S)), 12)
+    shares = [round(3.0 * s.real / P, 12) for s in S]
+    if any(s != 1.0 for s in shares):
+        keys["unbalance"] = shares
+    return keys

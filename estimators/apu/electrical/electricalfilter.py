@@ -12,7 +12,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, last
 from apu_casadi.machine.machinedata import MachineParameters
-from apu_casadi.machine.park import PHASE_ANGLE
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
     INPUTS,
@@ -30,7 +30,6 @@ from estimators.apu.electrical.terminalsignals import (
     GAIN_SENSORS,
     JUMP_SIZES,
     MEASURED,
-    PHASES,
     PHASES_I,
     PHASES_V,
     VOLTAGES,

@@ -10,10 +10,11 @@ import numpy as np
 
 from apu_casadi.core.errors import EstimationError
 from apu_casadi.core.signals import Signals
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import LEAKY, shunt_parameters
 from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.machinemodel import leaky_pair
-from estimators.apu.electrical.terminalsignals import ADMITTANCE, PHASES
+from estimators.apu.electrical.terminalsignals import ADMITTANCE
 from estimators.apu.electrical.tuning import FAULT_LEVEL, LEAST_SUSCEPTANCE
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from estimators.apu.electrical.terminalsignals import PHASES
+from apu_casadi.machine.park import PHASES
 from estimators.filters.filtering import FilterResult
 
 __all__ = ["alarm_times", "h_covariance", "statistics_of"]
