@@ -13,7 +13,8 @@ lists from the tables: :data:`GAS_PATH` and :data:`ELECTRICAL`, whose numbers al
 >>> GAS_PATH.add("P5").outputs
 ('N', 'P3', 'T3', 'T5', 'P5')
 
-A sensor of one's own is registered by one line, in a file of one's own (:func:`load_sensors`)::
+A sensor of one's own is registered by one line, in a module of one's own, which commands and
+scenarios load by ``--with`` and ``extensions`` (:mod:`scenarios.extensions`)::
 
     register(Sensor("dP", 0.005, True, 0.005, "Pa", "assumed", reads=("P3", "P5"),
                     value=lambda P3, P5: P3 - P5))
@@ -23,16 +24,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import runpy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apu_casadi.core.checked import number
-from apu_casadi.core.errors import ApuError, DataError, ParameterError, nearest
+from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.core.measuring import measure
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.gasgenerator import GasGenerator
@@ -49,7 +48,6 @@ __all__ = [
     "Sensor",
     "SensorSet",
     "gas_path_table",
-    "load_sensors",
     "register",
     "respond",
     "unregister",
@@ -384,22 +382,3 @@ def unregister(name: str) -> None:
 def gas_path_table() -> SensorSet:
     """Return the gas-path sensors that commands use: :data:`GAS_PATH` and what was registered."""
     return GAS_PATH.add(*_registered.values())
-
-
-def load_sensors(path: str | Path) -> tuple[str, ...]:
-    """Run a Python file that registers sensors; returns their names.
-
-    Raises:
-        DataError: the file cannot be read or run, or registers nothing.
-    """
-    before = dict(_registered)
-    try:
-        runpy.run_path(str(path))
-    except ApuError:
-        raise
-    except Exception as e:
-        raise DataError(f"{path}: no sensors could be read: {type(e).__name__}: {e}") from None
-    new = tuple(n for n, s in _registered.items() if before.get(n) is not s)
-    if not new:
-        raise DataError(f"{path} registers no sensor: register(Sensor(...)) is expected")
-    return new
