@@ -24,6 +24,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.sensors import GAS_PATH, Sensor
 from estimators.models.filtermodel import FilterModel
@@ -40,7 +41,6 @@ __all__ = [
 ]
 
 DT = 0.02  # s; step of the gas-path filter (paper, section 3.3)
-HEALTH = GasGenerator.THETA.names
 OUTPUTS = GAS_PATH.outputs
 GAINED = GAS_PATH.uncertain
 POWER = ("measured", "unknown")
