@@ -245,7 +245,7 @@ def run_campaign(
 
 
 def _check(scenarios: Sequence[Scenario], workers: int | None, solver: str) -> None:
-    from apu_casadi.unit.multirate import SOLVERS
+    from apu_casadi.unit.integrators import SOLVERS
 
     if not scenarios:
         raise ScenarioError("a campaign needs at least one scenario")

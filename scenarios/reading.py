@@ -17,7 +17,7 @@ from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table
 from apu_casadi.machine.loads.load import LOADS, Load, load_from_table
 
 if TYPE_CHECKING:
-    from apu_casadi.unit.multirate import Noise
+    from apu_casadi.unit.noise import Noise
 
 DEFAULT_FAULT = "ttsc"
 """Kind of a fault whose table names none."""
@@ -143,7 +143,7 @@ def read_noise(data: Any) -> Noise:
         ScenarioError: an unknown name, or a value that is negative or not finite.
     """
     from apu_casadi.machine.measurement import MeasurementNoise
-    from apu_casadi.unit.multirate import Noise
+    from apu_casadi.unit.noise import Noise
 
     if isinstance(data, Noise):
         return data

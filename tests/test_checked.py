@@ -29,7 +29,8 @@ from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
-from apu_casadi.unit.multirate import Noise, simulate_joint
+from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.noise import Noise
 from estimators.detection.cusum import cusum_test
 from estimators.filters.ukf import PointSet
 from estimators.models.filtermodel import Unknown

@@ -10,9 +10,9 @@ Rotor speed is the one state.  The improved method of the paper (IGDM, Algorithm
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Never
 
 import casadi as ca
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import OperatingPointError, SimulationError
+from apu_casadi.core.runloop import run
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
@@ -396,17 +397,43 @@ class GasGenerator(Parametric):
         K = inputs.shape[1]
         th = start.theta if theta is None else np.asarray(theta, float)
         th = np.broadcast_to(th.reshape(len(self.THETA), -1), (len(self.THETA), K))
-        x, z = start.x, start.z
-        y, z = self.output(x, start.u, start.theta, z0=z)
-        X, Y = [x], [y]
-        for k in range(1, K + 1):
-            u, t = inputs[:, k - 1], th[:, k - 1]
-            x, z = self.state_update(x, u, t, z0=z, dt=dt)
-            if hook is not None:
-                x = np.asarray(hook(k, x), float).reshape(len(self.X))
-            y, z = self.output(x, u, t, z0=z)
-            if output_noise is not None:
-                y = y + output_noise(k)
-            X.append(x)
-            Y.append(y)
+        dt = self.dt if dt is None else dt
+        system = _Discrete(self, start, inputs, th, hook, dt)
+        rows = [(system.x, system.y)]
+
+        def record(k: int, _n: int, row: tuple[np.ndarray, np.ndarray]) -> None:
+            x, y = row
+            rows.append((x, y if output_noise is None else y + output_noise(k)))
+
+        run(system, dt * np.arange(K + 1), record=record)
+        X, Y = zip(*rows, strict=True)
         return np.array(X).T, np.array(Y).T
+
+
+class _Discrete:
+    """The discrete model on its way through a run: inputs and health of each step, and a hook."""
+
+    def __init__(
+        self,
+        gg: GasGenerator,
+        start: GasGeneratorState,
+        inputs: np.ndarray,
+        theta: np.ndarray,
+        hook: Callable[[int, np.ndarray], np.ndarray] | None,
+        dt: float,
+    ) -> None:
+        self.gg, self.inputs, self.theta, self.hook, self.dt = gg, inputs, theta, hook, dt
+        self.x = start.x
+        self.y, self.z = gg.output(start.x, start.u, start.theta, z0=start.z)
+
+    def switch(self, events: Sequence[Never], t: float) -> None:
+        """Nothing comes but inputs."""
+
+    def advance(self, k: int, _until: float) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+        """Update the state, process it, compute the output."""
+        u, theta = self.inputs[:, k], self.theta[:, k]
+        x, z = self.gg.state_update(self.x, u, theta, z0=self.z, dt=self.dt)
+        if self.hook is not None:
+            x = np.asarray(self.hook(k + 1, x), float).reshape(len(self.gg.X))
+        self.x, (self.y, self.z) = x, self.gg.output(x, u, theta, z0=z)
+        return 1, (self.x, self.y)

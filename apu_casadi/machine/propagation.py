@@ -32,7 +32,7 @@ import numpy as np
 
 from apu_casadi.core.backend import backend_in_use, compiled
 from apu_casadi.core.calling import Caller
-from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term
 from apu_casadi.core.sharing import Rebuilt, keep, kept
 from apu_casadi.core.simulation import StepResult
@@ -85,7 +85,7 @@ def _coefficients(ss: GeneratorModel) -> ca.Function:
     own = ca.vertcat(x[s.linear], x[s.drive])
     J = ca.jacobian(rate, own)
     if any(ca.which_depends(ca.vec(ca.densify(J)), own, 1, True)):
-        raise SimulationError(f"{ss.name} is not linear in its windings: use another integrator")
+        raise NotApplicable(f"{ss.name} is not linear in its windings: use another integrator")
     n = len(s.linear)
     rest = ca.substitute(rate, own, ca.SX.zeros(n + 1))
     M = ca.SX.zeros(n + EXTRA, n + EXTRA)
@@ -202,14 +202,14 @@ def symmetry(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray, w_rated: floa
     """Return whether the coefficients are constant; check that half a turn reverses the phases.
 
     Raises:
-        SimulationError: it does not, and :class:`Parity` would not hold.
+        NotApplicable: it does not, and :class:`Parity` would not hold.
     """
     M = _scaled(ss, u, theta)(np.append(_PROBE, _PROBE + np.pi), np.full(6, w_rated))
     sign = parity(ss, 1).sign
     turned = M[3:] * np.outer(sign, sign) - M[:3]
     largest = np.abs(M).max()
     if np.abs(turned).max() > 1e-9 * largest:
-        raise SimulationError(
+        raise NotApplicable(
             f"{ss.name}: half a turn does not reverse the phases; process noise in the zero "
             "sequence? Use another integrator"
         )
@@ -267,7 +267,7 @@ def transition_table(
         leaps: the matrices are those over one leap, two leaps, and so on, one below the other.
 
     Raises:
-        SimulationError: the Fourier series or the steps do not converge, or a noise in the zero
+        NotApplicable: the Fourier series or the steps do not converge, or a noise in the zero
             sequence does not change its sign with the phases.
     """
     n = len(ss.linear)
@@ -288,7 +288,7 @@ def transition_table(
     last = _transition(M_of, probe, slowest, length(slowest), steps)[0]
     while error > STEP_TOL:
         if steps >= 64:
-            raise SimulationError(
+            raise NotApplicable(
                 f"{ss.name}: transition matrices over {length(slowest)[0]:.3g} s do not converge "
                 f"(error {error:.1e} with {steps} steps)"
             )
@@ -322,7 +322,7 @@ def transition_table(
         if highest < resolved - 1:
             break
     else:
-        raise SimulationError(
+        raise NotApplicable(
             f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s has over {highest} "
             f"harmonics of the rotor angle above {TAIL:g}: the load is too light for this step"
         )
@@ -636,7 +636,7 @@ class Propagator(Rebuilt):
         fine: the exciter steps at every sample; for the steps that the usual strides refuse.
 
     Raises:
-        SimulationError: the model is not linear in its windings, or the series does not converge;
+        NotApplicable: the model is not linear in its windings, or the series does not converge;
             use :func:`apu_casadi.core.simulation.stepper` there.
     """
 
@@ -655,9 +655,9 @@ class Propagator(Rebuilt):
     ) -> None:
         """Compute or fetch the table, build or fetch the functions."""
         if not ss.linear:
-            raise SimulationError(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: its load is not linear")
         if n_out < 10:
-            raise SimulationError(f"{ss.name}: at least 10 samples are needed, got {n_out}")
+            raise NotApplicable(f"{ss.name}: at least 10 samples are needed, got {n_out}")
         self.ss, self.n_out, self.dt = ss, n_out, dt
         self.outputs, self.quad = tuple(outputs), tuple(quad)
         self.h = dt / n_out
@@ -704,12 +704,12 @@ class Propagator(Rebuilt):
             arrays are overwritten by the thread's next call.
 
         Raises:
-            SimulationError: the exciter moves too fast for the samples, a result is not finite, or
+            NotApplicable: the exciter moves too fast for the samples, a result is not finite, or
                 the speed is outside the table; use a ``Stepper`` for this step.
         """
         w = float(u[self._iw])
         if not self.valid(w):
-            raise SimulationError(
+            raise NotApplicable(
                 f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table's "
                 f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
             )
@@ -737,7 +737,7 @@ class Propagator(Rebuilt):
             np.matmul(O.view(float), odd, out=Q.T)
             x, y, mean, miss = call(x0, P, Q, u, self.theta, self.h)
         if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
-            raise SimulationError(
+            raise NotApplicable(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
                 f"{self.h:.3g} s misses it by {float(miss[0]):.1e} > {self.tol:.0e}"
             )

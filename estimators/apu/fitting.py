@@ -27,7 +27,8 @@ from apu_casadi.core.simulation import stepper
 from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.unit.control import GovernorParameters, governor
+from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.exchange import moved
 from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 from estimators.batch.fit import FitProblem
 from estimators.batch.fitresult import FitResult
@@ -393,16 +394,16 @@ def transient_truth(
         gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True))
     )  # fmt: skip
     run = stepper(ss, 1, rtol=1e-9, atol=1e-11)
-    x, Wf_I = start.x.copy(), float(start["Wf"])
+    x, x_gov = start.x.copy(), par.start(float(start["Wf"]))
     t, rows = np.arange(K) * dt, []
     for k in range(K):
         PW = STEP[0] if t[k] < 0.3 else STEP[1]
-        out = governor(N=float(x[0]), N_ref=gg.parameters.N, Wf_I=Wf_I, par=par)
-        u = ss.u.pack({"Wf": out.Wf, "PW": PW})
+        Wf, moves = par.law(float(x[0]), gg.parameters.N, x_gov)
+        u = ss.u.pack({"Wf": Wf, "PW": PW})
         y = ss.y.unpack(np.array(ss.g(x, u, theta)).ravel())
         rows.append([y[n] for n in (*OUTPUTS, *INPUTS)])
         x = run(x, u, theta, dt).x_end
-        Wf_I += dt * float(out.Wf_I_dot)
+        x_gov = moved(x_gov, dt, moves)
     values = np.array(rows).T
     readings = dict(zip((*OUTPUTS, *INPUTS), values, strict=True))
     return EngineData("load step", t, readings, dict(DEFAULT_DAY))

@@ -30,7 +30,7 @@ from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor
 from estimators.apu.gaspathmodel import (
     DT,
     GOVERNOR,
@@ -254,7 +254,7 @@ def gas_path_filter(
     consider_eta: bool = True,
     health_sigma: float = HEALTH_SIGMA,
     walk: Mapping[str, float] | None = None,
-    governed: GovernorParameters | None = GOVERNOR,
+    governed: Governor | None = GOVERNOR,
     power_jumps: bool = False,
 ) -> GasPathFilter:
     """Make a gas-path filter.

@@ -24,7 +24,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.sensors import GAS_PATH, Sensor
 from estimators.models.filtermodel import FilterModel
 
@@ -167,7 +167,7 @@ def gas_path_model(
     gains: tuple[str, ...] = GAINED,
     consider: tuple[str, ...] = (),
     walks: tuple[tuple[str, float], ...] = (),
-    governed: GovernorParameters | None = None,
+    governed: Governor | None = None,
     power_jumps: bool = False,
     sensors: tuple[Sensor, ...] | None = None,
 ) -> FilterModel:
@@ -228,8 +228,7 @@ def gas_path_model(
     k1, _, check, _ = engine(N, u_gg, health)
     k1 = k1 / (1 + at.get("gain_J", 0.0))
     if governed is not None:
-        N_ref = gg.parameters.N
-        slope = (governed.Ki * (N_ref - N) - governed.Kp * k1) / N_ref
+        slope = governed.slope(N, k1, gg.parameters.N)
         u_gg = gg.U.stack(inputs | {"Wf": inputs["Wf"] + dt / 2 * slope})
     k2, y_mid, check_mid, _ = engine(N + dt / 2 * k1, u_gg, health)
     x1 = at | {"N": N + dt * k2 / (1 + at.get("gain_J", 0.0))}

@@ -131,7 +131,7 @@ def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter
     inputs: dict[str, Any] = {n: given[n] for n in AMBIENT} | {"PW": PW, "Wf": Wf}
     _, y_g, check_y, _ = engine(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), health)
     k1, _, check, _ = engine(N, gg.U.stack(inputs), health)
-    slope = (GOVERNOR.Ki * (gg.parameters.N - N) - GOVERNOR.Kp * k1) / gg.parameters.N
+    slope = GOVERNOR.slope(N, k1, gg.parameters.N)
     now = inputs | {"Wf": Wf + given["since"] * slope}
     k2, _, check_2, _ = engine(N, gg.U.stack(now), health)
     error = (1 - given["fresh"]) * at["error_Wf"] + given["fresh"] * w[len(W) - 1]

@@ -33,6 +33,11 @@ UNIT = f"""{PARTS.rstrip()}
 """
 
 
+WHOLE = f"""{UNIT.rstrip()}
+--governor NAME | another law of the speed governor, of --with (default: the scenario's, or PI)
+"""
+
+
 class Pair(NamedTuple):
     """What stands on both sides of ``NAME=VALUE``, and the whole as it was given."""
 
@@ -93,11 +98,11 @@ def engine(args: Namespace) -> GasGenerator:
 
 
 def unit(args: Namespace) -> Apu:
-    """Return the whole unit with the engine of ``--engine``, else the paper's."""
+    """Return the whole unit with the engine and the governor of the options, else the paper's."""
     from scenarios import registry
 
     parts(args)
-    return registry.unit_of(engine=args.engine)
+    return registry.unit_of(engine=args.engine, governor=args.governor)
 
 
 def load(args: Namespace) -> Load:
@@ -116,14 +121,15 @@ def load_words(load: Load) -> str:
 
 
 def scenario(args: Namespace, name: str) -> Scenario:
-    """Return a scenario with the parts of ``--with`` and the engine of ``--engine``."""
+    """Return a scenario with the parts, the engine and the governor of the options."""
     from scenarios import registry
 
     parts(args)
     s = registry.get(name)
     if args.extensions:
         s = s.change(extensions=(*s.extensions, *args.extensions))
-    return s if args.engine is None else s.change(engine=args.engine)
+    asked = {n: getattr(args, n) for n in ("engine", "governor")}
+    return s.change(**{n: v for n, v in asked.items() if v is not None})
 
 
 def program() -> str:

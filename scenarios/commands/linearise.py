@@ -32,7 +32,7 @@ OPTIONS = f"""
 --load TABLE part    | another load, by the keys of a scenario:
                      | 'kind = "series", R_ohm = 1, L_mH = 1'
 {given.ambient_options()}
-{given.UNIT}
+{given.WHOLE}
 --json               | print JSON, with all matrices
 --out DIR =results/linearise | default %(default)s
 --no-figures         | draw no figure

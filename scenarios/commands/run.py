@@ -19,15 +19,15 @@ NAME = "run"
 HELP = "run a scenario of the library or of a file"
 OPTIONS = f"""
 scenario SCENARIO      | a name, a .toml or a .py file
-{given.UNIT}
+{given.WHOLE}
 --out DIR              | folder for the files (default results/NAME)
 --json                 | print the summary as JSON only
 --no-figures           | draw no figures
 --no-waveforms         | keep no waveforms: a small file, rms figures
 --phasors              | keep the fundamental phasors of voltages and currents of every exchange
                        | step
---solver NAME =cvodes  | cvodes (default), idas, or propagator: exact and fast where the load is
-                       | linear
+--solver NAME =auto    | auto (default): exact and fast where the load is linear, elsewhere CVODES;
+                       | cvodes, idas, or propagator, another name of auto
 --exchange NAME        | of speed and fuel between the parts: paper, predicted (errs less at the
                        | same price), or corrected; default: the scenario's
 --quiet                | no progress bar, no list of files

@@ -49,7 +49,7 @@ OPTIONS = f"""
 --max-power T4=K     | highest shaft power at a temperature (T4 or T5)
 --health NAME=VALUE ... | health factor, 1 is healthy: {", ".join(HEALTH)}
 --limit NAME=VALUE ...  | off_map (table spans), SM_min, T4_max, T5_max (K)
-{given.UNIT}
+{given.WHOLE}
 --all                | print every output
 --json               | print JSON
 """

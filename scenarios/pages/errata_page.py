@@ -23,6 +23,7 @@ from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios.shell.markdown import markdown_table
@@ -311,8 +312,9 @@ def efficiency_split() -> str:
 
 def _load_step(**change: float) -> xr.Dataset:
     apu = _apu().change({k.replace("__", "."): v for k, v in change.items()})
+    step = [LoadChange(0.1, KW100)]
     return simulate_joint(
-        apu, duration=1.5, load=KW225, events=[LoadChange(0.1, KW100)], waveform_dt=None
+        apu, duration=1.5, load=KW225, events=step, waveform_dt=None, solver="cvodes"
     )
 
 
@@ -330,7 +332,7 @@ def inertia() -> str:
 
 def gains() -> str:
     """Overspeed of the load step with other gains of the governor."""
-    g = _apu().governor
+    g = GovernorParameters()
     peaks = [
         f"{f:g} times: {_peak(governor__Kp=f * g.Kp, governor__Ki=f * g.Ki)}"
         for f in (0.5, 1.0, 2.0)

@@ -80,7 +80,7 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
     ds = simulate_joint(
         registry.unit_for(s),
         duration=s.duration, **s.start(), ambient=s.ambient, events=s.events(), dt=FINE,
-        exchange="corrected", waveform_dt=WAVEFORM, progress=progress,
+        exchange="corrected", waveform_dt=WAVEFORM, progress=progress, solver="cvodes",
     )  # fmt: skip
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)

@@ -195,7 +195,8 @@ def measure(
             options: dict[str, Any] = {"rtol": _RTOL, "progress": tick}
             if ex != "one model":
                 simulate = simulate_joint
-                options |= {"dt": dt, "exchange": ex, "waveform_dt": None, "warn_exchange": False}
+                options |= {"dt": dt, "exchange": ex, "waveform_dt": None, "solver": "cvodes"}
+                options["warn_exchange"] = False
             # build the integrators first: that is paid once, and is no part of the comparison
             case.run(simulate, apu, duration=T_EVENT + COMMON, **{**options, "progress": None})
             start = time.process_time()

@@ -18,7 +18,7 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.isolation.problem import (
     CLASSES,
     DEFAULT,
@@ -74,7 +74,7 @@ def simulate_windows(
     seeds: Sequence[int],
     protocol: Protocol = DEFAULT,
     gg: GasGenerator | None = None,
-    governor: GovernorParameters | None = None,
+    governor: Governor | None = None,
 ) -> Windows:
     """Simulate windows of the governed unit, one for each label and seed.
 
@@ -185,25 +185,23 @@ class _Course:
         u, z: inputs and unknowns at the start, one column for each window.
     """
 
-    def __init__(
-        self, gg: GasGenerator, gov: GovernorParameters, u: np.ndarray, z: np.ndarray
-    ) -> None:
+    def __init__(self, gg: GasGenerator, gov: Governor, u: np.ndarray, z: np.ndarray) -> None:
         self.gg, self.gov = gg, gov
         self.engine = _engine(gg, backend_in_use())
         self.u, self.z = u, z
         self.i_Wf, self.i_PW = gg.U.index("Wf"), gg.U.index("PW")
-        self.N, self.I = np.full((1, u.shape[1]), gg.parameters.N), u[self.i_Wf].copy()
+        self.N = np.full((1, u.shape[1]), gg.parameters.N)
+        start = gov.start(u[self.i_Wf])
+        self.I = np.array([np.broadcast_to(x, u.shape[1]) for x in start])  # governor's states
         self.worst = 0.0  # residual
 
     def _rates(
         self, N: np.ndarray, I: np.ndarray, theta: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        gov, N_ref = self.gov, self.gg.parameters.N
-        e = (N_ref - N[0]) / N_ref
-        self.u[self.i_Wf] = Wf = np.clip(gov.Kp * e + I, gov.Wf_min, gov.Wf_max)
+        self.u[self.i_Wf], moves = self.gov.law(N[0], self.gg.parameters.N, [*I])
         ode, y, self.z, check = self.engine(self.z, N, self.u, theta)
         self.worst = max(self.worst, float(np.nan_to_num(check, nan=np.inf).max()))
-        return ode, gov.Ki * e + (Wf - gov.Kp * e - I) / gov.T_aw, y
+        return ode, np.array(moves), y
 
     def step(self, PW: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
         """Return N, P3, T3, T5 and Wf at a sample, and go on to the next."""

@@ -128,6 +128,7 @@ def unit_truth(duration: float, events: tuple[Any, ...], *, load: Load = FULL) -
         dt=UNIT_STEP,
         exchange="corrected",
         waveform_dt=DT,
+        solver="cvodes",
         rtol=RTOL,
         atol=ATOL,
     )

@@ -97,6 +97,7 @@ def _monolithic(n: int, seed0: int, tell: Tell) -> Any:
     full, part = (SeriesLoad.from_power(P) for P in (225e3, 100e3))
     events = [LoadChange(MONOLITHIC / 2, part)]
     fine: dict[str, Any] = {"dt": 0.005, "exchange": "corrected", "waveform_dt": 1e-4}
+    fine["solver"] = "cvodes"
     ds = simulate_joint(Apu(), duration=MONOLITHIC, load=full, events=events, **fine)
     return {"duration": MONOLITHIC, "seed": seed0, "compared": compare_monolithic(ds, seed0)}
 

@@ -17,7 +17,8 @@ from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.unit.control import GovernorParameters, governor
+from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.exchange import EXCHANGES, PAPER, Link, governed_step
 from estimators.apu.gaspath import HEALTH_WALK, N_SIGMA, N_WALK, GasPathFilter
 from estimators.apu.gaspathmodel import DT, HEALTH, OUTPUTS, gas_path_model
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
@@ -78,19 +79,23 @@ class MatchedTruth(Parametric):
     @derived
     def _call(self) -> Caller:
         model = self._model
-        gov, N_ref, nx = GovernorParameters(), self.gg.parameters.N, len(model.x)
+        link, nx = Link(GovernorParameters(), self.gg.parameters.N), len(model.x)
         carry, given = ca.MX.sym("carry", nx + 1), ca.MX.sym("given", 5 + nx)  # gain_J is last
         x, Wf_I, PW, jump, xi = carry[:nx], carry[nx], given[0], given[1:5], given[5:]
-        fuel = governor(N=x[0], N_ref=N_ref, Wf_I=Wf_I, par=gov)
         still = {"sigma_Wf": ca.MX(0), "sigma_PW": ca.MX(0), "jump": ca.MX(1)}
-        u = model.u.stack(_day() | {"Wf": fuel.Wf, "PW": PW} | still)
         w, p = ca.MX.zeros(len(model.w)), ca.MX(0, 1)
         w[len(model.w) - 4 :] = jump
-        y, check = model.output(x, u, p, w)
-        x1, check1 = model.transition(x, u, p, w, DT)
-        x1 += math.sqrt(DT) * ca.DM(model.walk) * xi
-        after = ca.vertcat(x1, Wf_I + DT * fuel.Wf_I_dot)
-        seen = ca.vertcat(y, fuel.Wf, PW, x[1:5], check + check1)
+
+        def engine(Wf: ca.MX, PW: ca.MX) -> tuple[ca.MX, tuple[ca.MX, ca.MX]]:
+            u = model.u.stack(_day() | still | {"Wf": Wf, "PW": PW})
+            y, check = model.output(x, u, p, w)
+            x1, check1 = model.transition(x, u, p, w, DT)
+            x1 += math.sqrt(DT) * ca.DM(model.walk) * xi
+            return x1[0], (x1, ca.vertcat(y, Wf, PW, x[1:5], check + check1))
+
+        made = governed_step(link, PAPER, lambda *_: (PW, None), engine, N=x[0], x=[Wf_I], h=DT)
+        x1, seen = made.engine
+        after = ca.vertcat(x1, *made.governor)
         return _folded("matched_truth", [carry, given], [after, seen])
 
     def __call__(self, case: Case, power: np.ndarray, rng: np.random.Generator | None) -> Truth:
@@ -120,24 +125,29 @@ class EngineTruth(Parametric):
 
     @derived
     def _call(self) -> Caller:
-        gg, gov, dt = self.gg, GovernorParameters(), DT / FINE
+        gg, dt = self.gg, DT / FINE
+        link = Link(GovernorParameters(), gg.parameters.N)
         nz = len(gg.z)
         carry, given = ca.MX.sym("carry", 3 + nz), ca.MX.sym("given", 5)
         N, Wf_I, N_dot, z = carry[0], carry[1], carry[2], carry[3:]
+        PW = given[0]
+
+        def engine(Wf: ca.MX, PW: ca.MX) -> tuple[ca.MX, list[ca.MX]]:
+            N1, *more = gg.step(N, gg.U.stack(_day() | {"Wf": Wf, "PW": PW}), given[1:], dt, z)
+            return N1, [N1, *more]
+
         # fuel of the middle of the step, with the last slope of speed
-        now = governor(N=N, N_ref=gg.parameters.N, Wf_I=Wf_I, par=gov)
-        mid = governor(
-            N=N + dt / 2 * N_dot, N_ref=gg.parameters.N, Wf_I=Wf_I + dt / 2 * now.Wf_I_dot, par=gov
+        way = EXCHANGES["predicted fuel"]
+        made = governed_step(
+            link, way, lambda *_: (PW, None), engine, N=N, x=[Wf_I], h=dt, slope=N_dot
         )
-        u = gg.U.stack(_day() | {"Wf": mid.Wf, "PW": given[0]})
-        N1, _, z1, residual = gg.step(N, u, given[1:], dt, z)
-        Wf_I1 = Wf_I + dt * mid.Wf_I_dot
+        N1, _, z1, residual = made.engine
         # a meter reads the fuel of the instant
-        end = governor(N=N1, N_ref=gg.parameters.N, Wf_I=Wf_I1, par=gov)
-        u_end = gg.U.stack(_day() | {"Wf": end.Wf, "PW": given[0]})
+        Wf, _ = link.fuel(N1, made.governor)
+        u_end = gg.U.stack(_day() | {"Wf": Wf, "PW": PW})
         y_end, _ = gg.g(N1, u_end, given[1:], z1)
-        after = ca.vertcat(N1, Wf_I1, (N1 - N) / dt, z1)
-        seen = ca.vertcat(y_end[gg.Y.indices(OUTPUTS)], end.Wf, given, residual)
+        after = ca.vertcat(N1, *made.governor, made.slope, z1)
+        seen = ca.vertcat(y_end[gg.Y.indices(OUTPUTS)], Wf, given, residual)
         return _folded("engine_truth", [carry, given], [after, seen])
 
     def __call__(self, case: Case, power: np.ndarray, rng: np.random.Generator) -> Truth:
