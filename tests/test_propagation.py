@@ -8,13 +8,14 @@ from numpy.testing import assert_allclose
 
 from apu_casadi.core import simulation
 from apu_casadi.core.errors import SimulationError
-from apu_casadi.machine import propagation
+from apu_casadi.machine import transition
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.series import SeriesLoad
-from apu_casadi.machine.propagation import Propagator, gregory, strides
+from apu_casadi.machine.propagation import Propagator, strides
+from apu_casadi.machine.weights import gregory
 
 GEN = Generator()
 ISOLATED = Generator(neutral="isolated")
@@ -94,10 +95,10 @@ def test_coefficients_are_recognised_as_constant_or_periodic():
     ):
         ss = GEN.variant(load, fault)
         u, theta = GEN.inputs(load), GEN.fault_vector(load, fault)
-        table = propagation.transition_table(ss, u, theta, W, h=50e-6)
+        table = transition.transition_table(ss, u, theta, W, h=50e-6)
         assert (table.harmonics == 0) == constant
-        assert table.harmonics < propagation.HARMONICS[-1] - 1
-        assert table.error <= propagation.STEP_TOL
+        assert table.harmonics < transition.HARMONICS[-1] - 1
+        assert table.error <= transition.STEP_TOL
 
 
 def test_mean_weights_are_of_order_ten_and_six():
@@ -150,12 +151,12 @@ def test_a_series_that_does_not_converge_is_refused(monkeypatch):
     load, fault = OpenLoad(1e4), Ttsc(0.05, 20.0)
     ss = GEN.variant(load, fault)
     u, theta = GEN.inputs(load), GEN.fault_vector(load, fault)
-    monkeypatch.setattr(propagation, "HARMONICS", (8, 16))
+    monkeypatch.setattr(transition, "HARMONICS", (8, 16))
     with pytest.raises(SimulationError, match=r"over \d+ harmonics"):
-        propagation.transition_table(ss, u, theta, W, h=50e-6)
-    monkeypatch.setattr(propagation, "STAGES", 1)
+        transition.transition_table(ss, u, theta, W, h=50e-6)
+    monkeypatch.setattr(transition, "STAGES", 1)
     with pytest.raises(SimulationError, match="do not converge"):
-        propagation.transition_table(ss, u, theta, W, h=50e-6)
+        transition.transition_table(ss, u, theta, W, h=50e-6)
 
 
 def test_noise_that_half_a_turn_does_not_reverse_is_refused():
@@ -164,7 +165,7 @@ def test_noise_that_half_a_turn_does_not_reverse_is_refused():
     ss = GEN.variant(KW100, fault)
     u, theta = GEN.inputs(KW100, w1_0=1.0), GEN.fault_vector(KW100, fault)
     with pytest.raises(SimulationError, match="half a turn"):
-        propagation.transition_table(ss, u, theta, W, h=50e-6)
+        transition.transition_table(ss, u, theta, W, h=50e-6)
 
 
 def test_transition_matrices_agree_with_exponentials():
@@ -172,15 +173,15 @@ def test_transition_matrices_agree_with_exponentials():
     from scipy.linalg import expm
 
     ss, u, h = GEN.variant(KW100), GEN.inputs(KW100), 100e-6
-    table = propagation.transition_table(ss, u, np.zeros(0), W, h=h)
+    table = transition.transition_table(ss, u, np.zeros(0), W, h=h)
     n = len(ss.linear)
     nominal = ss.x.nominals[ss.x.indices(ss.linear)]
     for w in (0.95 * W, W, 1.03 * W):
         u[ss.u.index("w_r")] = w
-        M = propagation._coefficients(ss)(0.7, u, []).full()
+        M = transition.coefficients(ss.shared)(0.7, u, ss.full([])).full()
         exact = expm(h * M)[:n]
-        entries = np.zeros(n * (n + propagation.EXTRA))
-        entries[propagation.parity(ss, 1).even] = table.at(w)[0].ravel()
+        entries = np.zeros(n * (n + transition.EXTRA))
+        entries[transition.parity(ss, 1).even] = table.at(w)[0].ravel()
         P = entries.reshape(-1, n).T
-        scale = nominal[:, None] / np.append(nominal, np.ones(propagation.EXTRA))
+        scale = nominal[:, None] / np.append(nominal, np.ones(transition.EXTRA))
         assert_allclose(P / scale, exact / scale, rtol=0, atol=1e-9)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError, nearest
+from apu_casadi.core.signals import Signal, Signals
 
 
 def par(
@@ -61,6 +63,23 @@ class Parameters:
             if n not in names:
                 raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
         return dataclasses.replace(self, **values)
+
+    def signals(self, prefix: str, names: Iterable[str] | None = None) -> Signals:
+        """Return the values as signals with dotted names, as ``machine.r_s``.
+
+        Args:
+            prefix: what stands before the dot.
+            names: which, and in which order; default all.
+        """
+        by_name = {f.name: f for f in dataclasses.fields(self) if "unit" in f.metadata}
+        signals = []
+        for f in by_name.values() if names is None else [by_name[n] for n in names]:
+            size: Any = f.default
+            meta = f.metadata
+            signals.append(
+                Signal(f"{prefix}.{f.name}", meta["unit"], meta["doc"], nominal=abs(size) or 1.0)
+            )
+        return Signals(signals)
 
     def symbolic(self, **values: Any) -> Self:
         """Return a copy with some values replaced by symbols or expressions, unchecked.

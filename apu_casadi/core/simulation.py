@@ -122,15 +122,18 @@ class Stepper(Rebuilt):
             )
         self.quad = tuple(quad)
         self.solver, self.rtol, self.atol, self._max_steps = solver, rtol, atol, max_steps
-        n = self.grid.size
+        # units that differ in numbers alone share what takes time to build
+        key = (self.grid.tobytes(), self.quad, solver, rtol, atol, max_steps)
+        self._F, self._g = keep(ss.shared, Stepper._functions, key, self._functions)
+
+    def _functions(self) -> tuple[_Buffered, _Buffered]:
+        ss, n = self.ss.shared, self.grid.size
         sym = _symbols(ss)
         args = [sym.sym(label, len(s)) for label, s in (("x", ss.x), ("u", ss.u), ("t", ss.theta))]
         g = ca.Function(f"{ss.name}_dense_g", args, [ca.densify(ss.g(*args))])
-        self._F = self._integrator()
-        self._g = _Buffered(g.map(f"{ss.name}_g{n}", "serial", n, [1, 2], []))
+        return self._integrator(ss), _Buffered(g.map(f"{ss.name}_g{n}", "serial", n, [1, 2], []))
 
-    def _integrator(self) -> _Buffered:
-        ss = self.ss
+    def _integrator(self, ss: StateSpace) -> _Buffered:
         sym = _symbols(ss)
         nx, nz, nu, nt = (len(s) for s in (ss.x, ss.z, ss.u, ss.theta))
         p, time = sym.sym("p", nu + nt + 3), sym.sym("time")
@@ -174,7 +177,8 @@ class Stepper(Rebuilt):
         within: tuple[float, float] = (0.0, 1.0),
     ) -> tuple[np.ndarray, ...]:
         """Return states at the outputs, shape (nx, n), and the means asked for, scaled."""
-        scaled, p = x0 / self.ss.x.nominals, np.concatenate([u, theta, [dt], within])
+        full = self.ss.full(theta)
+        scaled, p = x0 / self.ss.x.nominals, np.concatenate([u, full, [dt], within])
         if self.solver != "idas":
             xf, qf = self._F(scaled, p, np.zeros(0))
             return xf * self.ss.x.nominals[:, None], qf
@@ -231,7 +235,7 @@ class Stepper(Rebuilt):
         if self.quad:
             for name, value in zip(self.quad, means[:, -1], strict=True):
                 mean[name] = float(value) * Term.of(name).nominal(ss)
-        (y,) = self._g(x, u, theta)
+        (y,) = self._g(x, u, ss.full(theta))
         return StepResult(t0 + dt * self.grid, x, y, mean, self._F.stats())
 
     def _failure(

@@ -72,10 +72,10 @@ class StateSpace(Parametric):
                     f"{self.name}.{label}: expected sizes {n_in} -> {n_out}, "
                     f"got {got_in} -> {got_out}"
                 )
-        if len(self.shared.theta) != nt + len(self.numbers):
+        more = 0 if self.family is None else len(self.family.theta) - nt
+        if more != len(self.numbers):
             raise SignalError(
-                f"{self.name}: {len(self.numbers)} numbers for the "
-                f"{len(self.shared.theta) - nt} parameters of its family"
+                f"{self.name}: {len(self.numbers)} numbers for the {more} parameters of its family"
             )
 
     @property
@@ -90,7 +90,7 @@ class StateSpace(Parametric):
     @classmethod
     def member(
         cls, name: str, family: StateSpace, theta: Signals, numbers: Sequence[float]
-    ) -> StateSpace:
+    ) -> Self:
         """Make the model of one unit: the family's with its last parameters held.
 
         Args:

@@ -39,17 +39,18 @@ def exciter_signals(p: ExciterParameters) -> Signals:
         Signal("E_fd", "1", "exciter output, per unit of the no-load field voltage"),
         Signal("x_F1", "1", "rate feedback, first lag, per unit"),
     ]
-    if p.T_F2 > 0:
+    if "T_F2" not in p.absent:
         signals.append(Signal("x_F2", "1", "rate feedback, second lag, per unit"))
     return Signals(signals)
 
 
 def saturation(p: ExciterParameters, E_fd: Any) -> Any:
     """Return S_E(E_fd), exponential through (E_1, S_E1) and (E_2, S_E2)."""
-    if p.S_E1 == 0:
+    if "S_E1" in p.absent:
         return 0.0 * E_fd
-    B = math.log(p.S_E1 / p.S_E2) / (p.E_1 - p.E_2)
-    A = p.S_E2 * math.exp(-B * p.E_2)
+    log, exp = (ca.log, ca.exp) if isinstance(p.S_E1, ca.SX) else (math.log, math.exp)
+    B = log(p.S_E1 / p.S_E2) / (p.E_1 - p.E_2)
+    A = p.S_E2 * exp(-B * p.E_2)
     if isinstance(E_fd, ca.SX | ca.MX | ca.DM):
         return A * ca.exp(B * E_fd)
     return A * math.exp(min(B * E_fd, 500.0))  # a root search may try any field
@@ -62,7 +63,7 @@ def exciter_rates(p: ExciterParameters, s: ExciterState, *, V_t: Any, V_ref: Any
     is bounded so that the limit is approached, never crossed, and left without delay.
     """
     V_F1 = p.K_F / p.T_F1 * (s.E_fd - s.x_F1)
-    if p.T_F2 > 0:
+    if "T_F2" not in p.absent:
         V_F = s.x_F2 + p.T_F3 / p.T_F2 * (V_F1 - s.x_F2)
         x_F2 = (V_F1 - s.x_F2) / p.T_F2
     else:
@@ -81,5 +82,5 @@ def exciter_rates(p: ExciterParameters, s: ExciterState, *, V_t: Any, V_ref: Any
 def exciter_steady(p: ExciterParameters, *, E_fd: float, V_t: float) -> tuple[ExciterState, float]:
     """Return the states at rest and the V_ref that holds them, per unit; limits not checked."""
     V_R = (p.K_E + saturation(p, E_fd)) * E_fd
-    x_F2 = 0.0 if p.T_F2 > 0 else None
+    x_F2 = None if "T_F2" in p.absent else 0.0
     return ExciterState(V_c=V_t, V_R=V_R, E_fd=E_fd, x_F1=E_fd, x_F2=x_F2), V_t + V_R / p.K_A

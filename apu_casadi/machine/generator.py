@@ -28,7 +28,7 @@ from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import wrsg
 from apu_casadi.machine.faults.fault import FAULTS, Fault, FaultStructure
-from apu_casadi.machine.generatormodel import GeneratorModel, Structure, build
+from apu_casadi.machine.generatormodel import GeneratorModel, Structure, variant
 from apu_casadi.machine.loads.load import LOADS, Load, LoadStructure
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from apu_casadi.machine.wrsg import Windings
@@ -108,7 +108,10 @@ class Generator(Parametric):
         else:
             kind = self.fault_kind(beside, fault)
             found = FaultStructure.of(fault, kind) if fault and kind else None
-        return _variant(self, Structure(LoadStructure.of(beside), found, self.neutral))
+        return _variant(self, self._structure(beside, found))
+
+    def _structure(self, load: Load, fault: FaultStructure | None = None) -> Structure:
+        return Structure(LoadStructure.of(load), fault, self.neutral, self.exciter.absent)
 
     def fault_kind(self, load: Load, fault: Fault | None) -> str | None:
         """Return which equations a fault needs beside this load."""
@@ -137,9 +140,7 @@ class Generator(Parametric):
             "w_r": self.machine.w_rated if w_r is None else w_r,
             "V_ref": self.V_ref_default if V_ref is None else V_ref,
         }
-        return Structure(LoadStructure.of(load), None, self.neutral).inputs.pack(
-            {**values, **load.inputs, **noise}
-        )
+        return self._structure(load).inputs.pack({**values, **load.inputs, **noise})
 
     def fault_vector(self, load: Load, fault: Fault | None) -> np.ndarray:
         """Return the parameters theta of :meth:`variant` for this load and fault."""
@@ -467,7 +468,7 @@ def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[s
 
 @kept
 def _variant(gen: Generator, structure: Structure) -> GeneratorModel:
-    return build(structure, gen.machine, gen.exciter)
+    return variant(structure, gen.machine, gen.exciter)
 
 
 def load_of_kind(kind: str) -> Load:

@@ -9,11 +9,14 @@ from the DAE by elimination.  The healthy model has no fault state at all.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
+from apu_casadi.core.sharing import Parametric, keep, once
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import exciter as ac5a
@@ -76,21 +79,55 @@ class GeneratorModel(StateSpace):
         linear: names of the states that are linear at constant speed with the exciter held; empty
             where the load is not.
         reversing: those of them that change their sign when the rotor has turned by half a turn.
+        exciter: Function (x, V_t, V_ref, theta) -> rates of the exciter's states, in the order of
+            ``x``, from a terminal voltage in V rms.
+        reduced: of a family, the same model with what follows from theta alone as its theta, and
+            Function theta -> that.
     """
 
     load: LoadStructure | None = None
     fault: FaultStructure | None = None
     linear: tuple[str, ...] = ()
     reversing: tuple[str, ...] = ()
+    exciter: ca.Function = field(default=None, repr=False)
+    reduced: tuple[GeneratorModel, ca.Function] | None = field(default=None, repr=False)
+
+    @property
+    def shared(self) -> GeneratorModel:
+        """The family with all that follows from theta alone as its theta, computed beforehand."""
+        family = self.family
+        if isinstance(family, GeneratorModel) and family.reduced is not None:
+            return family.reduced[0]
+        return self
+
+    def full(self, theta: Any) -> np.ndarray:
+        """Return theta of :attr:`shared` from this model's, shape (ntheta,)."""
+        given = np.asarray(theta, dtype=float)
+        family = self.family
+        if not isinstance(family, GeneratorModel) or family.reduced is None:
+            return given
+        follow = family.reduced[1]
+        return keep(
+            self,
+            GeneratorModel,
+            given.tobytes(),
+            lambda: follow(np.append(given, self.numbers)).full().ravel(),
+        )
 
 
 @dataclass(frozen=True)
-class Structure:
-    """What the equations of a generator depend on, beside numbers."""
+class Structure(Parametric):
+    """What the equations of a generator depend on, beside numbers.
+
+    Args:
+        load, fault, neutral: as of the generator.
+        absent: parameters of the exciter that do not count (:attr:`ExciterParameters.absent`).
+    """
 
     load: LoadStructure
     fault: FaultStructure | None
     neutral: str
+    absent: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -104,20 +141,40 @@ class Structure:
         return self.neutral == "grounded"
 
     @property
+    def exciter(self) -> ExciterParameters:
+        """An exciter of this structure, unchecked: what does not count is zero, all else one."""
+        names = (f.name for f in fields(ExciterParameters))
+        return ExciterParameters().symbolic(**{n: float(n not in self.absent) for n in names})
+
+    @property
     def own_of_fault(self) -> OwnOfFault:
         """What the fault brings in."""
         if self.fault is None:
             return OwnOfFault()
         return self.fault.fault.own(self.fault.kind, self.neutral)
 
-    def signals(self, e: ExciterParameters) -> tuple[Signals, Signals, Signals, Signals]:
-        """Return x, z, u and theta."""
+    def signals(self) -> tuple[Signals, Signals, Signals, Signals]:
+        """Return x, z, u and theta; theta without the machine's and the exciter's parameters."""
         load, fault = self.load.load.own, self.own_of_fault
         fluxes = [s for s in FLUXES if self.grounded or s.name != "lam_s0"]
-        X = [*fluxes, *fault.states, ANGLE, *ac5a.exciter_signals(e), *load.states]
+        exciter = ac5a.exciter_signals(self.exciter)
+        X = [*fluxes, *fault.states, ANGLE, *exciter, *load.states]
         v = by_phase("v", "V", "terminal voltage of phase {}", nominal=300.0)
         Z = [*v, *([] if self.grounded else [V_N]), *fault.unknowns, *load.unknowns]
         return Signals(X), Signals(Z), self.inputs, Signals(fault.theta)
+
+    def parameters(self) -> tuple[Signals, Signals]:
+        """Return the parameters of machine and exciter that count."""
+        names = [f.name for f in fields(ExciterParameters) if f.name not in self.absent]
+        return (
+            MachineParameters().signals("machine"),
+            ExciterParameters().signals("exciter", names),
+        )
+
+    def numbers(self, p: MachineParameters, e: ExciterParameters) -> list[float]:
+        """Return their values."""
+        parts = zip((p, e), self.parameters(), strict=True)
+        return [getattr(x, n.split(".")[1]) for x, part in parts for n in part.names]
 
     @property
     def inputs(self) -> Signals:
@@ -141,28 +198,91 @@ class Structure:
         return tuple(n for n in self.linear if n in names)
 
 
-def build(structure: Structure, p: MachineParameters, e: ExciterParameters) -> GeneratorModel:
-    """Write the semi-explicit DAE once, and eliminate its algebraic unknowns."""
-    X, Z, U, TH = structure.signals(e)
+@once
+def family(structure: Structure) -> GeneratorModel:
+    """Write the semi-explicit DAE, and eliminate its algebraic unknowns.
+
+    theta has the parameters of the fault, the machine and the exciter.
+    """
+    X, Z, U, TH = structure.signals()
+    of_machine, of_exciter = structure.parameters()
     (xv, x), (zv, z), (uv, u), (tv, th) = X.sx(), Z.sx(), U.sx(), TH.sx()
+    pv, ev = ca.SX.sym("machine", len(of_machine)), ca.SX.sym("exciter", len(of_exciter))
+    p = MachineParameters().symbolic(**_by_field(of_machine, pv))
+    e = structure.exciter.symbolic(**_by_field(of_exciter, ev))
+    V_t, V_ref = ca.SX.sym("V_t"), ca.SX.sym("V_ref")
     ode, alg, y = equations(structure, p, e, x, z, u, th)
+    dex = exciter_rates(p, e, x, V_t, V_ref)
     ode_v, alg_v, y_v = X.stack(ode), ca.vertcat(*alg), OUTPUTS.stack(y)
     z_expr = solve_linear(ca.jacobian(alg_v, zv), -ca.substitute(alg_v, zv, ca.SX.zeros(len(Z))))
     f_v, g_v = ca.substitute([ode_v, y_v], [zv], [z_expr])
+    exciter = ca.vertcat(*(dex[n] for n in X.names if n in dex))
+    theta, signals = ca.vertcat(tv, pv, ev), Signals([*TH, *of_machine, *of_exciter])
+    symbols = (xv, zv, uv, V_t, V_ref)
+    expressions = [ode_v, alg_v, f_v, g_v, z_expr, exciter]
+    reduced, follow, by = ca.extract_parametric(
+        ca.cse(expressions), theta, {"extract_trivial": True}
+    )
+    compact = Signals([Signal(f"p{k}", "1", "follows from parameters") for k in range(len(follow))])
+    inner = _model(structure, (X, Z, U, compact), symbols, ca.vertcat(*follow), reduced)
+    outer = _model(structure, (X, Z, U, signals), symbols, theta, expressions)
+    values = ca.Function("follow", [theta], [ca.vertcat(*by)], {"cse": True})
+    return replace(outer, reduced=(inner, values))
+
+
+def _by_field(signals: Signals, symbols: ca.SX) -> dict[str, Any]:
+    return {n.split(".")[1]: symbols[k] for k, n in enumerate(signals.names)}
+
+
+def _model(
+    structure: Structure,
+    signals: tuple[Signals, Signals, Signals, Signals],
+    symbols: tuple[Any, Any, Any, Any, Any],
+    theta: Any,
+    expressions: Sequence[Any],
+) -> GeneratorModel:
+    (xv, zv, uv, V_t, V_ref), (ode, alg, f, g, z, exciter) = symbols, expressions
     made = GeneratorModel.of(
         structure.name,
-        (X, Z, U, TH, OUTPUTS),
-        (xv, zv, uv, tv),
-        dae=(ode_v, alg_v),
-        f=f_v,
-        g=g_v,
-        z=z_expr,
+        (*signals, OUTPUTS),
+        (xv, zv, uv, theta),
+        dae=(ode, alg),
+        f=f,
+        g=g,
+        z=z,
         cse=True,
     )
+    rates = ca.Function("exciter", [xv, V_t, V_ref, theta], [exciter], {"cse": True})
+    return _told(made, structure, rates)
+
+
+def _told(made: GeneratorModel, structure: Structure, exciter: ca.Function) -> GeneratorModel:
     linear, reversing = structure.linear, structure.reversing
     return replace(
-        made, load=structure.load, fault=structure.fault, linear=linear, reversing=reversing
+        made,
+        load=structure.load,
+        fault=structure.fault,
+        linear=linear,
+        reversing=reversing,
+        exciter=exciter,
     )
+
+
+def variant(structure: Structure, p: MachineParameters, e: ExciterParameters) -> GeneratorModel:
+    """Return the model of one unit, a member of the family."""
+    whole = family(structure)
+    theta = structure.signals()[3]
+    made = GeneratorModel.member(structure.name, whole, theta, structure.numbers(p, e))
+    return _told(made, structure, None)
+
+
+def exciter_rates(
+    p: MachineParameters, e: ExciterParameters, x: dict[str, Any], V_t: Any, V_ref: Any
+) -> dict[str, Any]:
+    """Return the rates of the exciter's states by name, from V_t in V rms."""
+    ex = ac5a.ExciterState(*(x.get(n) for n in ac5a.ExciterState._fields))
+    dex = ac5a.exciter_rates(e, ex, V_t=V_t / p.V_rated_rms, V_ref=V_ref)
+    return {n: d for n, d in dex._asdict().items() if d is not None}
 
 
 def equations(
@@ -216,12 +336,10 @@ def equations(
     # exciter
     V_space = ca.sqrt(v_qd0.q**2 + v_qd0.d**2 + (1e-6 * p.V_rated_rms) ** 2)
     V_t = V_space / math.sqrt(2.0)
-    ex = ac5a.ExciterState(*(x.get(n) for n in ac5a.ExciterState._fields))
-    dex = ac5a.exciter_rates(e, ex, V_t=V_t / p.V_rated_rms, V_ref=u["V_ref"])
+    dex = exciter_rates(p, e, x, V_t, u["V_ref"])
 
     ode = {f"lam_{n}": d for n, d in dlam._asdict().items() if f"lam_{n}" in x}
-    ode |= {n: d for n, d in dex._asdict().items() if n in x}
-    ode |= {"theta_e": w_r, **load.rates(at_load), **(fault.rates(at) if fault else {})}
+    ode |= {**dex, "theta_e": w_r, **load.rates(at_load), **(fault.rates(at) if fault else {})}
 
     P_e = sum((vk * ik for vk, ik in zip(v, i, strict=True)), zero)
     P_loss = fault.loss(at) if fault else zero

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.parameters import Parameters, par
@@ -110,6 +111,14 @@ class ExciterParameters(Parameters):
         lo=1e-6,
     )
 
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Names of the values that do not count, since what they belong to is left out."""
+        return (
+            *(("T_F2", "T_F3") if _is_zero(self.T_F2) else ()),
+            *(("E_1", "S_E1", "E_2", "S_E2") if _is_zero(self.S_E1) else ()),
+        )
+
     def __post_init__(self) -> None:
         """Check the ranges, and what two values must satisfy together."""
         super().__post_init__()
@@ -126,3 +135,8 @@ class ExciterParameters(Parameters):
             )
         if self.T_F2 == 0 and self.T_F3 > 0:
             raise ParameterError("ExciterParameters: T_F3 > 0 needs T_F2 > 0 (a proper lead-lag)")
+
+
+def _is_zero(value: Any) -> bool:
+    """Whether it is the number zero; a symbol is not."""
+    return isinstance(value, int | float) and value == 0

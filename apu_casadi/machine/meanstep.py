@@ -29,16 +29,9 @@ from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import (
-    SPEED_RANGE,
-    cached_table,
-    end_weights,
-    exciter_step,
-    leap,
-    parity,
-    symmetry,
-    through,
-)
+from apu_casadi.machine.propagation import exciter_step, leap
+from apu_casadi.machine.transition import SPEED_RANGE, cached_table, parity, symmetry
+from apu_casadi.machine.weights import end_weights, through
 
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
 #: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
@@ -194,28 +187,30 @@ def _parts(ss: GeneratorModel, x: Any, u: Any, th: Any, terms: ca.Function) -> l
     return found
 
 
-def _constant_step(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
-    nx, nu, n_P = len(ss.x), len(ss.u), parity(ss, 1).even.size
-    X0, U, dt = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("dt")
+def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
+    nx, nu, nt, n_P = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1).even.size
+    X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
+    dt = ca.MX.sym("dt")
     series = ca.MX.sym("series", len(PANELS) * 4 * n_P)
     ranges = ca.MX.sym("range", 4)  # of the speed; and where the step lies in a longer one
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
     s = (w - ranges[0]) / ranges[1]
     powers = ca.vertcat(1, s, s**2, s**3)
-    step, V_of = leap(gen, ss, 1, True)
-    x, V, P, u = (ca.SX.sym(k, n) for k, n in zip("xVPu", (nx, 3, n_P, nu), strict=True))
+    step, V_of = leap(ss, 1, True)
+    sizes = zip("xVPut", (nx, 3, n_P, nu, nt), strict=True)
+    x, V, P, u, th = (ca.SX.sym(k, n) for k, n in sizes)
     h = ca.SX.sym("h")
     xk, Vk, states = x, V, []
     for _ in range(4):
-        xk, Vk = step(xk, Vk, P, u, ca.SX(0, 1), h)
+        xk, Vk = step(xk, Vk, P, u, th, h)
         states.append(xk)
-    panel = ca.Function("panel", [x, V, P, u, h], [ca.horzcat(*states), Vk], {"cse": True})
-    x_k, V_k = X0, ca.vertcat(*V_of(X0, U, ca.DM(0, 1)), 0)
+    panel = ca.Function("panel", [x, V, P, u, th, h], [ca.horzcat(*states), Vk], {"cse": True})
+    x_k, V_k = X0, ca.vertcat(*V_of(X0, U, TH), 0)
     samples = [X0]
     for k, (number, share) in enumerate(PANELS):
         P_k = ca.mtimes(ca.reshape(series[k * 4 * n_P : (k + 1) * 4 * n_P], n_P, 4), powers)
         for _ in range(number):
-            four, V_k = panel(x_k, V_k, P_k, U, dt * share / 4)
+            four, V_k = panel(x_k, V_k, P_k, U, TH, dt * share / 4)
             x_k = four[:, 3]
             samples.append(four)
     X = ca.horzcat(*samples)
@@ -225,16 +220,17 @@ def _constant_step(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...]) ->
     weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
     W, share = ca.SX.sym("W", 2 * highest + 1), ca.SX.sym("share")
     means = ca.Function(
-        "harmonics", [x, W, share, u], [_harmonics(ss, (x, u, ca.SX(0, 1)), quad, W, share)],
+        "harmonics", [x, W, share, u, th], [_harmonics(ss, (x, u, th), quad, W, share)],
         {"cse": True},
     )  # fmt: skip
     shares = ranges[2] + ranges[3] * ca.DM(_shares()).T
-    each = means.map("each", "serial", X.shape[1], [3], [])(X, weights(dt, w, X0[at]), shares, U)
+    each = means.map("each", "serial", X.shape[1], [3, 4], [])
+    sampled = each(X, weights(dt, w, X0[at]), shares, U, TH)
     return ca.Function(
         f"means_{ss.name}",
-        [X0, ca.vertcat(series, ranges), U, dt],
-        [x_k, ca.sum2(each), V_k[2]],
-        ["x0", "series", "u", "dt"],
+        [X0, ca.vertcat(series, ranges), U, TH, dt],
+        [x_k, ca.sum2(sampled), V_k[2]],
+        ["x0", "series", "u", "theta", "dt"],
         ["x", "mean", "miss"],
     )
 
@@ -277,7 +273,7 @@ def _trig(pairs: int, angles: int, *, odd: bool) -> ca.Function:
     return ca.Function("trig", [first], [ca.vertcat(*columns)], {"cse": True})
 
 
-class _Turn(NamedTuple):
+class Turn(NamedTuple):
     """Half turns in a step, and the samples between which it may end."""
 
     halves: int
@@ -285,20 +281,21 @@ class _Turn(NamedTuple):
 
     @property
     def samples(self) -> int:
+        """Samples of a step, the start included."""
         return 1 + self.halves * STRIDES // 2
 
 
-def _turn(dt: float, w_rated: float) -> _Turn:
+def _turn(dt: float, w_rated: float) -> Turn:
     """How many strides are needed for the fastest speed, and where the slowest ends.
 
     Half of the samples that its polynomial goes through lie beyond the end.
     """
     strides = dt * w_rated * STRIDES / (2 * math.pi)
     halves = math.ceil(((1 + SPEED_RANGE) * strides + _AROUND // 2) / (STRIDES // 2))
-    return _Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND)
+    return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND)
 
 
-def _end_weights(turn: _Turn) -> ca.Function:
+def _end_weights(turn: Turn) -> ca.Function:
     """Function (length in strides) -> weights of the samples, shape (5, samples).
 
     Rows: the mean, relative to a stride; the polynomial at the end of the step, through the
@@ -338,10 +335,9 @@ def _end_weights(turn: _Turn) -> ca.Function:
 
 
 def _periodic_step(
-    gen: Generator, ss: GeneratorModel, quad: tuple[str, ...], dt: float, harmonics: int
+    ss: GeneratorModel, quad: tuple[str, ...], turn: Turn, harmonics: int
 ) -> ca.Function:
-    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-    turn, kinds = _turn(dt, gen.machine.w_rated), parity(ss, 1)
+    nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
     n_even, n_odd = kinds.even.size, kinds.odd.size
     pairs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
     sizes = 4 * 2 * pairs[0] * n_even, 4 * 2 * pairs[1] * n_odd
@@ -359,7 +355,7 @@ def _periodic_step(
         trig = _trig(pairs[i], half_turn, odd=bool(i))(theta0)
         P.append(entry(series, s, trig).T)
     # half a turn; then the phases are reversed instead of the angle going on
-    step, V_of = leap(gen, ss, PACE, False, chained=True)
+    step, V_of = leap(ss, PACE, False, chained=True)
     x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
     Pe, Po = ca.SX.sym("P", n_even, half_turn), ca.SX.sym("Q", n_odd, half_turn)
     h = ca.SX.sym("h")
@@ -384,14 +380,13 @@ def _periodic_step(
     X = ca.horzcat(*samples)
     length = DT / h_now
     weights = _end_weights(turn)(length)
-    held, HELD = ([u, th], [U, TH]) if nt else ([u], [U])
     outputs, share = ss.g(x, u, th), ca.SX.sym("share")
     terms = [Term.of(q).expression(ss, x, outputs, share) for q in quad]
     terms.append(outputs[ss.y.index("V_t")])
-    y = ca.Function("y", [x, share, *held], [ca.vertcat(*terms)], {"cse": True})
+    y = ca.Function("y", [x, share, u, th], [ca.vertcat(*terms)], {"cse": True})
     # beyond the end of the step the weight goes on as the polynomial that it is
     shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
-    Y = y.map("ys", "serial", turn.samples, list(range(2, 2 + len(held))), [])(X, shares, *HELD)
+    Y = y.map("ys", "serial", turn.samples, [2, 3], [])(X, shares, U, TH)
     mean = ca.mtimes(Y[:-1, :], weights[0, :].T) / length
     # the end of the step, with the phases as they are after so many half turns
     tail = np.arange(turn.first, turn.samples)
@@ -407,19 +402,19 @@ def _periodic_step(
         ca.mtimes(V_tail, weights[k, turn.first :].T) for k in (1, 3, 4)
     )  # fmt: skip
     rest = DT - h_now * PACE * ca.floor(length / PACE)
-    _, exciter = exciter_step(gen, ss)
+    _, exciter = exciter_step(ss)
     slow = [i for i in range(nx) if i != at and not linear[i, 0]]
     x_end = ca.MX(ends[:, 0])
-    x_end[slow] = exciter(
-        ends[:, 3][slow], ca.vertcat(V_start, V_middle, V_end), U[ss.u.index("V_ref")], rest
-    )
+    V_ref = U[ss.u.index("V_ref")]
+    drives = ca.vertcat(V_start, V_middle, V_end)
+    x_end[slow] = exciter(ends[:, 3][slow], drives, V_ref, TH, rest)
     x_end[at] = theta0 + w * DT
     doubt = ca.mmax(ca.fabs(ends[:, 0] - ends[:, 1]) * linear / ss.x.nominals)
     return ca.Function(
         f"means_{ss.name}",
-        [X0, parameters, U, *([TH] if nt else []), DT],
+        [X0, parameters, U, TH, DT],
         [x_end, mean, ca.vertcat(V_k[2], doubt)],
-        ["x0", "series", "u", *(["theta"] if nt else []), "dt"],
+        ["x0", "series", "u", "theta", "dt"],
         ["x", "mean", "miss"],
     )
 
@@ -428,19 +423,21 @@ def _periodic_step(
 
 
 @kept
-def _function(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...], dt: float,
-              harmonics: int) -> ca.Function:  # fmt: skip
-    """Function (x0, series, u[, theta], dt) -> (x, mean, miss); ``dt`` only bounds the samples."""
-    if harmonics == 0:
-        return _constant_step(gen, ss, quad)
-    return _periodic_step(gen, ss, quad, dt, harmonics)
+def _function(
+    ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int
+) -> ca.Function:
+    """Function (x0, series, u, theta, dt) -> (x, mean, miss); without a turn for constant ones."""
+    if turn is None:
+        return _constant_step(ss, quad)
+    return _periodic_step(ss, quad, turn, harmonics)
 
 
 @kept
-def _caller(gen: Generator, ss: GeneratorModel, quad: tuple[str, ...], dt: float, harmonics: int,
-            _in_use: str) -> Caller:  # fmt: skip
+def _caller(
+    ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int, _in_use: str
+) -> Caller:
     """The same in the backend in use, one for each layout."""
-    return Caller(compiled(_function(gen, ss, quad, dt, harmonics), level=3))
+    return Caller(compiled(_function(ss, quad, turn, harmonics), level=3))
 
 
 class MeanStep(Rebuilt):
@@ -476,19 +473,18 @@ class MeanStep(Rebuilt):
         if not ss.linear:
             raise NotApplicable(f"{ss.name}: its load is not linear")
         self.ss, self.dt, self.quad = ss, dt, tuple(quad)
-        self.theta = np.array(theta, dtype=float)
+        given = np.array(theta, dtype=float)
+        self.theta = ss.full(given)
         w_rated = gen.machine.w_rated
         if dt * w_rated < 4 * math.pi:
             raise NotApplicable(f"{ss.name}: a step of {dt:g} s has less than two turns")
-        self.constant = symmetry(ss, u, self.theta, w_rated)
+        self.constant = symmetry(ss, u, given, w_rated)
         if self.constant:
-            tables = [
-                cached_table(ss, u, self.theta, w_rated, h=dt * share / 4) for _, share in PANELS
-            ]
+            tables = [cached_table(ss, u, given, w_rated, h=dt * share / 4) for _, share in PANELS]
             series, harmonics = [t.even.ravel() for t in tables], 0
         else:
             angle = 2 * math.pi / STRIDES
-            tables = [cached_table(ss, u, self.theta, w_rated, angle=angle)]
+            tables = [cached_table(ss, u, given, w_rated, angle=angle)]
             harmonics = next((k for k in HARMONICS if k >= tables[0].harmonics), 0)
             if not harmonics:
                 raise NotApplicable(
@@ -499,8 +495,8 @@ class MeanStep(Rebuilt):
             series = [_filled(part, terms) for part, terms in full]
         self._range = tables[0].centre, tables[0].half
         self.parameters = np.concatenate([*series, self._range, within])
-        shape = 0.0 if self.constant else dt  # the panels are shares of the step
-        self.layout = (gen, ss, self.quad, shape, harmonics)
+        turn = None if self.constant else _turn(dt, w_rated)  # panels are shares of the step
+        self.layout = (ss.shared, self.quad, turn, harmonics)
         self.advance = _function(*self.layout)
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]
         self.limits = np.array([drive] if self.constant else [drive, END_TOL])
@@ -526,8 +522,7 @@ class MeanStep(Rebuilt):
         call = self._compiled
         if call is None:
             call = self._compiled = _caller(*self.layout, backend_in_use())
-        held = [self.theta] if self.theta.size else []
-        x, mean, miss = call(x0, self.parameters, u, *held, self.dt)
+        x, mean, miss = call(x0, self.parameters, u, self.theta, self.dt)
         if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):
             raise NotApplicable(
                 f"{self.ss.name}: step from {t0:.6g} s: errors of E_fd and of the state at the end "

@@ -55,12 +55,23 @@ def flux_linkages(p: MachineParameters, i: Windings) -> Windings:
 
 
 def currents(p: MachineParameters, lam: Windings) -> Windings:
-    """Return ibar = L^-1 lambda, (7) inverted, in A; linear, so it also maps rates to rates."""
-    L = inductance(p)
-    inverse = np.zeros((6, 6))
-    for axis in ([0, 5], [1, 3, 4], [2]):  # block by block: the axes stay exactly decoupled
-        inverse[np.ix_(axis, axis)] = np.linalg.inv(L[np.ix_(axis, axis)])
-    return Windings(*(_combine(row, lam) for row in inverse))
+    """Return ibar = L^-1 lambda, (7) inverted, in A; linear, so it also maps rates to rates.
+
+    By the mutual flux linkages (Krause): lambda_md = L_MD (lambda_sd/L_ls + lambda_fd/L_lfd +
+    lambda_kd/L_lkd) with 1/L_MD = 1/L_md + 1/L_ls + 1/L_lfd + 1/L_lkd, and so in the q axis.
+    """
+    s, fd, kd, kq = (1.0 / L for L in (p.L_ls, p.L_lfd, p.L_lkd, p.L_lkq))
+    L_MD, L_MQ = 1.0 / (1.0 / p.L_md + s + fd + kd), 1.0 / (1.0 / p.L_mq + s + kq)
+    md = (L_MD * s) * lam.sd + (L_MD * fd) * lam.fd + (L_MD * kd) * lam.kd
+    mq = (L_MQ * s) * lam.sq + (L_MQ * kq) * lam.kq
+    return Windings(
+        sq=s * (mq - lam.sq),
+        sd=s * (md - lam.sd),
+        s0=-s * lam.s0,
+        fd=fd * (lam.fd - md),
+        kd=kd * (lam.kd - md),
+        kq=kq * (lam.kq - mq),
+    )
 
 
 def _combine(row: np.ndarray, x: Windings) -> Any:

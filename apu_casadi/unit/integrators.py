@@ -28,7 +28,8 @@ from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.meanstep import MeanStep
-from apu_casadi.machine.propagation import SPEED_RANGE, Propagator
+from apu_casadi.machine.propagation import Propagator
+from apu_casadi.machine.transition import SPEED_RANGE
 from apu_casadi.unit.exchange import PAPER, Exchange
 from apu_casadi.unit.stepmeans import StepMeans
 

@@ -24,7 +24,8 @@ from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.core.statespace import StateSpace
-from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.cyclefunctions import CycleFunctions
+from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu
@@ -65,8 +66,8 @@ def block_function(
     speed; last, the waveforms if there are any.
 
     Args:
-        advance: the machine's step, (x, series, u[, theta], dt) -> (x, [samples], means, errors).
-        ss: the machine's model.
+        advance: the machine's step, (x, series, u, theta, dt) -> (x, [samples], means, errors).
+        ss: the machine's model; theta of the block are those of the families.
         gas_step: (N, u, theta, dt, z) -> (N, y, z, residual).
         link: gearbox and governor; its numbers are inputs.
         name: of the function.
@@ -75,10 +76,10 @@ def block_function(
     ends = np.cumsum([0, 1, n_z, len(law.X), len(ss.x)]).tolist()
     carry, u = ca.MX.sym("carry", ends[-1]), ca.MX.sym("u", n_u)
     theta, u_sg = ca.MX.sym("theta", n_theta), ca.MX.sym("u_sg", len(ss.u))
+    theta_sg = ca.MX.sym("theta_sg", len(ss.shared.theta))
     numbers = ca.MX.sym("numbers", link.numbers.size)
     series, dt = ca.MX.sym("series", advance.numel_in(1)), ca.MX.sym("dt")
-    fault = [ca.MX.sym("fault", len(ss.theta))] if len(ss.theta) else []
-    held = [u, theta, u_sg, *fault, numbers, series, dt]
+    held = [u, theta, u_sg, theta_sg, numbers, series, dt]
 
     N, z, x_gov, x_sg = (carry[i:j] for i, j in pairwise(ends))
     own, at = link.with_numbers(ca.vertsplit(numbers)), ss.x.index("theta_e")
@@ -87,7 +88,7 @@ def block_function(
     def machine(_N: ca.MX, _slope: ca.MX) -> tuple[ca.MX, list[ca.MX]]:
         u_now = ca.MX(u_sg)
         u_now[ss.u.index("w_r")] = w_r
-        x1, *Y, means, miss = advance(x_sg, series, u_now, *fault, dt)
+        x1, *Y, means, miss = advance(x_sg, series, u_now, theta_sg, dt)
         x1[at] -= 2 * math.pi * ca.floor(x1[at] / (2 * math.pi) + 0.5)
         return means[0], [x1, means, miss, *Y]
 
@@ -110,7 +111,7 @@ def block_function(
         name,
         [carry, *held],
         [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))],
-        ["carry", "u", "theta", "u_sg"] + ["fault"] * len(fault) + ["numbers", "series", "dt"],
+        ["carry", "u", "theta", "u_sg", "theta_sg", "numbers", "series", "dt"],
         ["last", "y", "means", "checks"] + ["waves"] * len(Y),
     )
 
@@ -122,7 +123,7 @@ class JointBlock(Rebuilt):
         """Build or fetch the compiled block; a ``Propagator`` must have constant coefficients."""
         self.apu, self.machine = apu, machine
         self._numbers, self._n_gov = apu.link.numbers, len(apu.governor.X)
-        self._call = _caller(apu.gas_generator, apu.link, machine)
+        self._call = _caller(apu.gas_generator.family, apu.link, machine)
 
     def __call__(
         self,
@@ -141,9 +142,9 @@ class JointBlock(Rebuilt):
         """
         m = self.machine
         carry = np.concatenate([N, z, governor, x_sg])
-        fault = [m.theta] if m.theta.size else []
+        full = self.apu.gas_generator.full(theta)
         last, y, means, checks, *waves = self._call(
-            carry, u, theta, u_sg, *fault, self._numbers, m.parameters, m.dt
+            carry, u, full, u_sg, m.theta, self._numbers, m.parameters, m.dt
         )
         *miss, residual, w_r = checks
         good = (
@@ -163,13 +164,13 @@ class JointBlock(Rebuilt):
         return BlockResult(N, z, tuple(x_gov.tolist()), x_sg, y, means, wave)
 
 
-def _caller(gg: GasGenerator, link: Link, machine: Propagator | MeanStep) -> Caller:
-    """One compiled block for each gas generator, structure of the link and layout."""
+def _caller(family: CycleFunctions, link: Link, machine: Propagator | MeanStep) -> Caller:
+    """One compiled block for each structure of gas generator, link and machine, and layout."""
 
     def make() -> Caller:
         name = f"joint_block_{machine.ss.name}_{machine.n_out}"
-        function = block_function(machine.advance, machine.ss, gg.step, link, name)
+        function = block_function(machine.advance, machine.ss, family.step, link, name)
         return Caller(compiled(function, level=3), copy=False)
 
     key = (link.structure, machine.layout, backend_in_use())
-    return keep(gg, JointBlock, key, make)
+    return keep(family, JointBlock, key, make)

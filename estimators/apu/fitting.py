@@ -203,8 +203,10 @@ def to_recording(
         wide = np.full(t.size, OPEN * design)
         if there.any():
             inputs[name] = (t, np.interp(t, t[there], v[there]))
-            inputs[f"sigma_{name}"] = (t, np.where(there, np.maximum(sigma(name, v), 1e-9 * design),
-                                                   wide))  # fmt: skip
+            inputs[f"sigma_{name}"] = (
+                t,
+                np.where(there, np.maximum(sigma(name, v), 1e-9 * design), wide),
+            )
         else:
             inputs[name], inputs[f"sigma_{name}"] = (t, np.full(t.size, design)), (t, wide)
     for name, value in data.ambient.items():
@@ -213,13 +215,7 @@ def to_recording(
             raise DataError(f"{data.name}: {name} has gaps; ambient conditions are needed always")
         inputs[name] = float(a) if a.ndim == 0 else (t, a)
     p = dict.fromkeys(lifted.model.p.names, 0.0) | dict.fromkeys(HEALTH, 1.0)
-    return record(
-        lifted.model,
-        outputs=outputs,
-        sigma=noise,
-        inputs=inputs,
-        p=p,
-    )
+    return record(lifted.model, outputs=outputs, sigma=noise, inputs=inputs, p=p)
 
 
 def _read(lifted: Lifted, r: Recording, name: str) -> np.ndarray:
@@ -343,11 +339,7 @@ def fit_engine(
         p[i] = list(values.values())
         recordings[k] = dataclasses.replace(r, p=p)
     problem = FitProblem(
-        lifted,
-        [r.size for r in recordings],
-        estimate,
-        own=own,
-        consider=tuple(consider or ()),
+        lifted, [r.size for r in recordings], estimate, own=own, consider=tuple(consider or ())
     )
     result = problem.solve(recordings, prior=prior, bounds=bounds, consider=consider)
     # an input left open is an unknown without a reading
@@ -377,7 +369,7 @@ def steady_truth(gg: GasGenerator, theta: np.ndarray) -> EngineData:
             gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, theta, strict=True))
         )
         for PW in POWERS
-    ]  # fmt: skip
+    ]
     readings = {n: np.array([p[n] for p in points]) for n in (*OUTPUTS, *INPUTS)}
     return EngineData("steady", np.arange(len(points), dtype=float), readings, dict(DEFAULT_DAY))
 
@@ -392,7 +384,7 @@ def transient_truth(
     ss, par = gg.state_space, GovernorParameters()
     start = trim_gas_generator(
         gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True))
-    )  # fmt: skip
+    )
     run = stepper(ss, 1, rtol=1e-9, atol=1e-11)
     x, x_gov = start.x.copy(), par.start(float(start["Wf"]))
     t, rows = np.arange(K) * dt, []
@@ -465,9 +457,12 @@ def coverage(
     truth = [(steady_truth if steady else transient_truth)(gg, th) for th in healths]
     averaged = READINGS if steady else 1
     problem = FitProblem(
-        lifted, [truth[0].t.size], HEALTH, consider=tuple(considered),
+        lifted,
+        [truth[0].t.size],
+        HEALTH,
+        consider=tuple(considered),
         build=(not steady) if build is None else build,
-    )  # fmt: skip
+    )
     error, sigma = np.full((n, 4), np.nan), np.full((n, 4), np.nan)
     chi2, freedom, failed = [], 0, 0
     for i in range(n):

@@ -211,9 +211,13 @@ def _gas_path(
             priors[f"gain_{name}"] = gain
             columns.append(np.eye(len(y))[:, [i]] * y[i])
     return Sensitivities.of(
-        Signals(signals), sensors.names, np.hstack(columns), sigma,
-        faults=gg.THETA.names, prior=priors,
-    )  # fmt: skip
+        Signals(signals),
+        sensors.names,
+        np.hstack(columns),
+        sigma,
+        faults=gg.THETA.names,
+        prior=priors,
+    )
 
 
 #: Of the transient: s from the start of the ramp to its end, and proportional fuel control that
@@ -310,15 +314,14 @@ def shaft_power_snapshot(
     Raises:
         ParameterError: numbers out of range.
     """
-    g = gas_path(
-        point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
-        eta_bias=eta_bias, gain_errors=gain_errors, gas_generator=gas_generator,
-    )  # fmt: skip
+    how: dict[str, Any] = {"sensors": GAS_PATH, "samples": samples, "prior": prior}
+    how["gas_generator"] = gas_generator
+    errors: dict[str, Any] = {"power_noise": power_noise, "eta_bias": eta_bias}
+    g = gas_path(point, **how, **errors, gain_errors=gain_errors)
     without = g.only(BASE)
     C0, C1 = without.covariance(), g.covariance()
     # with gain errors considered it is no longer exactly invisible: take it without them
-    of: dict[str, Any] = {"samples": samples, "prior": prior, "gas_generator": gas_generator}
-    plain = gas_path(point, sensors=GAS_PATH, **of).only(BASE)
+    plain = gas_path(point, **how).only(BASE)
     v = np.linalg.svd(plain.signatures())[2][-1]
     v = v * np.sign(v[np.abs(v).argmax()])
     s0, s1 = np.sqrt(np.diag(C0)), np.sqrt(np.diag(C1))
@@ -364,10 +367,7 @@ def snapshot_sweep(
     """
     chosen = VARIANTS if variants is None else variants
     return [
-        {
-            "variant": label,
-            **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options),
-        }
+        {"variant": label, **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options)}
         for label, options in chosen.items()
         for noise in power_noises
         for prior in priors
@@ -515,9 +515,14 @@ def snapshot_trials(
     read = _Reader(gg, at)
     rows = gg.Y.indices(GAS_PATH.names)
     g = gas_path(
-        point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
-        eta_bias=eta_bias, gas_generator=gas_generator,
-    )  # fmt: skip
+        point,
+        sensors=GAS_PATH,
+        samples=samples,
+        prior=prior,
+        power_noise=power_noise,
+        eta_bias=eta_bias,
+        gas_generator=gas_generator,
+    )
     nominal = np.array([at[n] for n in GAS_PATH.names])
     sigma = np.array([GAS_PATH.sigma(n, v) for n, v in zip(GAS_PATH.names, nominal, strict=True)])
     sigma /= math.sqrt(samples)
@@ -538,8 +543,9 @@ def snapshot_trials(
         y = measure(read(true)[0][rows], sigma, rng)
         y[power] += bias * rng.standard_normal()
         for label, use in (("before", without), ("after", list(range(len(rows))))):
-            found, cov = _most_probable(read, start, y[use], [rows[i] for i in use],
-                                        claimed[use], prior)  # fmt: skip
+            found, cov = _most_probable(
+                read, start, y[use], [rows[i] for i in use], claimed[use], prior
+            )
             e = (found - true)[2:]
             errors[label].append(e)
         nees.append(float(e @ np.linalg.solve(cov[2:, 2:], e)) / 4)

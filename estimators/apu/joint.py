@@ -445,17 +445,22 @@ def cross_talk(
         fault; RMSE of the factors, and RMS of error over claimed sigma, at the end of each phase.
     """
     variants: dict[str, dict[str, Any]] = {
-        "coupled": {}, "healthy machine": {"ttsc": False}, "no power": {"power": False},
-    }  # fmt: skip
+        "coupled": {},
+        "healthy machine": {"ttsc": False},
+        "no power": {"power": False},
+    }
     out: dict[str, Any] = {"seeds": len(seeds)}
     for name, options in variants.items():
         change, h_change, error, z, alarms, h_alarms = [], [], [], [], 0, 0
         for seed in seeds:
             case = joint_case(seed)
             e = estimate_joint(
-                ds, seed, gas_gains=case.gas_gains, electrical_gains=case.electrical_gains,
+                ds,
+                seed,
+                gas_gains=case.gas_gains,
+                electrical_gains=case.electrical_gains,
                 **options,
-            )  # fmt: skip
+            )
             t = e["time"].values
             k0, k1 = (int(np.searchsorted(t, v - 1e-9)) for v in (fault, fault + 3.0))
             k = np.array([int(np.searchsorted(t, v - 1e-9)) for v in (2.0, gas_fault, fault)])

@@ -137,18 +137,10 @@ def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter
     error = (1 - given["fresh"]) * at["error_Wf"] + given["fresh"] * w[len(W) - 1]
     x1 = ca.vertcat(x_e, N + dt * k2, health, error)
     y = ca.vertcat(y_e, apu.w_r(N), N, y_g)
-    free = np.full(len(X), np.inf)
-    model = FilterModel(
-        "unit", X, U, Signals(), W, Y,
-        transition=ca.Function(
-            "unit_f", [x, u, p, w, dt], [x1, check_e + check + check_2],
-            ["x", "u", "p", "w", "dt"], ["x1", "check"],
-        ),
-        output=ca.Function(
-            "unit_g", [x, u, p, w], [y, check_y], ["x", "u", "p", "w"], ["y", "check"]
-        ),
-        walk=np.concatenate([me.walk, mg.walk, [0.0]]), lower=-free, upper=free,
-    )  # fmt: skip
+    step, output = (x1, check_e + check + check_2), (y, check_y)
+    model = FilterModel.of("unit", (X, U, Signals(), W, Y), (x, u, p, w, dt), step, output)
+    walks = zip(X.names, np.concatenate([me.walk, mg.walk, [0.0]]), strict=True)
+    model = model.with_walk(dict(walks))
     return Monolithic(apu, electrical, gas, model)
 
 
@@ -179,9 +171,10 @@ def compare_monolithic(ds: xr.Dataset, seed: int, *, apu: Apu | None = None) -> 
     found = extended_kalman_filter(electrical.model, first, fast)
     _, P, var = window_power(electrical, found, fast)
     slow = gas.recording(
-        ds, np.random.default_rng([seed, 2]),
+        ds,
+        np.random.default_rng([seed, 2]),
         power=(apu.PW(P), np.sqrt(var) / apu.coupling.eta_gtSg),
-    )  # fmt: skip
+    )
     sigma = ELECTRICAL.sigma("w_r", float(np.median(samples_fast["w_r"])))
     speed = speed_from_generators(samples_fast["t"], samples_fast["w_r"], sigma, t, apu)
     before = gas.prior()

@@ -127,13 +127,9 @@ def severity(
         signals.append(Signal("gain_i_a", "1", "gain error of the current sensor"))
         J = np.column_stack([J, current])
         prior["gain_i_a"] = sensor.gain
-    return (
-        Sensitivities.of(
-            Signals(signals), ["i_a"] * n, J, np.full(n, sensor.noise), faults=faults,
-            prior=prior, size=dict.fromkeys(faults, 0.1),
-        ),
-        float(ratio.ravel()[0]),
-    )  # fmt: skip
+    of, noise, size = Signals(signals), np.full(n, sensor.noise), dict.fromkeys(faults, 0.1)
+    g = Sensitivities.of(of, ["i_a"] * n, J, noise, faults=faults, prior=prior, size=size)
+    return g, float(ratio.ravel()[0])
 
 
 #: Severities of the study: (mu, k_rf).

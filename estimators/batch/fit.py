@@ -39,11 +39,7 @@ from estimators.models.filtermodel import FilterModel
 from estimators.models.lifting import Lifted, plain
 from estimators.models.recording import Recording
 
-__all__ = [
-    "FitProblem",
-    "fit",
-    "profile",
-]
+__all__ = ["FitProblem", "fit", "profile"]
 
 #: Eigenvalue of the information, parameters scaled to unit information each, below which a
 #: direction counts as undetermined; and below which it is reported as hardly determined.
@@ -81,6 +77,16 @@ class FitProblem(Rebuilt):
     Raises:
         ParameterError: unknown or doubled names, nothing to estimate.
     """
+
+    lifted: Lifted
+    model: FilterModel
+    estimate: tuple[str, ...]
+    own: tuple[str, ...]
+    consider: tuple[str, ...]
+    program: Transcription
+    free: list[int]
+    held: list[int]
+    names: tuple[str, ...]
 
     @building
     def __init__(
@@ -575,8 +581,9 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
             lo, hi, rl, rh = a, b, ra, rb
             for _ in range(points):
                 x: float = lo + (target - rl) / (rh - rl) * (hi - lo)
-                x = min(max(x, min(lo, hi) + 0.05 * abs(hi - lo)),
-                        max(lo, hi) - 0.05 * abs(hi - lo))  # fmt: skip
+                x = min(
+                    max(x, min(lo, hi) + 0.05 * abs(hi - lo)), max(lo, hi) - 0.05 * abs(hi - lo)
+                )
                 r, near = root_drop(x, near)
                 if abs(r - target) <= 1e-3 * target or abs(hi - lo) <= 1e-9 * scale:
                     return x

@@ -80,10 +80,7 @@ def kernel(lifted: Lifted, names: tuple[str, ...]) -> Kernel:
     Q, D = ca.MX.sym("q", n), ca.MX.sym("d", d.shape[0])
     X = ca.vertsplit(Q * ca.DM(scale), [0, *np.cumsum(sizes).tolist()])
     U, P0, _, _, DT = ca.vertsplit(D, [0, *np.cumsum([nu, np_, ny, ny, 1]).tolist()])
-    P = ca.vertcat(
-        ca.MX(0, 1),
-        *(X[4][cols.index(i)] if i in place else P0[i] for i in range(np_)),
-    )
+    P = ca.vertcat(ca.MX(0, 1), *(X[4][cols.index(i)] if i in place else P0[i] for i in range(np_)))
     K = lifted.frozen(X[0], X[1], U, P, X[2], DT)
 
     def function(name: str, more: Sequence[Any], out: Sequence[Any]) -> ca.Function:

@@ -31,9 +31,9 @@ from apu_casadi.core.backend import compiled
 from apu_casadi.core.errors import EstimationError
 from apu_casadi.core.interrupts import watched
 from apu_casadi.core.sharing import Rebuilt, building, derived, keep
-from estimators.batch.stagekernel import kernel
+from estimators.batch.stagekernel import Kernel, kernel
 from estimators.filters.belief import Belief
-from estimators.models.filtermodel import CHECK_TOL
+from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.lifting import Lifted
 from estimators.models.recording import Recording
 
@@ -106,6 +106,22 @@ class Transcription(Rebuilt):
         prior: whether the recordings come with beliefs of their first states.
         backend, build: see :func:`apu_casadi.core.backend.compiled`.
     """
+
+    lifted: Lifted
+    model: FilterModel
+    sizes: tuple[int, ...]
+    shared: tuple[str, ...]
+    own: tuple[str, ...]
+    prior: bool
+    kernel: Kernel
+    n_theta: int
+    n_local: int
+    n_z: int
+    n_g: int
+    starts: np.ndarray
+    recording_of: np.ndarray
+    index: np.ndarray
+    linked: np.ndarray
 
     @building
     def __init__(
@@ -264,9 +280,11 @@ class Transcription(Rebuilt):
         I, J = self.index[:, hr].ravel(), self.index[:, hc].ravel()
         fixed = np.arange(self.n_theta + (R * nx if self.prior else 0))
         hess = _placed(
-            [np.minimum(I, J), fixed], [np.maximum(I, J), fixed],
-            [np.ones(I.size), np.ones(fixed.size)], (self.n_z, self.n_z),
-        )  # fmt: skip
+            [np.minimum(I, J), fixed],
+            [np.maximum(I, J), fixed],
+            [np.ones(I.size), np.ones(fixed.size)],
+            (self.n_z, self.n_z),
+        )
         spread = sp.csc_matrix(
             (np.ones(self.index.size), (self.index.ravel(), np.arange(self.index.size))),
             shape=(self.n_z, self.index.size),
@@ -343,7 +361,7 @@ class Transcription(Rebuilt):
     @derived
     def _n_data(self) -> int:
         nx, nu, np_, _, ny = self.model.sizes
-        n = (nu + np_ + 2 * ny + 1) * sum(self.sizes) + 2 * self.n_theta
+        n: int = (nu + np_ + 2 * ny + 1) * sum(self.sizes) + 2 * self.n_theta
         return n + (len(self.sizes) * (nx + nx * nx) if self.prior else 0)
 
     def solver(self, warm: bool = False, max_iterations: int = 200) -> ca.Function:

@@ -105,8 +105,12 @@ class FilterStep(Parametric):
         """
         if not self.root:
             return self
-        s = [ca.MX.sym(self.function.name_in(i), self.function.size1_in(i),
-                       self.function.size2_in(i)) for i in range(len(STEP_IN))]  # fmt: skip
+        s = [
+            ca.MX.sym(
+                self.function.name_in(i), self.function.size1_in(i), self.function.size2_in(i)
+            )
+            for i in range(len(STEP_IN))
+        ]
         P = ca.SX.sym("P", s[1].shape[0], s[1].shape[0])
         root = ca.Function("root", [P], [ca.densify(cholesky_semidefinite(P))])
         out = list(self.function(s[0], root(s[1]), *s[2:]))[: len(STEP_OUT)]
@@ -224,8 +228,10 @@ def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.F
         now = out[:carried]
         results.append(out)
     first = f.n_out() - kept
-    out = [*results[-1][:first], *(ca.horzcat(*(r[i] for r in results))
-                                   for i in range(first, f.n_out()))]  # fmt: skip
+    out = [
+        *results[-1][:first],
+        *(ca.horzcat(*(r[i] for r in results)) for i in range(first, f.n_out())),
+    ]
     return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
 
 
@@ -251,9 +257,12 @@ def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> c
     before each sample and C, S; matrices as columns.
     """
     nx, nu, np_, _, ny = step.model.sizes
-    s = [ca.MX.sym(n, *shape) for n, shape in zip(
-        STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
-    )]  # fmt: skip
+    s = [
+        ca.MX.sym(n, *shape)
+        for n, shape in zip(
+            STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
+        )
+    ]
     m, P, u, p, y, R, dt = s
     o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
     kept = [o["m_f"], ca.vec(o["P_f"]), o["nu"], ca.diag(o["S"]), o["stats"]]
@@ -328,8 +337,12 @@ def run(
         r = slice(b * BLOCK, b * BLOCK + n)
         out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
         for target, source in (
-            (mean, out[2]), (var, out[3][:: nx + 1]), (nu, out[4]), (S, out[5]), (stats, out[6])
-        ):  # fmt: skip
+            (mean, out[2]),
+            (var, out[3][:: nx + 1]),
+            (nu, out[4]),
+            (S, out[5]),
+            (stats, out[6]),
+        ):
             target[:, r] = source[:, :n]
         _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
         if kept is not None:
@@ -342,14 +355,12 @@ def run(
     root = None if not passes.now.gives_roots else out[-1][:, n - 1].reshape(nx, nx).T.copy()
     np.maximum(var, 0.0, out=var)  # rounding, judged above
     nu[missing], S[missing] = np.nan, np.nan
-    again = None
+    final = Belief(model.x, mean[:, -1].copy(), last, root)
+    told = stats[1], stats[3], float(stats[2].sum()), final
+    more: dict[str, Any] = {} if kept is None else kept.fields()
     if full and step.wide is not None:
-        again = partial(_rooted, step, prior, data, backend)
-    return FilterResult(
-        model.x, model.y, data.t, mean, var, nu, S, stats[1], stats[3], float(stats[2].sum()),
-        Belief(model.x, mean[:, -1].copy(), last, root),
-        **({} if kept is None else kept.fields()), again=again,
-    )  # fmt: skip
+        more["again"] = partial(_rooted, step, prior, data, backend)
+    return FilterResult(model.x, model.y, data.t, mean, var, nu, S, *told, **more)
 
 
 def _rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
@@ -464,9 +475,13 @@ class _Kept:
     def fields(self) -> dict[str, Any]:
         """The fields of a result that hold them."""
         return {
-            "cov": self.cov, "mean_pred": self.mean_pred, "cov_pred": self.cov_pred,
-            "cross": self.cross, "innovation_cov": self.S, "roots": self.roots,
-        }  # fmt: skip
+            "cov": self.cov,
+            "mean_pred": self.mean_pred,
+            "cov_pred": self.cov_pred,
+            "cross": self.cross,
+            "innovation_cov": self.S,
+            "roots": self.roots,
+        }
 
     def put(self, r: slice, columns: list[np.ndarray], *, root: bool) -> None:
         """Take P_f, m, P, C, S of some instants; matrices are columns in column-major order."""

@@ -270,10 +270,8 @@ def _block(
     x = [m.x for m in models]
     n = [len(s) for s in x]
     _, nu, np_, _, ny = models[0].sizes
-    shapes = {
-        "logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2, "u": nu,
-        "y": ny, "R": ny, "dt": 1, "p": np_,
-    }  # fmt: skip
+    shapes = {"logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2}
+    shapes |= {"u": nu, "y": ny, "R": ny, "dt": 1, "p": np_}
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
     mixer = root_mixer if roots else plain_mixer
     logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
@@ -291,11 +289,7 @@ def _block(
     ll = ca.vertcat(*(o[7][2] for o in outs))
     check = ca.vertcat(*(o[7][0] for o in outs))
     new, total, mean, var = _weigher(x, common)(logs, ll, m_f, P_f)
-    carried = [
-        new,
-        ca.vertcat(*(o[0] for o in outs)),
-        ca.vertcat(*(ca.vec(o[1]) for o in outs)),
-    ]
+    carried = [new, ca.vertcat(*(o[0] for o in outs)), ca.vertcat(*(ca.vec(o[1]) for o in outs))]
     S = ca.vertcat(*(ca.diag(o[6]) for o in outs))
     kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check), S]
     name = "imm_roots" if roots else "imm"

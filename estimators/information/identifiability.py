@@ -255,11 +255,14 @@ class Identifiability:
             data,
             coords={"fault": list(g.faults), "other": list(g.faults)},
             attrs={
-                "sensors": ", ".join(self.sensors), "rank": self.rank,
-                "rank_in_noise": self.rank_in_noise, "P_fa": self.P_fa, "P_d": self.P_d,
+                "sensors": ", ".join(self.sensors),
+                "rank": self.rank,
+                "rank_in_noise": self.rank_in_noise,
+                "P_fa": self.P_fa,
+                "P_d": self.P_d,
                 "threshold": self.threshold,
             },
-        )  # fmt: skip
+        )
 
 
 def _and(words: Sequence[str]) -> str:
@@ -402,10 +405,13 @@ def _pairs(
         angle = math.degrees(math.asin(min(share, 1.0)))
         out.append(
             Pair(
-                faults[i], faults[j], angle, float(correlation[i, j]),
+                faults[i],
+                faults[j],
+                angle,
+                float(correlation[i, j]),
                 _over(need, rest, float(length[i])),
             )
-        )  # fmt: skip
+        )
     return tuple(out)
 
 
@@ -476,9 +482,7 @@ class SensorComparison:
 
 
 def compare_sensors(
-    sensitivities: Sensitivities,
-    sets: Mapping[str, Sequence[str]],
-    **options: float,
+    sensitivities: Sensitivities, sets: Mapping[str, Sequence[str]], **options: float
 ) -> SensorComparison:
     """Tell what several sets of sensors can know.
 

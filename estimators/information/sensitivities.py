@@ -209,12 +209,7 @@ def bound_of(M: np.ndarray, size: np.ndarray, prior: np.ndarray) -> np.ndarray:
 
 
 def steady_sensitivities(
-    xdot_w: Any,
-    y_w: Any,
-    w: Signals,
-    *,
-    unknown: Sequence[str],
-    solved: Sequence[str],
+    xdot_w: Any, y_w: Any, w: Signals, *, unknown: Sequence[str], solved: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return derivatives along steady states, on which 0 = xdot(w) holds exactly.
 

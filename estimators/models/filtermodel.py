@@ -236,10 +236,7 @@ class FilterModel(Parametric):
 
 @remade
 def discretise(
-    ss: StateSpace,
-    *,
-    method: str = "midpoint",
-    walk: Mapping[str, float] | None = None,
+    ss: StateSpace, *, method: str = "midpoint", walk: Mapping[str, float] | None = None
 ) -> FilterModel:
     """Make a filter's model from a continuous one, inputs held over each step.
 

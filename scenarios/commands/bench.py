@@ -39,6 +39,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print, write."""
     from scenarios import registry
     from scenarios.bench import benchmarks
+    from scenarios.bench.linearity import write_plot
+    from scenarios.bench.measuring import Size
     from scenarios.shell import markdown
 
     if args.list:
@@ -47,13 +49,13 @@ def run(args: argparse.Namespace) -> int:
     usage.count("--runs", args.runs)
     if args.pycycle_python:
         os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
-    size = benchmarks.Size()
+    size = Size()
     if args.runs is not None:
         size = dataclasses.replace(size, runs=args.runs)
     names = None
     if args.only is not None:
         names = given.names(args.only)
-        names += [n for n in benchmarks.PEERS if args.peers and n not in names]
+        names += [n for n in benchmarks.parts(peers=True) if args.peers and n not in names]
     if args.page:
         registry.prepare(Path(args.page).parent)
     show = not args.quiet and not args.json and sys.stderr.isatty()
@@ -67,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         page, image = Path(args.page), None
         if report.curves:
             image = "docs/images/bench_linear.png"
-            made.append(benchmarks.write_plot(report.curves, size, page.parent / image))
+            made.append(write_plot(report.curves, size, page.parent / image))
         made.append(markdown.write_text(page, benchmarks.page(report, image)))
     if args.json:
         jsontext.show(report.to_dict())

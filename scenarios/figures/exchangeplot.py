@@ -53,10 +53,9 @@ def figure_exchange_error(
             ax = fig.add_subplot(grid[k // 2, k % 2])
             for (case, ex), (dt, errors) in curves.items():
                 c = cases.index(case)
-                ax.loglog(
-                    1e3 * dt, errors[q], color=LINE_INK[c], ls=dash[ex], marker=MARKS[c], ms=4.5,
-                    mfc=LINE_INK[c] if ex == exchanges[0] else "white", lw=1.5,
-                )  # fmt: skip
+                inside = LINE_INK[c] if ex == exchanges[0] else "white"
+                look = {"color": LINE_INK[c], "marker": MARKS[c], "mfc": inside}
+                ax.loglog(1e3 * dt, errors[q], ls=dash[ex], ms=4.5, lw=1.5, **look)
             every = np.concatenate([errors[q] for _, errors in curves.values()])
             _slopes(ax, steps, every)
             ax.axvline(1e3 * mark, color=MUTED, lw=0.9, zorder=0.5)

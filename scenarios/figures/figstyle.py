@@ -39,6 +39,10 @@ ABC = {"a": "#d55e00", "b": "#0072b2", "c": "#009e73"}
 NESTED = {"a": 3.4, "b": 2.2, "c": 1.0}
 """Line widths of the three phases: curves that coincide all stay visible."""
 DASHED = (0, (4, 2))
+PATCH = {"fc": "white", "ec": "none", "pad": 0.8}
+"""Ground of words that stand on curves."""
+OF_AXES = ("data", "axes fraction")
+"""Coordinates ``xycoords`` of a point whose height is a fraction of the axes."""
 
 STYLE = {
     "font.family": "DejaVu Sans",
@@ -114,6 +118,12 @@ def margins(fig: Figure, *, top: float = 0.18, bottom: float = 0.98) -> dict[str
 def title(ax: Axes, text: str, ink: str = INK) -> None:
     """Write a small bold title over the left end of the axes."""
     ax.set_title(text, loc="left", fontsize=9.5, fontweight="bold", color=ink, pad=6)
+
+
+def remark(ax: Axes, text: str, at: Any, shift: tuple[float, float], **more: Any) -> None:
+    """Write beside a point of the data, shifted by points; see :data:`OF_AXES`."""
+    look = {"fontsize": 8.2, "color": INK, "textcoords": "offset points", **more}
+    ax.annotate(text, at, xytext=shift, **look)
 
 
 def above(ax: Axes, text: str, ink: str, x: float = 0.5, **more: Any) -> None:

@@ -95,9 +95,13 @@ class Template:
             rows: values of each row.
             right: columns that are aligned to the right; all but the first by default.
         """
-        head, row = (_row(part) for part in self.raw(name).split("\n---\n"))
-        body = [[_FORMAT.vformat(c, (), r) for c in row] for r in rows]
+        head, *body = self.rows(name, rows)
         return markdown_table(head, body, right=range(1, len(head)) if right is None else right)
+
+    def rows(self, name: str, rows: Iterable[Mapping[str, Any]]) -> list[list[str]]:
+        """Return the heads of a block's table, and the cells of each row."""
+        head, row = (_row(part) for part in self.raw(name).split("\n---\n"))
+        return [head, *([_FORMAT.vformat(c, (), r) for c in row] for r in rows)]
 
 
 def _row(text: str) -> list[str]:

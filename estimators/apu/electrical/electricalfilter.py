@@ -57,8 +57,8 @@ from estimators.models.recording import SAME_TIME, Recording, plain_numbers
 __all__ = ["GAINS", "ElectricalFilter", "electrical_filter"]
 
 #: Harmonics that each channel consists of, for what is missing of it.
-HARMONICS_OF = {**dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3)),
-                **dict.fromkeys(("V_fd", "i_fd"), (0, 2))}  # fmt: skip
+HARMONICS_OF: dict[str, tuple[int, ...]] = dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3))
+HARMONICS_OF |= dict.fromkeys(("V_fd", "i_fd"), (0, 2))
 GAINS = ("none", "estimate", "consider")
 #: Phases onto the positive sequence; and the start of a leaky fault's admittance.
 TURN = np.exp(1j * np.array(list(PHASE_ANGLE.values())))

@@ -149,12 +149,7 @@ def _signals(
     what = "unknown course of a jump of the voltage, {} axis"
     W += [Signal(f"w_jump_{n}", "1", what.format(n)) for n in "qd0"]
     par = [*(ADMITTANCE if leaky else SHUNTS), *gain]
-    return (
-        Signals(X),
-        Signals([*U, *(PREDICTED if with_gains else ())]),
-        Signals(par),
-        Signals(W),
-    )
+    return (Signals(X), Signals([*U, *(PREDICTED if with_gains else ())]), Signals(par), Signals(W))
 
 
 class _Readings(NamedTuple):

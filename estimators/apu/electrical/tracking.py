@@ -105,19 +105,17 @@ def _usual(share: np.ndarray) -> np.ndarray:
     return out
 
 
+_COURSES = ("t", "mean", "variance", "innovation", "innovation_variance", "nis", "measured")
+
+
 def _piece(r: FilterResult, n: int) -> FilterResult:
     """Return the first n instants."""
-    return dataclasses.replace(
-        r, t=r.t[:n], mean=r.mean[:, :n], variance=r.variance[:, :n],
-        innovation=r.innovation[:, :n], innovation_variance=r.innovation_variance[:, :n],
-        nis=r.nis[:n], measured=r.measured[:n],
-    )  # fmt: skip
+    return dataclasses.replace(r, **{name: getattr(r, name)[..., :n] for name in _COURSES})
 
 
 def _joined(pieces: list[FilterResult]) -> FilterResult:
-    names = ("t", "mean", "variance", "innovation", "innovation_variance", "nis", "measured")
     joined: dict[str, Any] = {
-        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in names
+        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES
     }
     joined["loglik"] = sum(p.loglik for p in pieces)
     return dataclasses.replace(pieces[-1], **joined)

@@ -46,11 +46,9 @@ def linear_problem(
     state = np.zeros((len(model.x), len(JUMPS)))
     for c, j in enumerate(JUMPS):
         state[model.x.index(j.name), c] = 1.0
-    return linear_filter(
-        y, A=F, H=H, Q=Fw @ Fw.T + DT * np.diag(model.walk**2),
-        R=np.diag(np.square(sigma)) + Hw @ Hw.T, P0=prior.cov, cross=Fw @ Hw.T,
-        names=FAULTS, state=state,
-    )  # fmt: skip
+    Q, R = Fw @ Fw.T + DT * np.diag(model.walk**2), np.diag(np.square(sigma)) + Hw @ Hw.T
+    noise = {"Q": Q, "R": R, "P0": prior.cov, "cross": Fw @ Hw.T}
+    return linear_filter(y, A=F, H=H, **noise, names=FAULTS, state=state)
 
 
 @kept

@@ -14,15 +14,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit.apu import Apu
 from estimators.apu.sensors import GAS_PATH, SensorSet
 
-__all__ = [
-    "CLASSES",
-    "DEFAULT",
-    "FAULTS",
-    "SNAPSHOT",
-    "Hypothesis",
-    "Protocol",
-    "severity_of_loss",
-]
+__all__ = ["CLASSES", "DEFAULT", "FAULTS", "SNAPSHOT", "Hypothesis", "Protocol", "severity_of_loss"]
 
 DT = 0.02  # s
 HEALTH = GasGenerator.THETA.names
@@ -64,8 +56,10 @@ class Hypothesis:
         """Mean and variance of a normal distribution of sizes that covers the ranges."""
         mean = [float(np.mean(r)) for r in self.ranges]
         # sqrt(3) wider than the uniform one: the filter's start, divided out again afterwards
-        var = [3 * float(np.mean([(a * a + a * b + b * b) / 3 for a, b in r])) - 3 * m * m
-               for r, m in zip(self.ranges, mean, strict=True)]  # fmt: skip
+        var = [
+            3 * float(np.mean([(a * a + a * b + b * b) / 3 for a, b in r])) - 3 * m * m
+            for r, m in zip(self.ranges, mean, strict=True)
+        ]
         return np.array(mean), np.array(var)
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:

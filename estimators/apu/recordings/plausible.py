@@ -49,7 +49,15 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = ChainMap(
 )
 #: Quantities whose range holds zero: without a unit, a largest reading below this is not in SI.
 _SMALL = {"PW": 2e3}
-_TEMPERATURES = ("degC", "degF", "degR")
+#: What a quantity is read in, beside SI.
+_USUAL = {
+    "K": ("degC", "degF", "degR"),
+    "Pa": ("kPa", "bar", "psi", "hPa", "MPa"),
+    "rad/s": ("rpm",),
+    "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"),
+    "W": ("kW", "hp", "MW"),
+    "m": ("ft", "km"),
+}
 #: What loggers write for "no reading", where a range would let it pass.
 _SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
 
@@ -156,11 +164,8 @@ class Limits:
 
 def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
     """Return the units in which all the readings would be plausible."""
-    order = {"K": _TEMPERATURES, "Pa": ("kPa", "bar", "psi", "hPa", "MPa"), "rad/s": ("rpm",),
-             "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"), "W": ("kW", "hp", "MW"),
-             "m": ("ft", "km")}.get(si, ())  # fmt: skip
     found = []
-    for unit in order:
+    for unit in _USUAL.get(si, ()):
         _, factor, offset = UNITS[unit]
         v = raw * factor + offset
         if ((v >= low) & (v <= high)).all():

@@ -221,7 +221,7 @@ def _flux_matrix(w_r: float) -> np.ndarray:
     none = Qd0(0.0, 0.0, 0.0)
     for e in np.eye(6):
         lam = Windings(*e)
-        r = flux_rates(p, lam=lam, i=currents(p, lam), v=none, V_fd=0.0, w_r=w_r, w1=none,
-                       w2=(0.0, 0.0, 0.0))  # fmt: skip
+        still: dict[str, Any] = {"v": none, "V_fd": 0.0, "w1": none, "w2": (0.0, 0.0, 0.0)}
+        r = flux_rates(p, lam=lam, i=currents(p, lam), w_r=w_r, **still)
         columns.append([float(x) for x in r])
     return np.array(columns).T

@@ -1,0 +1,343 @@
+"""Transition matrices of the windings over a sample, for all rotor angles and nearby speeds.
+
+At constant speed the windings, and the load's own states, obey
+
+    dx/dt = A(theta) x + b(theta) E_fd + c(theta),    theta = theta_0 + w_r t,
+
+in the qd0 frame.  Their transition matrix over a sample h,
+
+    x(t + h) = P(theta(t)) [x; E; E'; E''; E'''; 1],     E(t + s) = E + s E' + ... + s^3/6 E''',
+
+is an analytic function of the rotor angle: its Fourier series is cut where it has converged to
+``TAIL``, and interpolated in speed.  A, b and c are derivatives of the model's own right-hand side:
+no equation is written again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
+from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.sharing import keep, kept
+from apu_casadi.machine.generatormodel import GeneratorModel
+
+TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
+STAGES = 8  # of the Radau method that P is made by; even where stiff its error falls as steps^-8
+STEP_TOL = 5e-7  # largest change of P, nominal units, when its steps are halved; then used: 2e-9
+HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goes on is refused
+EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
+SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
+NODES = 4  # Chebyshev nodes in speed
+
+
+@dataclass(frozen=True)
+class Split:
+    """Positions of the parts of a generator's state."""
+
+    linear: list[int]
+    slow: list[int]
+    angle: int
+    drive: int  # E_fd among all states
+
+
+def split(ss: GeneratorModel) -> Split:
+    """Return where windings, exciter and angle stand in the state."""
+    linear = ss.x.indices(ss.linear)
+    angle, drive = ss.x.index("theta_e"), ss.x.index("E_fd")
+    slow = [i for i in range(len(ss.x)) if i not in (*linear, angle)]
+    return Split(linear, slow, angle, drive)
+
+
+@kept
+def coefficients(ss: GeneratorModel) -> ca.Function:
+    """Function (theta_e, u, theta) -> augmented matrix M of d/dt [x; E; E'; E''; E'''; 1].
+
+    Checks that the model is linear in x and E where it is taken to be.
+    """
+    s = split(ss)
+    x, u, th = ca.SX.sym("x", len(ss.x)), ca.SX.sym("u", len(ss.u)), ca.SX.sym("t", len(ss.theta))
+    rate = ss.f(x, u, th)[s.linear]
+    own = ca.vertcat(x[s.linear], x[s.drive])
+    J = ca.jacobian(rate, own)
+    if any(ca.which_depends(ca.vec(ca.densify(J)), own, 1, True)):
+        raise NotApplicable(f"{ss.name} is not linear in its windings: use another integrator")
+    n = len(s.linear)
+    rest = ca.substitute(rate, own, ca.SX.zeros(n + 1))
+    M = ca.SX.zeros(n + EXTRA, n + EXTRA)
+    M[:n, : n + 1] = J
+    M[:n, -1] = rest
+    for k in range(n, n + EXTRA - 2):
+        M[k, k + 1] = 1
+    return ca.Function("M", [x[s.angle], u, th], [ca.densify(M)], {"cse": True})
+
+
+def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes in (0, 1], the last one 1, and Butcher matrix of a Radau IIA method."""
+    c = np.array(ca.collocation_points(stages, "radau"))
+    k = np.arange(stages)
+    return c, (c[:, None] ** (k + 1) / (k + 1)) @ np.linalg.inv(c[:, None] ** k)
+
+
+def _transition(
+    M_of: Any, theta0: np.ndarray, w: np.ndarray, h: np.ndarray, steps: int, leaps: int = 1
+) -> list[np.ndarray]:
+    """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Radau collocation.
+
+    All three arrays have the shape (angles,).  There are ``steps`` of the method in h, of order 15
+    (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch that settles
+    within nanoseconds, or an open generator, needs no smaller steps.
+
+    Returns:
+        One array for each leap, shape (angles, n, n + EXTRA): the rows of the windings.
+    """
+    c, a = _radau(STAGES)
+    hs, out = h / steps, []
+    X = np.empty(0)
+    for k in range(leaps * steps):
+        t = hs[:, None] * (k + c)
+        angles = theta0[:, None] + w[:, None] * t
+        M = M_of(angles.ravel(), np.repeat(w, STAGES))
+        n = M.shape[1] - EXTRA
+        M = M.reshape(theta0.size, STAGES, n + EXTRA, n + EXTRA)[:, :, :n]
+        drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
+        drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
+        drive[..., -1, -1] = 1.0
+        if k == 0:
+            X = np.broadcast_to(np.eye(n, n + EXTRA), (theta0.size, n, n + EXTRA))
+        by_h = hs[:, None, None]
+        G = -a[None, :, None, :, None] * M[:, None, :, :, :n].transpose(0, 1, 3, 2, 4)
+        G = G.reshape(theta0.size, STAGES, n, STAGES, n).reshape(theta0.size, STAGES * n, -1)
+        G = by_h * G + np.eye(STAGES * n)
+        rhs = np.repeat(X[:, None], STAGES, axis=1)
+        forced = M[..., n:] @ drive
+        forced = by_h * (a @ forced.reshape(theta0.size, STAGES, -1))
+        rhs[..., n:] += forced.reshape(*t.shape, n, EXTRA)
+        X = np.linalg.solve(G, rhs.reshape(theta0.size, STAGES * n, n + EXTRA))[:, -n:]
+        if (k + 1) % steps == 0:
+            out.append(X)
+    return out
+
+
+@kept
+def _coefficients_at(ss: GeneratorModel, count: int) -> Caller:
+    """:func:`coefficients` at ``count`` angles at once."""
+    return Caller(compiled(coefficients(ss).map(count), build=False))
+
+
+class Parity(NamedTuple):
+    """Which entries of a transition matrix repeat after half a turn, and which change their sign.
+
+    Half a turn reverses all phases.  The windings in the rotor's frame do not see that; the zero
+    sequence and the fault current, which belong to phases, change their sign.  So entries between
+    the two kinds have odd harmonics of the rotor angle only, all others even ones.
+
+    Args:
+        sign: 1 or -1 for each linear state, E and its derivatives, 1; shape (n + EXTRA,).
+        even, odd: positions of the entries, column by column, one leap after the other.
+    """
+
+    sign: np.ndarray
+    even: np.ndarray
+    odd: np.ndarray
+
+
+def parity(ss: GeneratorModel, leaps: int) -> Parity:
+    """Return the parity of the entries of ``leaps`` transition matrices (:class:`Strides`)."""
+    names = ss.linear
+    sign = np.array([-1.0 if k in ss.reversing else 1.0 for k in names] + [1.0] * EXTRA)
+    one = np.outer(sign, sign[: len(names)]).ravel()  # column by column
+    entries = np.tile(one, leaps)
+    return Parity(sign, np.flatnonzero(entries > 0), np.flatnonzero(entries < 0))
+
+
+_PROBE = np.array([0.1, 0.9, 2.3])  # rotor angles, rad, without any symmetry
+
+
+def _scale(ss: GeneratorModel) -> np.ndarray:
+    """Factors that make coefficients of all states comparable, shape (n + EXTRA, n + EXTRA)."""
+    nominal = np.append(ss.x.nominals[split(ss).linear], np.ones(EXTRA))
+    return np.asarray(nominal / nominal[:, None])
+
+
+def _scaled(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray) -> Any:
+    """Function (angles, speeds) -> matrices M of :func:`coefficients` in nominal units."""
+    n, iw, scale = len(ss.linear), ss.u.index("w_r"), _scale(ss)
+    full = ss.full(theta).reshape(-1, 1)
+
+    def M_of(angle: np.ndarray, w: np.ndarray) -> np.ndarray:
+        U = np.repeat(u[:, None], angle.size, axis=1)
+        U[iw] = w
+        TH = np.repeat(full, angle.size, axis=1)
+        out = _coefficients_at(ss.shared, angle.size)(angle.reshape(1, -1), U, TH)[0]
+        return np.asarray(out.reshape(-1, angle.size, n + EXTRA).transpose(1, 0, 2)) * scale
+
+    return M_of
+
+
+def symmetry(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray, w_rated: float) -> bool:
+    """Return whether the coefficients are constant; check that half a turn reverses the phases.
+
+    Raises:
+        NotApplicable: it does not, and :class:`Parity` would not hold.
+    """
+    M = _scaled(ss, u, theta)(np.append(_PROBE, _PROBE + np.pi), np.full(6, w_rated))
+    sign = parity(ss, 1).sign
+    turned = M[3:] * np.outer(sign, sign) - M[:3]
+    largest = np.abs(M).max()
+    if np.abs(turned).max() > 1e-9 * largest:
+        raise NotApplicable(
+            f"{ss.name}: half a turn does not reverse the phases; process noise in the zero "
+            "sequence? Use another integrator"
+        )
+    return bool(np.abs(M - M[0]).max() <= 1e-12 * largest)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Transition matrices of one load, fault and sample, as Fourier series in the rotor angle.
+
+    Args:
+        centre, half: middle and half width of the speed range, rad/s.
+        even, odd: coefficients, for entries of either :class:`Parity`, of cos k theta and sin k
+            theta in turn, k = 0, 2, 4, ... and 1, 3, 5, ...; each a polynomial in the relative
+            speed (w - centre)/half.  Shape (powers, terms, entries).
+        harmonics: number of the highest one; 0 where the angle does not matter, and ``odd`` is
+            empty.
+        error: largest change, in nominal units, when the steps were halved that it is made by.
+    """
+
+    centre: float
+    half: float
+    even: np.ndarray
+    odd: np.ndarray
+    harmonics: int
+    error: float
+
+    def at(self, w: float) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients at speed w, rad/s: even and odd, shape (terms, entries)."""
+        s = (w - self.centre) / self.half
+        powers = np.array([1.0, s, s * s, s * s * s])
+        even, odd = (
+            (powers @ part.reshape(NODES, -1)).reshape(part.shape[1:])
+            for part in (self.even, self.odd)
+        )
+        return even, odd
+
+
+def transition_table(
+    ss: GeneratorModel,
+    u: np.ndarray,
+    theta: np.ndarray,
+    w_rated: float,
+    *,
+    h: float | None = None,
+    angle: float | None = None,
+    leaps: int = 1,
+) -> Table:
+    """Compute the transition matrices for all rotor angles and nearby speeds.
+
+    Args:
+        ss, u, theta: model, inputs and fault parameters; ``w_r`` among the inputs does not matter.
+        w_rated: speed in the middle of the table, rad/s.
+        h, angle: length of a leap, in s or, at any speed, in rad of the rotor's turn.
+        leaps: the matrices are those over one leap, two leaps, and so on, one below the other.
+
+    Raises:
+        NotApplicable: the Fourier series or the steps do not converge, or a noise in the zero
+            sequence does not change its sign with the phases.
+    """
+    n = len(ss.linear)
+    centre, half = w_rated, SPEED_RANGE * w_rated
+    k = np.arange(NODES)
+    nodes = centre + half * np.cos(np.pi * (2 * k + 1) / (2 * NODES))
+    to_powers = np.linalg.inv(np.vander((nodes - centre) / half, NODES, increasing=True))
+    M_of = _scaled(ss, u, theta)
+    constant, kinds = symmetry(ss, u, theta, w_rated), parity(ss, leaps)
+
+    def length(w: np.ndarray) -> np.ndarray:
+        return angle / w if angle is not None else np.full(w.shape, h)
+
+    # the number of steps is doubled until the probes agree, then used for all angles
+    steps, error = 1, math.inf
+    probe = _PROBE[:1] if constant else _PROBE
+    slowest = np.full(probe.size, nodes.min())
+    last = _transition(M_of, probe, slowest, length(slowest), steps)[0]
+    while error > STEP_TOL:
+        if steps >= 64:
+            raise NotApplicable(
+                f"{ss.name}: transition matrices over {length(slowest)[0]:.3g} s do not converge "
+                f"(error {error:.1e} with {steps} steps)"
+            )
+        new = _transition(M_of, probe, slowest, length(slowest), 2 * steps)[0]
+        error = float(np.abs(new - last).max())
+        steps, last = 2 * steps, new
+
+    def sampled(angles: np.ndarray) -> np.ndarray:
+        """Entries in nominal units, column by column, leap after leap: (nodes, angles, entries)."""
+        a, w = np.tile(angles, NODES), np.repeat(nodes, angles.size)
+        P = np.stack(_transition(M_of, a, w, length(w), steps, leaps), axis=1)
+        return P.transpose(0, 1, 3, 2).reshape(NODES, angles.size, -1)
+
+    units = np.tile((1 / _scale(ss)[:n]).T.ravel(), leaps)
+
+    def powers(series: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Polynomials in speed from values at the nodes, shape (nodes, terms, entries); in SI."""
+        return np.tensordot(to_powers, series, 1) * units[which]
+
+    if constant:
+        P = sampled(np.zeros(1))
+        none = np.zeros((NODES, 0, kinds.odd.size))
+        return Table(centre, half, powers(P[:, :, kinds.even], kinds.even), none, 0, error)
+    turn = np.ones(kinds.even.size + kinds.odd.size)
+    turn[kinds.odd] = -1.0
+    for resolved in HARMONICS:
+        P = sampled(np.pi * np.arange(resolved) / resolved)
+        F = np.fft.rfft(np.concatenate([P, P * turn], axis=1), axis=1) / (2 * resolved)
+        size = np.abs(F).max(axis=(0, 2))
+        highest = int(np.nonzero(size > TAIL * size.max())[0][-1])
+        if highest < resolved - 1:
+            break
+    else:
+        raise NotApplicable(
+            f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s has over {highest} "
+            f"harmonics of the rotor angle above {TAIL:g}: the load is too light for this step"
+        )
+
+    def series(first: int, which: np.ndarray) -> np.ndarray:
+        part = F[:, first : highest + 1 : 2, which]
+        pairs = np.stack([2 * part.real, -2 * part.imag], axis=2)
+        if first == 0:
+            pairs[:, 0] /= 2
+        return powers(pairs.reshape(NODES, -1, which.size), which)
+
+    even, odd = series(0, kinds.even), series(1, kinds.odd)
+    return Table(centre, half, even, odd, highest, error)
+
+
+def cached_table(
+    ss: GeneratorModel,
+    u: np.ndarray,
+    theta: np.ndarray,
+    w_rated: float,
+    *,
+    h: float | None = None,
+    angle: float | None = None,
+    leaps: int = 1,
+) -> Table:
+    """Return a table of :func:`transition_table`, kept by all that it depends on."""
+    key_u = np.array(u, dtype=float)
+    key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
+    length = (None if h is None else round(h, 15), angle)
+    key = (key_u.tobytes(), theta.tobytes(), *length, w_rated, leaps)
+    return keep(
+        ss, Table, key,
+        lambda: transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps),
+        locked=False,
+    )  # fmt: skip
