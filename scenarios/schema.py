@@ -62,6 +62,7 @@ from scenarios.reading import (
     check_numbers,
     inside,
     limits,
+    load_parts,
     names_of,
     read_fault,
     read_load,
@@ -249,7 +250,7 @@ class Scenario(_Plain):
         """Check every value and the order of what happens."""
         put = object.__setattr__
         put(self, "extensions", _paths(self.extensions))
-        extensions.load(self.extensions)  # before what follows may name their parts
+        load_parts(self.extensions)  # before what follows may name their parts
         text_of(self.name, "name")
         only = "only letters, digits, '_' and '-', beginning with a letter or digit"
         require(_NAME.fullmatch(self.name) is not None, "name", f"{only}: {self.name!r}")

@@ -84,9 +84,10 @@ def ambient_line(given: Mapping[str, Any]) -> str:
 
 def parts(args: Namespace) -> None:
     """Load the files of ``--with``, whose parts can be named from then on."""
-    from scenarios import extensions
+    if args.extensions:
+        from scenarios.reading import load_parts
 
-    extensions.load(args.extensions)
+        load_parts(args.extensions)
 
 
 def engine(args: Namespace) -> GasGenerator:
