@@ -205,14 +205,12 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
     from apu_casadi.core.results import phase_summary
     from apu_casadi.unit.validity import found_in
 
-    try:
-        title = str(json.loads(ds.attrs["scenario"])["title"])
-    except (KeyError, TypeError, ValueError):
-        title = ""
+    scenario = _table(ds, "scenario")
     return {
         "scenario": name_of(ds),
-        "title": title,
+        "title": str(scenario.get("title", "")),
         "apu_casadi_version": str(ds.attrs.get("apu_casadi_version", "")),
+        **{k: scenario[k] for k in ("engine", "governor", "extensions") if k in scenario},
         **conditions(ds),
         "phases": phase_summary(ds),
         "validity": json.loads(ds.attrs.get("validity", "[]")),

@@ -153,9 +153,10 @@ def test_commands_take_them(files, capsys):
     assert main(["linearise", *load, "--no-figures", "--model", "gas"]) == 0
     assert "load of each generator: 200 kW; healthy" in capsys.readouterr().out
     path.write_text(RUN.replace('extensions = ["parts/my_parts.py"]\n', ""))
-    quick = ["--solver", "propagator", "--no-figures", "--quiet"]
+    quick = ["--solver", "propagator", "--no-figures", "--quiet", "--governor", "PI"]
     assert main(["run", str(path), "--with", str(parts), *quick]) == 0
-    assert "100 kW" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "100 kW" in said and "\ngovernor PI\n" in said
     argv = ["campaign", "--base", str(path), "--with", str(parts), "--runs", "1", "--out", "c"]
     assert main([*argv, "--workers", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["counts"]["done"] == 1
@@ -282,7 +283,11 @@ def test_every_command_takes_another_engine(other_engine, capsys):
     fuel = trim_gas_generator(made, {"N": made.parameters.N, "PW": 2e5})["Wf"]
     assert fuel > 1.03 * trim_gas_generator(GasGenerator(), {"N": 3775.147, "PW": 2e5})["Wf"]
     assert main(["trim", "--engine", "engine.toml", "--power", "2e5", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["outputs"]["Wf"] == pytest.approx(fuel, rel=1e-9)
+    report = json.loads(capsys.readouterr().out)
+    assert report["outputs"]["Wf"] == pytest.approx(fuel, rel=1e-9)
+    assert report["engine"] == "engine.toml"
+    assert main(["trim", "--engine", "engine.toml", "--power", "2e5"]) == 0
+    assert "health: healthy; engine engine.toml; apu-casadi" in capsys.readouterr().out
     deck = ["deck", "--altitude", "0", "--mach", "0", "--power", "2e5", "--engine", "engine.toml"]
     assert main(deck) == 0
     assert float(results.load("deck.nc")["Wf"].values.item()) == pytest.approx(fuel, rel=1e-9)

@@ -129,13 +129,19 @@ def scenario(args: Namespace, name: str) -> Scenario:
     s = registry.get(name)
     if args.extensions:
         s = s.change(extensions=(*s.extensions, *args.extensions))
-    asked = {n: getattr(args, n) for n in ("engine", "governor")}
-    return s.change(**{n: v for n, v in asked.items() if v is not None})
+    return s.change(**own(args))
 
 
-def program() -> str:
-    """Return name and version of the program, for results."""
-    return f"apu-casadi {installed()}"
+def own(args: Namespace) -> dict[str, str]:
+    """Return engine and governor where the options name them, for results."""
+    named = {n: getattr(args, n, None) for n in ("engine", "governor")}
+    return {n: v for n, v in named.items() if v is not None}
+
+
+def program(args: Namespace | None = None) -> str:
+    """Return name and version of the program, for results, after engine and governor if named."""
+    words = [f"{n} {v}" for n, v in own(args).items()] if args is not None else []
+    return "; ".join([*words, f"apu-casadi {installed()}"])
 
 
 def names(text: str) -> list[str]:

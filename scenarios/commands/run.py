@@ -115,6 +115,8 @@ def made_with(report: dict[str, Any]) -> list[str]:
             f"{'none' if report['seed'] is None else report['seed']}; apu-casadi "
             f"{report['apu_casadi_version']}"
         )
+    own = [f"{k} {report[k]}" for k in ("engine", "governor") if k in report]
+    lines += ["; ".join(own)] if own else []
     if error is not None:
         lines.append(exchange_words(error, report["exchange"], report["dt"]))
     left = ", ".join(
