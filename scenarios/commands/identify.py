@@ -186,6 +186,7 @@ def _report(
         "points": {n: _condition(n) for n in given.names(args.point)},
         "trial_seeds": [10_000, 10_000 + args.trials] if args.trials else None,
         "apu_casadi_version": installed(),
+        **given.own(args),
         "sentences": these.sentences(),
         "rank": these.rank,
         "rank_in_noise": these.rank_in_noise,
@@ -238,7 +239,8 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
         f"true speed and fuel flow unknown; efficiency behind PW known to {args.eta_bias:g} %; "
         "noise: estimators.apu.sensors.",
         *(f"{n}: {_condition_words(n)}; healthy engine" for n in given.names(args.point)),
-        given.program() + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
+        given.program(args)
+        + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
     ]
 
 
