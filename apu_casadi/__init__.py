@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu, trim
     from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
-    from apu_casadi.unit.multirate import Noise, simulate_joint
+    from apu_casadi.unit.multirate import simulate_joint
+    from apu_casadi.unit.noise import Noise
 
     __version__: str
 
@@ -62,7 +63,7 @@ _HOME = {
     "Generator": "apu_casadi.machine.generator",
     "HealthChange": "apu_casadi.unit.events",
     "LoadChange": "apu_casadi.unit.events",
-    "Noise": "apu_casadi.unit.multirate",
+    "Noise": "apu_casadi.unit.noise",
     "OpenLoad": "apu_casadi.machine.loads.open",
     "OperatingPoint": "apu_casadi.gaspath.steady.steadypoint",
     "SeriesLoad": "apu_casadi.machine.loads.series",
@@ -76,20 +77,10 @@ _HOME = {
 }
 
 
-def _version() -> str:
-    """Return the installed version; "unknown" in a checkout that is not installed."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("apu-casadi")
-    except PackageNotFoundError:
-        return "unknown"
-
-
 def __getattr__(name: str) -> Any:
     """Load a public name from its module, once."""
     if name == "__version__":
-        value: Any = _version()
+        value: Any = import_module("apu_casadi.core.version").installed()
     elif name in _HOME:
         value = getattr(import_module(_HOME[name]), name)
     else:

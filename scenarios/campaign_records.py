@@ -19,18 +19,19 @@ from pathlib import Path
 from typing import Any
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.gaspath.health import HEALTH
 
 RUNS = "runs.jsonl"
 STATUS = ("done", "refused", "failed", "invalid", "crashed")
 """What became of a run: refused, no steady start; failed, the simulation stopped; invalid, a wrong
 scenario or parameter; crashed, an unforeseen error or the loss of the process."""
 
-COLUMNS = (
-    "start", "end", "window", "N_rpm", "PW_kW", "Wf", "SFC", "T3", "P3_kPa", "T4", "T5",
-    "SM_percent", "V_a_rms", "V_b_rms", "V_c_rms", "I_a_rms", "I_b_rms", "I_c_rms", "P_e",
-    "P_loss_fault", "N_rpm_min", "N_rpm_max", "T4_max", "SM_percent_min", "f_eta_c", "f_W_c",
-    "f_eta_t", "f_W_t", "mu", "k_rf", "kappa", "h",
-)  # fmt: skip
+_COLUMNS = f"""
+start end window N_rpm PW_kW Wf SFC T3 P3_kPa T4 T5 SM_percent V_a_rms V_b_rms V_c_rms I_a_rms
+I_b_rms I_c_rms P_e P_loss_fault N_rpm_min N_rpm_max T4_max SM_percent_min
+{" ".join(HEALTH)} mu k_rf kappa h
+"""
+COLUMNS = tuple(_COLUMNS.split())
 """Numbers of :func:`apu_casadi.core.results.phase_summary` that are kept of each phase."""
 _MAY_BE_NONE = {"k_rf", "kappa"}  # healthy
 _log = logging.getLogger("apu_casadi")
@@ -118,17 +119,14 @@ def read(path: Path, asked: Mapping[str, tuple[str, int]]) -> dict[str, dict[str
         if record["key"] in asked:
             found[record["key"]] = record
     if damaged:
-        _log.warning(
-            "%s: %d damaged %s left out (%s); their runs are made again",
-            path, damaged, "line" if damaged == 1 else "lines", first,
-        )  # fmt: skip
+        lines = "line" if damaged == 1 else "lines"
+        told = "%s: %d damaged %s left out (%s); their runs are made again"
+        _log.warning(told, path, damaged, lines, first)
         _rewrite(path, b"".join(sound))
     return found
 
 
-def _parsed(
-    text: bytes, asked: Mapping[str, tuple[str, int]]
-) -> tuple[dict[str, Any], str]:  # fmt: skip
+def _parsed(text: bytes, asked: Mapping[str, tuple[str, int]]) -> tuple[dict[str, Any], str]:
     """Return the record of a line, and what is wrong with it or ""."""
     total, _, body = text.partition(b" ")
     if _sum(body) != total:

@@ -33,9 +33,12 @@ import numpy as np
 
 from apu_casadi.core import interrupts
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
+from apu_casadi.core.version import installed
+from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, registry
 from scenarios.campaign_records import COLUMNS, RUNS, STATUS
-from scenarios.schema import FaultSpec, Scenario
+from scenarios.extensions import digest
+from scenarios.schema import Scenario
 from scenarios.shell.locking import locked
 from scenarios.shell.workers import pool, stoppable
 
@@ -84,7 +87,7 @@ def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> l
     if n < 1 or seed < 0:
         raise ScenarioError(f"a campaign needs n >= 1 runs and a seed >= 0, got {n} and {seed}")
     sick = next((i for i, p in enumerate(s.phases) if isinstance(p.health, Mapping)), None)
-    short = next((i for i, p in enumerate(s.phases) if isinstance(p.fault, FaultSpec)), None)
+    short = next((i for i, p in enumerate(s.phases) if isinstance(p.fault, Ttsc)), None)
     if sick is None or short is None:
         what = "a phase with health factors" if sick is None else "a phase with a fault"
         raise ScenarioError(f"scenario {s.name!r} lacks {what} to draw at random")
@@ -242,7 +245,7 @@ def run_campaign(
 
 
 def _check(scenarios: Sequence[Scenario], workers: int | None, solver: str) -> None:
-    from apu_casadi.unit.multirate import SOLVERS
+    from apu_casadi.unit.integrators import SOLVERS
 
     if not scenarios:
         raise ScenarioError("a campaign needs at least one scenario")
@@ -289,15 +292,15 @@ def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
 
     table = s.to_dict()
     # the same numbers from the same program: a changed model runs its campaign again
-    content = json.dumps([table, solver, package_digest()], sort_keys=True)
+    files = [digest(path) for path in s.extensions]
+    files += [digest(s.engine, "engine file")] if s.engine else []
+    content = json.dumps([table, solver, package_digest(), *files], sort_keys=True)
     return _Task(hashlib.sha256(content.encode()).hexdigest()[:32], table, solver, keep)
 
 
-def _records(
-    tasks: Sequence[_Task], workers: int | None
-) -> Generator[dict[str, Any], None, None]:  # fmt: skip
+def _records(tasks: Sequence[_Task], workers: int | None) -> Generator[dict[str, Any]]:
     """Yield the records of all tasks, in the order in which they end."""
-    from apu_casadi.core.backend import available_threads
+    from apu_casadi.core.calling import available_threads
 
     n = min(available_threads() if workers is None else workers, len(tasks))
     if n <= 1:
@@ -311,15 +314,12 @@ def _records(
         again: list[_Task] = []
         yield from _pooled([t], 1, again)
         if again:
-            yield {
-                "key": t.key, "name": t.table["name"], "status": "crashed", "seconds": math.nan,
-                "reason": "the process ended without an answer (killed, out of memory?)",
-            }  # fmt: skip
+            why = "the process ended without an answer (killed, out of memory?)"
+            lost = {"key": t.key, "name": t.table["name"], "status": "crashed", "reason": why}
+            yield lost | {"seconds": math.nan}
 
 
-def _pooled(
-    tasks: list[_Task], workers: int, suspects: list[_Task]
-) -> Iterator[dict[str, Any]]:  # fmt: skip
+def _pooled(tasks: list[_Task], workers: int, suspects: list[_Task]) -> Iterator[dict[str, Any]]:
     """Yield records of tasks run by a pool; those under way when a process died go to suspects."""
     waiting = tasks[::-1]
     fruitless = 0
@@ -403,13 +403,19 @@ _UNITS: Mapping[str, tuple[str, str]] = {
 }
 
 
-def _dataset(
-    scenarios: Sequence[Scenario], records: Sequence[Mapping[str, Any]], solver: str
-) -> xr.Dataset:  # fmt: skip
+_OF_RUNS: Mapping[str, tuple[str, str]] = {
+    "seconds": ("s", "wall time of the run"),
+    "residual": ("1", "largest scaled residual of the gas path equations in the run"),
+    "exchange_error": ("1", "estimated exchange error, of the speed's excursion"),
+}
+
+Runs = Sequence[Mapping[str, Any]]
+
+
+def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Dataset:
     import xarray as xr
 
     from apu_casadi.core.results import CHANNELS
-    from apu_casadi.unit import runrecord
 
     n, m = len(records), max(len(s.phases) for s in scenarios)
     rows = [r.get("phases", ()) for r in records]
@@ -428,41 +434,28 @@ def _dataset(
         now = "-"
         for j, p in enumerate(s.phases):
             if p.fault is not None:
-                now = p.fault.phase if isinstance(p.fault, FaultSpec) else "-"
+                now = str(getattr(p.fault, "phase", "-"))
             label[i, j], fault[i, j] = p.name[:64], now
-    data["phase_name"] = (("run", "phase"), label, {"long_name": "name of the phase"})
-    data["fault_phase"] = (
-        ("run", "phase"), fault, {"long_name": "phase a, b or c with the short circuit; - healthy"}
-    )  # fmt: skip
+    phases, runs = ("run", "phase"), "run"
+    words = "phase a, b or c with the short circuit; - healthy"
+    data["phase_name"] = (phases, label, {"long_name": "name of the phase"})
+    data["fault_phase"] = (phases, fault, {"long_name": words})
     status = np.array([STATUS.index(r["status"]) for r in records], dtype=np.int8)
-    data["status"] = (
-        "run",
-        status,
-        {
-            "long_name": "what became of the run",
-            "flag_values": list(range(len(STATUS))),
-            "flag_meanings": " ".join(STATUS),
-        },
-    )
-    data["reason"] = (
-        "run", np.array([r["reason"] or "-" for r in records]), {"long_name": "of no result"}
-    )  # fmt: skip
+    flags = {"flag_values": list(range(len(STATUS))), "flag_meanings": " ".join(STATUS)}
+    data["status"] = (runs, status, {"long_name": "what became of the run", **flags})
+    reasons = [r["reason"] or "-" for r in records]
+    data["reason"] = (runs, np.array(reasons), {"long_name": "of no result"})
     said = ["; ".join(r.get("warnings", ())) or "-" for r in records]
-    data["warnings"] = (
-        "run", np.array(said), {"long_name": "what must be known of the run; - nothing"}
-    )  # fmt: skip
+    words = "what must be known of the run; - nothing"
+    data["warnings"] = (runs, np.array(said), {"long_name": words})
     seeds = [-1 if s.seed is None else s.seed for s in scenarios]
-    data["seed"] = ("run", np.array(seeds, dtype=np.int32), {"long_name": "of the noise; -1 none"})
-    for k, unit, doc in (
-        ("seconds", "s", "wall time of the run"),
-        ("residual", "1", "largest scaled residual of the gas path equations in the run"),
-        ("exchange_error", "1", "estimated exchange error, of the speed's excursion"),
-    ):
+    data["seed"] = (runs, np.array(seeds, dtype=np.int32), {"long_name": "of the noise; -1 none"})
+    for k, (unit, doc) in _OF_RUNS.items():
         a = np.array([r.get(k, np.nan) for r in records], dtype=float)
-        data[k] = ("run", a, {"units": unit, "long_name": doc})
+        data[k] = (runs, a, {"units": unit, "long_name": doc})
     days = {json.dumps(dataclasses.asdict(s.ambient)) for s in scenarios}
-    made = {"solver": solver, "runs": n, "apu_casadi_version": runrecord.installed(),
-            "ambient": days.pop() if len(days) == 1 else "differs from run to run"}  # fmt: skip
+    made = {"solver": solver, "runs": n, "apu_casadi_version": installed()}
+    made["ambient"] = days.pop() if len(days) == 1 else "differs from run to run"
     coords = {"run": [s.name for s in scenarios], "phase": np.arange(m, dtype=np.int32)}
     return xr.Dataset(data, coords=coords, attrs=made)
 

@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.errors import ScenarioError, nearest
 from apu_casadi.core.sharing import last, once
+from scenarios.extensions import digest
 from scenarios.schema import Scenario
 from scenarios.shell import jsontext
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.unit.apu import Apu
 
 Progress = Callable[[float, float], None]
@@ -76,7 +78,7 @@ def run(
     *,
     out: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
-    solver: str = "cvodes",
+    solver: str = "auto",
     phasors: bool = False,
     **overrides: Any,
 ) -> xr.Dataset:
@@ -86,7 +88,7 @@ def run(
         scenario: a description, a name of the library, or a file.
         out: folder for the netCDF file, the figures and the summary; None writes nothing.
         progress: called with the simulated and the total time [s].
-        solver: ``"cvodes"``, ``"idas"`` or the fast ``"propagator"``: see
+        solver: ``"auto"``, ``"cvodes"``, ``"idas"`` or ``"propagator"``: see
             :func:`apu_casadi.unit.multirate.simulate_joint`.
         phasors: keep the fundamental phasors of voltages and currents of each exchange step.
         overrides: attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
@@ -109,20 +111,49 @@ def run(
     return ds
 
 
+def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
+    """Return the engine that a file describes; None is the paper's.
+
+    Raises:
+        DataError: the file cannot be read; ParameterError, MapError : what it says cannot be.
+    """
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+
+    if path is None:
+        return GasGenerator()
+    from apu_casadi.gaspath.engines import read_engine
+
+    return read_engine(Path(path))
+
+
 @last(4)
-def unit_of(parameters: str) -> Apu:
-    """Return the unit with some parameters changed (JSON); kept, since building takes longer."""
+def unit_of(parameters: str = "{}", engine: str | None = None, content: str = "") -> Apu:
+    """Return the unit with some parameters changed, and another engine if one is given.
+
+    The last few are kept, since building takes longer.
+
+    Args:
+        parameters: values by dotted name, a JSON table.
+        engine: file of the engine.
+        content: its digest, so that a file that has changed is read again.
+    """
     from apu_casadi.unit.apu import Apu
 
-    return Apu().change(json.loads(parameters))
+    unit = Apu() if engine is None else Apu(gas_generator=engine_of(engine))
+    return unit.change(json.loads(parameters))
+
+
+def unit_for(s: Scenario) -> Apu:
+    """Return the unit that a scenario is about."""
+    parameters = json.dumps(dict(s.parameters), sort_keys=True)
+    return unit_of(parameters, *([s.engine, digest(s.engine, "engine file")] if s.engine else []))
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:
     from apu_casadi.unit.multirate import simulate_joint
 
-    apu = unit_of(json.dumps(dict(s.parameters), sort_keys=True))
     return simulate_joint(
-        apu,
+        unit_for(s),
         duration=s.duration,
         **s.start(),
         ambient=s.ambient,
@@ -130,7 +161,7 @@ def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool
         dt=s.dt,
         exchange=s.exchange,
         waveform_dt=s.waveform_dt,
-        noise=None if s.noise is None else s.noise.build(),
+        noise=s.noise,
         seed=s.seed,
         solver=solver,
         phasors=phasors,

@@ -27,7 +27,7 @@ from scenarios.commands import calibrate as command
 
 @pytest.fixture(scope="module")
 def defaults():
-    return calibrate(command.uncalibrated(), command.published_points(), command.FREE)
+    return calibrate(command.uncalibrated(GasGenerator()), command.published_points(), command.FREE)
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def test_command_with_a_file(gg, tmp_path, capsys):
 
 def test_text_of_the_command(defaults):
     """The printed table names each number and each row fitted."""
-    text = command.text(defaults)
+    text = command.text(defaults, command.in_use(GasGenerator(), defaults.names))
     for name in defaults.names:
         assert f"{name} " in text
     assert "0 degrees of freedom" in text and "Table 5" in text

@@ -14,11 +14,12 @@ import pytest
 
 from apu_casadi.core import results
 from apu_casadi.core.errors import DataError, ScenarioError, SimulationError
+from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, campaigns, registry
-from scenarios.campaign_records import COLUMNS
-from scenarios.campaigns import RUNS, counts, random_faults, run_campaign
+from scenarios.campaign_records import COLUMNS, RUNS
+from scenarios.campaigns import counts, random_faults, run_campaign
 from scenarios.cli import main
-from scenarios.schema import FaultSpec, Scenario
+from scenarios.schema import Scenario
 from scenarios.shell import workers
 from scenarios.shell.locking import locked
 
@@ -56,7 +57,7 @@ def test_draws_depend_on_seed_and_index_alone(base):
     assert random_faults(1, 8, base=base)[0].phases[1] != long[0].phases[1]
     assert len({s.name for s in long}) == 40
     faults = [s.phases[2].fault for s in long]
-    assert all(isinstance(f, FaultSpec) and f.mu <= f.kappa <= 1 for f in faults)
+    assert all(isinstance(f, Ttsc) and f.mu <= f.kappa <= 1 for f in faults)
     assert {f.phase for f in faults} == set("abc")
     full = sum(f.kappa == f.mu for f in faults)
     assert 0 < full < 40

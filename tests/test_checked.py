@@ -15,7 +15,7 @@ from apu_casadi.core.checked import array, number
 from apu_casadi.core.errors import ApuError, SignalError
 from apu_casadi.core.simulation import simulate
 from apu_casadi.gaspath.calibration import CalibrationPoint
-from apu_casadi.gaspath.cycle import GasGeneratorParameters
+from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, LoadLaw
 from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
@@ -29,7 +29,8 @@ from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
-from apu_casadi.unit.multirate import Noise, simulate_joint
+from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.noise import Noise
 from estimators.detection.cusum import cusum_test
 from estimators.filters.ukf import PointSet
 from estimators.models.filtermodel import Unknown
@@ -53,7 +54,7 @@ def test_real_numbers_are_taken_in_every_dress(value):
     assert_array_equal(array("x", value).ravel(), [2.0])
 
 
-@pytest.mark.parametrize("value", NOT_NUMBERS, ids=lambda v: repr(v)[:30])
+@pytest.mark.parametrize("value", NOT_NUMBERS, ids=lambda v: repr(v)[:15])
 def test_what_is_no_number_is_refused_by_name(value):
     """NumPy and float() turn text, booleans, dates and masked values into numbers silently."""
     for f in (number, array):

@@ -21,7 +21,7 @@ from apu_casadi.gaspath.conditions import (
     assumed_words,
     day_words,
 )
-from apu_casadi.gaspath.cycle import GasGeneratorParameters
+from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.steady.steadypoint import Limits, Status
 from apu_casadi.gaspath.steady.trimbatch import performance_deck
 from apu_casadi.machine.loads.series import SeriesLoad

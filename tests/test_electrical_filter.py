@@ -33,11 +33,12 @@ from estimators.apu.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
-from scenarios.studies.electrical.detection import detection
+from estimators.information.consistency import nees
+from scenarios.studies import catalogue
+from scenarios.studies.electrical.alarms import chance_of_alarm
+from scenarios.studies.electrical.delays import detection
 from scenarios.studies.electrical.efficiency import efficiency
-from scenarios.studies.electrical.false_alarms import _chance
 from scenarios.studies.electrical.leaky import shunt_information
-from scenarios.studies.electrical.parts import run
 from scenarios.studies.electrical.protocol import (
     DETECT,
     DT,
@@ -46,7 +47,6 @@ from scenarios.studies.electrical.protocol import (
     FULL_UNBALANCED,
     PART,
 )
-from scenarios.studies.electrical.scores import nees
 from scenarios.studies.electrical.truth import (
     chances,
     drawn_gains,
@@ -480,30 +480,32 @@ def test_chance_of_an_alarm_by_the_tail():
     """Maxima with P(> z) = exp(-(z^2 - 2.5^2)/2) from 2.5 on: the chance is that, the shape 1."""
     n = 4000
     tops = np.sqrt(2.5**2 - 2 * np.log((np.arange(n) + 0.5) / n))
-    tail = _chance(tops, 25.0)
+    tail = chance_of_alarm(tops, 25.0)
     assert tail["runs_beyond"] == n
     assert tail["chance_per_run"] == pytest.approx(math.exp(-(25 - 2.5**2) / 2))
     # quantiles at mid-points: the mean of -log over n of them is 1 within log(2)/(2 n)
     assert tail["shape"] == pytest.approx(1.0, abs=1e-3)
-    none = _chance(np.array([1.0, 2.0]), 25.0)
+    none = chance_of_alarm(np.array([1.0, 2.0]), 25.0)
     assert none["chance_per_run"] == 0.0
     assert none["shape"] is None
     json.dumps(none, allow_nan=False)
 
 
-def test_studies_give_json(monkeypatch):
+def test_studies_give_json(monkeypatch, tmp_path):
     """Studies at their smallest; numbers are judged elsewhere."""
     monkeypatch.setitem(EFFICIENCY, "duration", 0.02)
     monkeypatch.setitem(DETECT, "matched", (1e-4, 4))
-    monkeypatch.setattr("scenarios.studies.electrical.detection.WAIT", 0.02)
+    monkeypatch.setattr("scenarios.studies.electrical.delays.WAIT", 0.02)
     one = efficiency(2, 0, cases=["matched"])
     two = detection(2, 0, cases=["matched"])
     assert "nees_h" in json.dumps(one)
     assert json.loads(json.dumps(two))["matched"]["n_seeds"] == 2
-    with pytest.raises(ParameterError, match="did you mean 'leaky'"):
-        run(2, studies=["leak"])
-    with pytest.raises(EstimationError, match="2 at least"):
-        run(1)
+    with pytest.raises(ParameterError, match="did you mean 'matched'"):
+        detection(2, cases=["matchd"])
+    with pytest.raises(ParameterError, match="did you mean 'electrical'"):
+        catalogue.run("electrica", tmp_path, n_seeds=2)
+    with pytest.raises(ParameterError, match="2 at least"):
+        catalogue.run("electrical", tmp_path, n_seeds=1)
 
 
 @pytest.mark.slow

@@ -24,12 +24,13 @@ from scenarios import cli
 from scenarios.commands import estimate as command
 from scenarios.figures.jointestimateplot import NAMES, plot_joint_estimate
 from scenarios.pages import estimation_page
-from scenarios.pages.reports import REPORTS
 from scenarios.schema import Scenario
 from scenarios.shell.locking import locked
 from scenarios.studies import catalogue, fingerprint, jointrun
-from scenarios.studies.correctness import correctness
-from scenarios.studies.gaspath_study import FRESH
+from scenarios.studies.estimation import files, names
+from scenarios.studies.estimation.correctness import correctness
+from scenarios.studies.gaspath.course import FRESH
+from scenarios.studies.registration import Results, Study, plain
 
 ONSET_HEALTH, ONSET_H = 1.0, 2.0
 PHASES = [{"name": "healthy", "start": 0.0, "end": 1.0},
@@ -114,7 +115,7 @@ def test_the_table_marks_what_lies_outside():
 
 
 def test_a_figure_is_drawn_from_what_is_saved(tmp_path):
-    kept = json.loads(json.dumps(catalogue._plain(jointrun.saved(made()))))
+    kept = json.loads(json.dumps(plain(jointrun.saved(made()))))
     path = jointrun.draw(kept, tmp_path / "a.png")
     assert path.stat().st_size > 20_000
     wrong = {f"{n}{e}": np.zeros(3) for n in NAMES for e in ("", "_sigma", "_true")}
@@ -180,9 +181,12 @@ def toy(monkeypatch):
         return run
 
     toy_fails = []
-    parts = {"a": catalogue.Part(part("a"), 1, 1), "b": catalogue.Part(part("b"), 1, 1, share=0.1),
-             "c": catalogue.Part(part("c"), 1, 0, share=None)}  # fmt: skip
-    study = catalogue.Study("correctness", "t", "g", parts, ("electrical",))
+    filters = catalogue.get("correctness").filters
+    modules = {"electrical": ("estimators.apu.electrical",)}
+    study = Study("correctness", title="t", goal="g", modules=modules, filters=filters)
+    study.part("a", start=1, each=1)(part("a"))
+    study.part("b", start=1, each=1, share=0.1)(part("b"))
+    study.part("c", start=1, share=None)(part("c"))
     monkeypatch.setitem(catalogue.STUDIES, "correctness", study)
     return study, ran, toy_fails
 
@@ -213,7 +217,7 @@ def test_other_constants_make_all_parts_pending(toy, tmp_path, monkeypatch):
     study, *_ = toy
     catalogue.run("correctness", tmp_path, n_seeds=40)
     assert catalogue.pending(study, tmp_path, 40) == []
-    monkeypatch.setattr(catalogue, "constants", lambda m: {"Q": 2.0})
+    monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: {"Q": 2.0})
     assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
 
 
@@ -231,7 +235,7 @@ def test_other_seeds_make_a_part_pending_and_are_printed_as_they_were(toy, tmp_p
     # the study itself with seeds that are not today's
     kept = {"seeds": 9, "reduction": 0.6, "interval": [0.5, 0.7], "null_rmse": [0.01, 0.02]}
     part = {"seeds": [1, 9], "result": {"seeds": 9, "snapshot": kept, "transient": kept}}
-    said = REPORTS["shaft-power"].claims(catalogue.Results({"filter": part}))
+    said = catalogue.get("shaft-power").report.claims(Results({"filter": part}))
     assert {c.seeds for c in said} == {"9 from 1"}
 
 
@@ -246,7 +250,7 @@ def test_parts_made_with_other_filters_are_named(toy, tmp_path, capsys, monkeypa
     said = catalogue.other_code(study, record)
     assert "made with other code: a (--again" in said
     assert said.endswith("not known whether made with this code: b, c")
-    monkeypatch.setattr(catalogue, "digest", lambda name: "of tomorrow")
+    monkeypatch.setattr(Study, "digest", lambda self: "of tomorrow")
     line = ["estimate", "study", "correctness", "--seeds", "40", "--out", str(tmp_path), "--quiet"]
     assert cli.main(line) == 0
     assert "correctness: kept\n  made with other code: all parts (--ag" in capsys.readouterr().out
@@ -254,23 +258,23 @@ def test_parts_made_with_other_filters_are_named(toy, tmp_path, capsys, monkeypa
 
 def test_the_digest_of_the_filters_sees_a_constant_and_no_name():
     """Two models built alike are one; another step, another constant are not."""
-    assert set(fingerprint.FUNCTIONS) == set(catalogue.STUDIES)
-    assert fingerprint.digest("correctness") == fingerprint.digest_of(
-        fingerprint.FUNCTIONS["correctness"]()
-    )
+    for name, study in catalogue.STUDIES.items():
+        assert study.filters is not list, f"{name} names no filters"
+    study = catalogue.get("correctness")
+    assert study.digest() == fingerprint.digest(study.filters())
     x, y = ca.SX.sym("x"), ca.SX.sym("x")
     one, same, other = (ca.Function("f", [v], [c * v]) for v, c in ((x, 2), (y, 2), (x, 2.0001)))
-    digests = [fingerprint.digest_of([f]) for f in (one, same, other)]
+    digests = [fingerprint.digest([f]) for f in (one, same, other)]
     assert digests[0] == digests[1] != digests[2]
 
 
 def test_constants_are_those_in_capitals():
-    found = catalogue.constants("estimators.apu.electrical")
+    found = fingerprint.constants("estimators.apu.electrical")
     assert found["FAULT_LEVEL"] == FAULT_LEVEL and "H_WALK" in found
     assert "window_lengths" not in found
-    assert catalogue.constants("estimators.apu.joint")["TEST"]["margin"] > 1
+    assert fingerprint.constants("estimators.apu.joint")["TEST"]["margin"] > 1
     # of a package: those of its modules together
-    isolation = catalogue.constants("estimators.apu.isolation")
+    isolation = fingerprint.constants("estimators.apu.isolation")
     assert isolation["METHODS"] and isolation["SUBSTEPS"] and isolation["DEFAULT"]["every"]
     for s in catalogue.STUDIES.values():
         json.dumps(s.fixed(), allow_nan=False)
@@ -282,7 +286,7 @@ def test_wrong_studies_and_files(tmp_path):
     with pytest.raises(ParameterError, match="2 at least"):
         catalogue.run("speed", tmp_path, n_seeds=1)
     with pytest.raises(DataError, match="JSON cannot hold"):
-        catalogue._plain({"a": object()})
+        plain({"a": object()})
     (tmp_path / "speed.json").write_text("[]")
     with pytest.raises(DataError, match="does not hold the study"):
         catalogue.read(catalogue.get("speed"), tmp_path)
@@ -339,7 +343,8 @@ def test_two_processes_do_not_run_a_study_twice(toy, tmp_path, caplog):
 
 
 def test_names_on_the_command_line_are_the_studies():
-    assert tuple(catalogue.STUDIES) == command.NAMES
+    assert set(catalogue.STUDIES) == set(names())
+    assert [n.replace("-", "_") for n in names()] == files()  # a study is the file of its name
 
 
 @pytest.mark.parametrize(

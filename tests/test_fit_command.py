@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import DataError, ParameterError, SignalError
-from apu_casadi.gaspath.gasgenerator import RPM
+from apu_casadi.gaspath.designdata import RPM
 from estimators.apu import fitting
 from estimators.apu.sensors import GAS_PATH
 from scenarios.cli import main

@@ -13,7 +13,8 @@ from apu_casadi.core.errors import (
     SignalError,
     SimulationError,
 )
-from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator, GasGeneratorParameters
+from apu_casadi.gaspath.designdata import RPM, GasGeneratorParameters
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.maps.mapfiles import read_map, shipped, write_map_csv
 from apu_casadi.gaspath.steady.trimming import initialise, trim_gas_generator
 

@@ -15,21 +15,12 @@ from apu_casadi.core.errors import DataError, EstimationError, ParameterError
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu import gaspath
-from estimators.apu.gaspath import (
-    DT,
-    HEALTH,
-    OUTPUTS,
-    JumpTest,
-    gas_path_filter,
-    gas_path_model,
-    null_direction,
-    samples,
-    track_jumps,
-    whitened,
-    window_means,
-)
+from estimators.apu.gaspath import gas_path_filter, null_direction, samples, window_means
+from estimators.apu.gaspathmodel import DT, GOVERNOR, HEALTH, OUTPUTS, gas_path_model
+from estimators.apu.healthjumps import JumpTest, track_jumps, whitened
 from estimators.filters.filtering import FilterResult
-from scenarios.studies import gaspath_study
+from scenarios.studies.gaspath import course, enginetruth, montecarlo
+from scenarios.studies.gaspath.chance import LinearReference
 
 GG = GasGenerator()
 FAULTY = {"f_eta_c": 0.99, "f_W_c": 0.985, "f_eta_t": 0.99, "f_W_t": 1.02}
@@ -149,7 +140,7 @@ def test_fuel_follows_its_governor_within_a_step():
     x = np.append(point.x, np.ones(4))
     u = dict(Wf=point["Wf"], PW=222e3, dT_isa=5.0)
     N = {}
-    for name, law in (("held", None), ("governed", gaspath.GOVERNOR)):
+    for name, law in (("held", None), ("governed", GOVERNOR)):
         model = gas_path_model(GG, gains=(), governed=law)
         N[name] = float(model.transition(x, model.u.pack(u), [], np.zeros(len(model.w)), DT)[0][0])
     power = (N["held"] - N["governed"]) * point["N"] * GG.parameters.J / DT
@@ -377,14 +368,14 @@ def test_what_does_not_fit_is_refused(plain):
 
 
 def test_cases_are_drawn_from_the_prior_or_from_the_faults_stated():
-    f = gas_path_filter(GG, eta=gaspath_study.ETA_SIGMA, consider_eta=False)
+    f = gas_path_filter(GG, eta=course.ETA_SIGMA, consider_eta=False)
     rng = np.random.default_rng(1)
-    matched = [gaspath_study.draw(rng, f, matched=True) for _ in range(400)]
+    matched = [course.draw(rng, f, matched=True) for _ in range(400)]
     # standard error of a standard deviation of 400 numbers is 3.5 %; of the four factors, 1.8 %
     assert np.std([c.health for c in matched]) == pytest.approx(gaspath.HEALTH_SIGMA, rel=0.06)
     assert np.std([c.jump for c in matched]) == pytest.approx(gaspath.JUMP, rel=0.06)
     assert np.std([c.gains["P3"] for c in matched]) == pytest.approx(f.sigma["gain_P3"], rel=0.15)
-    other = [gaspath_study.draw(rng, f, matched=False) for _ in range(100)]
+    other = [course.draw(rng, f, matched=False) for _ in range(100)]
     sizes = np.abs([c.jump for c in other])
     assert set((sizes > 0).sum(1)) == {1, 2, 3, 4}
     assert sizes[sizes > 0].min() >= 0.01 and sizes.max() <= 0.04
@@ -394,7 +385,7 @@ def test_cases_are_drawn_from_the_prior_or_from_the_faults_stated():
 @pytest.mark.slow
 def test_matched_filter_is_efficient_and_consistent():
     """Goals 2 and 3 on 40 tuning seeds; the study shows them on 500 others."""
-    r = gaspath_study.efficiency(range(1, 41), matched=True)
+    r = montecarlo.efficiency(range(1, 41), matched=True)
     assert r["ratio_max"] < 1.2 + 3 * r["ratio_stderr"]
     assert r["nees_inside"] >= 0.9 and r["nis_inside"] >= 0.9
     null = r["null"]["claimed_over_limit"]
@@ -409,12 +400,12 @@ def test_matched_filter_is_efficient_and_consistent():
 def test_chance_alone_gives_chi_squared():
     """Errors and covariances of the linear reference belong together: drawn as it is assumed, the
     mean NEES of 600 seeds is 4 within three standard errors, sqrt(8/600), at each instant."""
-    f = gas_path_filter(GG, eta=gaspath_study.ETA_SIGMA, consider_eta=False)
-    chance, rng = gaspath_study.LinearReference(f), np.random.default_rng(8)
-    model, K = f.model, round(gaspath_study.DURATION / DT) + 1
+    f = gas_path_filter(GG, eta=course.ETA_SIGMA, consider_eta=False)
+    chance, rng = LinearReference(f), np.random.default_rng(8)
+    model, K = f.model, round(course.DURATION / DT) + 1
     told = np.zeros((len(model.w), 1))
     told[model.w.indices([f"w_{n}" for n in HEALTH])] = 1  # drawn where the filter is told to jump
-    jump = np.arange(K) == round(gaspath_study.FAULT / DT) - 1
+    jump = np.arange(K) == round(course.FAULT / DT) - 1
     sigma, walk = f.prior().sigma, np.sqrt(DT) * model.walk[:, None]
     for _ in range(600):
         w = rng.standard_normal((len(model.w), K)) * np.where(told, jump, 1.0)
@@ -428,16 +419,16 @@ def test_chance_alone_gives_chi_squared():
 
 def test_chance_is_refused_where_the_noise_is_not_known(plain):
     t, values = truth_of(steady(), 5)
-    case = gaspath_study.Case(np.ones(4), np.zeros(4), {})
+    case = course.Case(np.ones(4), np.zeros(4), {})
     with pytest.raises(EstimationError, match="matched truths only"):
-        gaspath_study.LinearReference(plain).add(
-            gaspath_study.Truth(t, values), case, plain.measured(t, values, None)
+        LinearReference(plain).add(
+            enginetruth.Truth(t, values), case, plain.measured(t, values, None)
         )
 
 
 @pytest.mark.slow
 def test_mismatched_filter_finds_the_jumps():
     """Goal 2 with other engines, faults of 1-4 %, gain errors."""
-    r = gaspath_study.efficiency(range(1, 41), matched=False)
+    r = montecarlo.efficiency(range(1, 41), matched=False)
     assert r["ratio_max"] < 1.5
     assert r["missed"] == 0 and r["false_alarms"] == 0

@@ -18,14 +18,16 @@ from estimators.apu.identify import BASE, CANDIDATES, gas_path
 from estimators.filters.belief import Belief
 from estimators.information.bounds import posterior_bound
 from estimators.information.identifiability import (
-    Sensitivities,
     compare_sensors,
     identify,
     noncentrality,
+    which_to_add,
+)
+from estimators.information.sensitivities import (
+    Sensitivities,
     recording_sensitivities,
     steady_sensitivities,
     together,
-    which_to_add,
 )
 
 

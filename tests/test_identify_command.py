@@ -16,6 +16,7 @@ from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
 from estimators.apu import identify as study
+from estimators.apu import severity
 from estimators.information.identifiability import identify
 from scenarios.cli import main
 from scenarios.figures.estimationplot import plot_gain_of_a_sensor
@@ -158,7 +159,7 @@ def test_wrong_numbers_are_refused():
     with pytest.raises(ParameterError, match="samples >= 1, prior > 0"):
         study.gas_path(samples=0)
     with pytest.raises(ParameterError, match="periods >= 1 and k_rf > 0"):
-        study.severity(Ttsc(0.05, 0.0))
+        severity.severity(Ttsc(0.05, 0.0))
 
 
 # ---------------------------------------------------------------------- severity
@@ -213,7 +214,7 @@ def test_the_shunt_is_what_the_faulty_machine_shows():
     Z = fault.R_shunt(GEN.machine) + 1j * w * fault.L_shunt(GEN.machine)
     assert abs(fault.mu * I + V / Z) < 5e-3 * abs(V / Z)
     # and the function behind the study is that closed form
-    shunt = study._shunt(GEN)
+    shunt = severity.shunt_current(GEN)
     args = (math.log(0.02), math.log(3.0), 1.0, 230.0, w)
     found = np.array([float(shunt(*args, s)[0]) for s in t[:25]])
     phasor = -math.sqrt(2) * 230 / Z * np.exp(1j * w * t[:25])
@@ -224,7 +225,7 @@ def test_the_shunt_is_what_the_faulty_machine_shows():
 def test_exact_sensitivities_are_finite_differences_of_the_current(kappa):
     """Central differences with a step of 1e-5 in the logarithms: 1e-8 of the largest."""
     fault = Ttsc(0.03, 2.0, kappa)
-    g, _ = study.severity(fault, gain_error=False)
+    g, _ = severity.severity(fault, gain_error=False)
     at = GEN.steady_state(LOAD)
     w = float(at.u[0])
     t = 1e-4 * np.arange(len(g.rows))
@@ -244,7 +245,7 @@ def test_exact_sensitivities_are_finite_differences_of_the_current(kappa):
 
 def test_kappa_decides_whether_mu_and_k_rf_can_be_known():
     """kappa = mu is a ridge; a known larger kappa removes it; an unknown one brings it back."""
-    rows = study.severity_study([(0.05, 1.0), (0.01, 10.0)])
+    rows = severity.severity_study([(0.05, 1.0), (0.01, 10.0)])
     for s in rows:
         tied = s.fault.kappa == s.fault.mu
         assert s.rank == (1 if tied else 2)
@@ -253,7 +254,7 @@ def test_kappa_decides_whether_mu_and_k_rf_can_be_known():
         if not tied:
             assert s.rank_with_kappa == 2  # of three
     # the ridge is the direction of constant h: d log h = 0
-    found = identify(study.severity(Ttsc(0.05, 1.0))[0])
+    found = identify(severity.severity(Ttsc(0.05, 1.0))[0])
     v = found.invisible[:2, 0]
     dlog_h = v[0] * (1 + 0.05 / 1.95) - v[1] / 1.95
     assert abs(dlog_h) < 1e-9

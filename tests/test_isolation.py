@@ -34,7 +34,7 @@ from estimators.apu.isolation.problem import (
 from estimators.apu.isolation.scores import cohen_kappa, scores
 from estimators.apu.isolation.truth import simulate_windows, windows_of_engines
 from estimators.apu.isolation.windowmodel import model_of
-from scenarios.studies import isolation_study
+from scenarios.studies.estimation import isolation
 
 SHORT = Protocol(before=0.4, after=0.8, spread=0.2)
 BY_NAME = {c.name: i for i, c in enumerate(CLASSES)}
@@ -260,7 +260,7 @@ def test_one_filter_tells_a_clear_fault(gg):
         (lambda: cohen_kappa(np.array([[5, 0], [0, 0]])), "not defined"),
         (lambda: log_box(np.ones(3), np.eye(3), []), "one or two sizes"),
         (lambda: isolate(None, methods=["glp"]), "did you mean 'glr'"),
-        (lambda: isolation_study.run(1, studies=["watchd"]), "did you mean 'watched'"),
+        (lambda: isolation.watched("watchd", GasGenerator()), "did you mean 'watched'"),
     ],
 )
 def test_refusals(call, words):
@@ -272,16 +272,16 @@ def test_every_sweep_has_its_curve():
     """Figures of a result of the right form, whatever its numbers."""
     s = scores(5 * np.eye(len(CLASSES), dtype=int))
     result = {
-        "studies": {name: {"bank": s, "limit": s} for name in isolation_study.STUDIES},
+        **{name: {"bank": s, "limit": s} for name in isolation.STUDIES},
         "sweeps": {
             name: [{"change": c, "value": v, "kappa": 0.9, "kappa_95": [0.8, 0.95]}
                    for c, values in changes.items() for v in values]
-            for name, _, changes in isolation_study.SWEEPS
+            for name, _, changes in isolation.SWEEPS
         },
     }  # fmt: skip
-    made = isolation_study.figures(result)
-    assert set(made) == {"isolation_confusion", "isolation_limit"}
-    curves = made["isolation_limit"].axes
+    made = dict(isolation.figures(result).values())
+    assert set(made) == {"estimation_confusion.png", "estimation_limit.png"}
+    curves = made["estimation_limit.png"]().axes
     assert [len(ax.lines[-1].get_xdata()) for ax in curves] == [6, 5, 5, 6]
 
 
@@ -289,8 +289,8 @@ def test_every_sweep_has_its_curve():
 def test_the_study_on_a_few_windows():
     """Goal 6 of the estimation work on 22 windows: kappa 0.8 at least, near the limit."""
     with use_backend("c"):
-        r = isolation_study.isolation_study(2, 5000, limit_draws=20, limit_points=1)
-        lost = isolation_study.isolation_study(2, 5000, SNAPSHOT, limit_draws=20, limit_points=1)
+        r = isolation.isolation_study(2, 5000, limit_draws=20, limit_points=1)
+        lost = isolation.isolation_study(2, 5000, SNAPSHOT, limit_draws=20, limit_points=1)
     json.dumps([r, lost])
     for m in ("glr", "bank", "limit"):
         assert r[m]["kappa"] >= 0.8, m

@@ -14,7 +14,7 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.gaspath import HEALTH
+from estimators.apu.gaspathmodel import HEALTH
 from estimators.apu.joint import (
     electrical_samples,
     estimate_joint,

@@ -7,7 +7,8 @@ import pytest
 
 from apu_casadi.core.errors import MapError
 from apu_casadi.gaspath.maps import mapcheck
-from apu_casadi.gaspath.maps.mapfiles import MapTable, read_map, shipped, write_map_csv
+from apu_casadi.gaspath.maps.mapfiles import read_map, shipped, write_map_csv
+from apu_casadi.gaspath.maps.maptable import MapTable
 
 MAPS = {n: shipped(n) for n in ("axi5", "lpt2269")}
 COLUMNS = ("W", "PR", "eta")

@@ -10,15 +10,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from apu_casadi.core.errors import DataError, MapError
-from apu_casadi.gaspath.maps.mapfiles import (
-    SHIPPED,
-    MapTable,
-    read_map,
-    read_map_csv,
-    read_map_gasturb,
-    shipped,
-    write_map_csv,
-)
+from apu_casadi.gaspath.maps.gasturbmaps import read_map_gasturb
+from apu_casadi.gaspath.maps.mapfiles import SHIPPED, read_map, read_map_csv, shipped, write_map_csv
+from apu_casadi.gaspath.maps.maptable import MapTable
 
 N = np.array([0.5, 0.7, 0.9, 1.0, 1.1])
 BETA = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.2])

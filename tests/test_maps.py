@@ -13,7 +13,8 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from apu_casadi.core.errors import MapError, ParameterError
-from apu_casadi.gaspath.maps.mapfiles import SHIPPED, MapTable, shipped
+from apu_casadi.gaspath.maps.mapfiles import SHIPPED, shipped
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.maps.scaledmaps import (
     MapCalibration,
     MapPoint,

@@ -15,7 +15,7 @@ from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.meanstep import MeanStep
-from apu_casadi.unit.machinestep import MEANS
+from apu_casadi.unit.stepmeans import MEANS
 
 GEN = Generator()
 W = GEN.machine.w_rated

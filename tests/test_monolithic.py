@@ -15,8 +15,11 @@ from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.exchange import EXCHANGES
+from apu_casadi.unit.integrators import ramped
 from apu_casadi.unit.monolithic import joint_state_space, simulate_monolithic
-from apu_casadi.unit.multirate import EXCHANGES, Noise, ramped, simulate_joint
+from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.noise import Noise
 
 APU = Apu()
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)

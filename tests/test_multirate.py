@@ -13,7 +13,8 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
-from apu_casadi.unit.multirate import Noise, exchange_grid, simulate_joint
+from apu_casadi.unit.multirate import exchange_grid, simulate_joint
+from apu_casadi.unit.noise import Noise
 
 APU = Apu()
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)
@@ -27,7 +28,7 @@ def run():
         HealthChange(0.2, {"f_eta_c": 0.99}),
         FaultChange(0.3137, Ttsc(0.05, 20.0)),
     ]
-    return simulate_joint(APU, duration=0.5, load=KW225, events=events)
+    return simulate_joint(APU, duration=0.5, load=KW225, events=events, solver="cvodes")
 
 
 def test_nothing_moves_before_the_first_event(run):

@@ -40,6 +40,7 @@ def test_thin(path):
             assert not bad, f"{path.name} defines {bad}"
 
 
+@pytest.mark.ci  # a kernel and a fresh interpreter for each: half a minute
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_runs(path, tmp_path, monkeypatch):
     """Every cell runs in a fresh kernel of this interpreter, in an empty folder."""

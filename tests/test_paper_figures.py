@@ -9,7 +9,7 @@ import pytest
 
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.results import RPM
-from scenarios.figures import plotting
+from scenarios.figures.moduleplots import MODULE_FIGURES
 from scenarios.pages import errata_page, validation_page
 from scenarios.validation import comparison, paper_figures
 from scenarios.validation.comparison import Row
@@ -69,7 +69,7 @@ def test_unknown_choices_are_refused_with_the_nearest():
 def test_figures_15_to_19_are_written(tmp_path):
     """PNG, 1600 px wide, in the paper's order."""
     made = paper_figures.write_figures(tmp_path, joint=False)
-    assert [p.stem for p in made] == list(plotting.MODULE_FIGURES)
+    assert [p.stem for p in made] == list(MODULE_FIGURES)
     for path in made:
         head = path.read_bytes()[:24]
         assert head[1:4] == b"PNG" and struct.unpack(">I", head[16:20])[0] == 1600

@@ -7,7 +7,7 @@ import pytest
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.parameters import Parameters, par
-from apu_casadi.gaspath.gasgenerator import GasGeneratorParameters
+from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from apu_casadi.unit.apu import Apu, CouplingParameters

@@ -31,7 +31,8 @@ from apu_casadi.core import backend, sharing
 from apu_casadi.core.errors import BackendError
 from apu_casadi.core.simulation import stepper
 from apu_casadi.gaspath.gasgenerator import MapChoice
-from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.gaspath.maps.mapfiles import shipped
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import Propagator
 from estimators.batch.fit import FitProblem
@@ -291,6 +292,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.ci  # starts a cluster; joblib and spawn, above, send the same models
 def test_dask(tmp_path):
     """A local cluster of threads and one of processes, in a process of its own."""
     pytest.importorskip("distributed")

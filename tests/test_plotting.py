@@ -10,6 +10,7 @@ from synthetic_joint import synthetic_joint
 
 from apu_casadi.core.errors import DataError
 from scenarios.figures import plotting
+from scenarios.figures.threephase import cycle_rms, envelope
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def test_files_are_1600_pixels_wide(ds, tmp_path):
 
 @pytest.mark.parametrize("key", plotting.FIGURES)
 def test_phases_units_and_caption_are_on_every_figure(ds, key):
-    fig = plotting._DRAW[key](ds)
+    fig = plotting.DRAW[key](ds)
     words = texts(fig)
     for name in ("design point", "load drop", "gas-path fault", "TTSC fault"):
         assert name in words
@@ -56,7 +57,7 @@ def test_phase_names_do_not_overlap_or_leave_the_figure(ds, key):
             for n, a, b in zip(names, starts, starts[1:], strict=False)
         ]
     )
-    fig = plotting._DRAW[key](ds)
+    fig = plotting.DRAW[key](ds)
     fig.canvas.draw()
     boxes = [t.get_window_extent() for t in fig.axes[0].texts if t.get_fontweight() == "bold"]
     assert len(boxes) == 6
@@ -69,21 +70,21 @@ def test_envelope_loses_no_peak():
     t = np.arange(100_003) * 50e-6
     y = np.sin(2 * np.pi * 400 * t)
     y[77_777] = 9.0
-    x, lo, hi = plotting.envelope(t, y, 1000)
+    x, lo, hi = envelope(t, y, 1000)
     assert x.shape == lo.shape == hi.shape == (1000,)
     assert hi.max() == 9.0 and lo.min() == y.min()
     assert abs(x[hi.argmax()] - t[77_777]) < t[101]
-    assert plotting.envelope(t[:3], y[:3], 1000)[0].shape == (3,)
+    assert envelope(t[:3], y[:3], 1000)[0].shape == (3,)
 
 
 @pytest.mark.parametrize("f", [400.0, 413.7])
 def test_cycle_rms_does_not_ripple_off_rated_speed(f):
     t = np.arange(4000) * 50e-6
-    x, rms = plotting.cycle_rms(t, 325.0 * np.sin(2 * np.pi * f * t + 0.3))
+    x, rms = cycle_rms(t, 325.0 * np.sin(2 * np.pi * f * t + 0.3))
     assert rms == pytest.approx(325.0 / np.sqrt(2), rel=1e-4)
     assert np.diff(x) == pytest.approx(1 / f, rel=1e-3)
-    assert plotting.cycle_rms(t, np.ones_like(t))[0].size == 0
-    assert plotting.cycle_rms(t, np.sin(2 * np.pi * f * t + 0.3), 8)[0].size == x.size - 7
+    assert cycle_rms(t, np.ones_like(t))[0].size == 0
+    assert cycle_rms(t, np.sin(2 * np.pi * f * t + 0.3), 8)[0].size == x.size - 7
 
 
 def test_envelope_is_drawn_and_not_every_sample(ds):

@@ -6,13 +6,15 @@ import types
 
 import pytest
 
-from apu_casadi.core.errors import ApuError, ScenarioError
+from apu_casadi.core.errors import ApuError, ParameterError, ScenarioError
+from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
 from scenarios import registry
-from scenarios.schema import Change, FaultSpec, LoadSpec, Phase, Scenario
+from scenarios.reading import read_fault, read_load
+from scenarios.schema import Change, Phase, Scenario
 
 GOOD = """
 name = "mine"
@@ -75,18 +77,17 @@ def test_library_has_joint_first():
 
 
 def test_every_kind_of_load_is_built_in_si_units():
-    assert LoadSpec("open").build() == OpenLoad()
-    assert LoadSpec("constant_power", power_kW=100, lag_ms=4).build() == ConstantPowerLoad(
+    assert read_load({"kind": "open"}) == OpenLoad()
+    assert read_load({"kind": "constant_power", "power_kW": 100, "lag_ms": 4}) == ConstantPowerLoad(
         100e3, tau=4e-3
     )
-    assert LoadSpec("RL", power_kW=90.0, power_factor=0.8).build() == SeriesLoad.from_power(
-        90e3, 0.8
-    )
-    series = LoadSpec("series", R_ohm=(0.7, 0.8, 0.9), L_mH=(0.1, 0.1, 0.1)).build()
+    lagging = read_load({"kind": "RL", "power_kW": 90.0, "power_factor": 0.8})
+    assert lagging == SeriesLoad.from_power(90e3, 0.8)
+    series = read_load({"kind": "series", "R_ohm": (0.7, 0.8, 0.9), "L_mH": (0.1, 0.1, 0.1)})
     assert series.R == (0.7, 0.8, 0.9)
     inductances = series.L
     assert inductances == pytest.approx((1e-4, 1e-4, 1e-4))
-    uneven = LoadSpec("R", power_kW=90.0, unbalance=(1.1, 1.0, 0.9)).build()
+    uneven = read_load({"kind": "R", "power_kW": 90.0, "unbalance": (1.1, 1.0, 0.9)})
     assert uneven == SeriesLoad.from_power(90e3, unbalance=(1.1, 1.0, 0.9))
 
 
@@ -175,8 +176,7 @@ def test_ambient_and_events_are_checked_in_place():
 
 def test_noise_is_a_table_of_standard_deviations():
     noise = read(GOOD + "[noise]\nN = 0.1\ngas = { T3 = 1.0 }\nterminal = { sigma_v = 0.5 }").noise
-    built = noise.build()
-    assert (built.N, built.gas, built.terminal.sigma_v) == (0.1, {"T3": 1.0}, 0.5)
+    assert (noise.N, noise.gas, noise.terminal.sigma_v) == (0.1, {"T3": 1.0}, 0.5)
     assert "noise.terminal.sigma_V: unknown key (did you mean 'sigma_v'?)" in refusal(
         GOOD + "[noise]\nterminal = { sigma_V = 0.5 }"
     )
@@ -202,7 +202,7 @@ def test_python_file(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(
         "from scenarios.schema import *\n"
-        "scenario = Scenario('mine', 4.0, (Phase('a', 0.0, load=LoadSpec('open')),))\n"
+        "scenario = Scenario('mine', 4.0, (Phase('a', 0.0, load={'kind': 'open'}),))\n"
     )
     assert registry.get(path).name == "mine"
     path.write_text("import tomllib\nscenario = tomllib.loads('''" + GOOD + "''')\n")
@@ -219,12 +219,16 @@ def test_python_file(tmp_path):
 
 
 def test_classes_check_as_files_do():
-    with pytest.raises(ScenarioError, match=r"a LoadSpec is expected"):
+    with pytest.raises(
+        ScenarioError, match=r"load: a Load, or a table with kind, is expected, got 225"
+    ):
         Phase("a", 0.0, load=225.0)
     with pytest.raises(ScenarioError, match=r"must be > 0 s, got 0"):
         Change(0.0, fault="none")
     with pytest.raises(ScenarioError, match=r"k_rf: must be >= 0, got -1"):
-        FaultSpec(0.05, -1.0)
+        read_fault({"mu": 0.05, "k_rf": -1.0})
+    with pytest.raises(ParameterError, match=r"k_rf = -1 must be >= 0"):
+        Ttsc(0.05, -1.0)
     with pytest.raises(ScenarioError, match=r"has no 'wavform_dt' \(did you mean 'waveform_dt'"):
         registry.get("quiet").change(wavform_dt=None)
 

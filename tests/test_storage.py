@@ -18,8 +18,9 @@ from apu_casadi.core import netcdf3, results, runstorage
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.filearrays import File, RowFile, lazy
 from apu_casadi.machine.measurement import MeasurementNoise
-from apu_casadi.unit import multirate
-from apu_casadi.unit.multirate import Noise
+from apu_casadi.unit import recorder
+from apu_casadi.unit.noise import Noise
+from apu_casadi.unit.stepmeans import StepMeans
 
 LONG = 200_000
 
@@ -230,7 +231,7 @@ def in_memory():
 
 @pytest.mark.parametrize("piece", [11, 1 << 15])
 def test_a_run_kept_in_a_file_has_the_same_bits(in_memory, piece, tmp_path, monkeypatch):
-    monkeypatch.setattr(multirate, "PIECE", piece)
+    monkeypatch.setattr(recorder, "PIECE", piece)
     ds = simulate_joint(Apu(), storage=tmp_path, **KW)
     assert list(ds.variables) == list(in_memory.variables) and ds.attrs == in_memory.attrs
     for name, v in in_memory.variables.items():
@@ -245,13 +246,15 @@ def test_a_run_kept_in_a_file_has_the_same_bits(in_memory, piece, tmp_path, monk
 @pytest.mark.parametrize("storage", ["memory", "file"])
 def test_the_last_instant_is_at_hand_wherever_results_are(storage, tmp_path, monkeypatch):
     """An error in the middle of a long run tells of the instant before."""
-    monkeypatch.setattr(multirate, "PIECE", 11)
+    monkeypatch.setattr(recorder, "PIECE", 11)
     gg, K = Apu().gas_generator, 25
     n = len(gg.Y)
     where = "memory" if storage == "memory" else tmp_path
-    book = multirate._Book(gg, np.arange(K) * 0.02, 0, 9, where)
+    book = recorder.Recorder(gg, np.arange(K) * 0.02, 0, StepMeans(Apu().generator, False), where)
     for k in range(K):
-        book.put(k, np.arange(n) + 100.0 * k, np.full(9, 4.0 * k), dict.fromkeys("abcd", 1.0), None)
+        y, factors = np.arange(n) + 100.0 * k, dict.fromkeys("abcd", 1.0)
+        row = recorder.Row(y, np.full(9, 4.0 * k), factors, None, np.zeros(1), np.zeros((11, 1)))
+        book.put(k, 1, row)
         assert book.last().tolist() == (np.arange(n) + 100.0 * k).tolist()
     rows = book.instants()
     assert np.asarray(rows[gg.Y.names[2]]).tolist() == [2 + 100.0 * k for k in range(K)]

@@ -13,7 +13,8 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.unit import validity as v
 from apu_casadi.unit.monolithic import simulate_monolithic
-from apu_casadi.unit.multirate import Noise, simulate_joint
+from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.noise import Noise
 from scenarios import cli, registry
 from scenarios.campaigns import run_campaign
 from scenarios.schema import Scenario

@@ -62,7 +62,7 @@ __all__ = [
     "use_backend",
 ]
 
-log = logging.getLogger("apu_casadi")
+log: logging.Logger = logging.getLogger("apu_casadi")
 
 BACKENDS = ("auto", "vm", "c")
 FLAGS = ("-fPIC", "-shared", "-fno-math-errno")  # no -ffast-math, because NaN must survive

@@ -19,7 +19,7 @@ from pathlib import Path
 
 __all__ = ["cache_folder", "unsafe", "unsafe_file"]
 
-log = logging.getLogger("apu_casadi")
+log: logging.Logger = logging.getLogger("apu_casadi")
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _LINKS = 40  # symbolic links followed at most, as the kernel does
 _said: set[str] = set()

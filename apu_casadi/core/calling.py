@@ -8,6 +8,7 @@ so threads gain what the cores give.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -29,6 +30,10 @@ class Buffers:
     """
 
     __slots__ = ("_buffer", "evaluate", "inputs", "outputs", "ret")
+    evaluate: Callable[[], None]
+    ret: Callable[[], int]
+    inputs: list[np.ndarray]
+    outputs: list[np.ndarray]
 
     def __init__(
         self, fun: ca.Function, arguments: tuple[int, ...], results: tuple[int, ...]
@@ -187,7 +192,7 @@ class Mapped:
         if wide:
             raise BackendError(f"{fun.name()}: {', '.join(wide)} must be columns to be mapped")
         self.fun = fun
-        self.n_threads = max(1, available_threads() if n_threads is None else int(n_threads))
+        self.n_threads: int = max(1, available_threads() if n_threads is None else int(n_threads))
         # chunks are multiples of the thread count; the last one is filled up with its last column
         sizes = sorted({max(1, c) for c in (16, 128, chunk) if c <= chunk} | {chunk})
         self._sizes = sorted({-(-c // self.n_threads) * self.n_threads for c in sizes})

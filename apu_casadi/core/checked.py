@@ -74,7 +74,9 @@ def array(
     if type(value) is float:
         return np.asarray(value)
     if isinstance(value, np.ma.MaskedArray) and np.any(np.ma.getmaskarray(value)):
-        raise error(f"{name}: {int(np.ma.count_masked(value))} of {value.size} values are masked")
+        raise error(
+            f"{name}: {int(np.ma.getmaskarray(value).sum())} of {value.size} values are masked"
+        )
     wrong = _no_number(value)
     if wrong is not None:
         raise error(f"{name} must be {what}, got {_shown(wrong)}")

@@ -45,6 +45,10 @@ class SimulationError(ApuError, RuntimeError):
     """An integration or an implicit step failed, or its re-evaluated residual is too large."""
 
 
+class NotApplicable(SimulationError):  # noqa: N818 - not a failure
+    """An integrator cannot take a step, or is not made for it; says why.  Another one may."""
+
+
 class ScenarioError(ApuError, ValueError):
     """A scenario description has an unknown key or an impossible value."""
 

@@ -31,7 +31,8 @@ class File:
 
     def __init__(self, f: IO[bytes], name: str) -> None:
         """Take over an open binary file; ``name`` is for messages."""
-        self._f, self.name = f, name
+        self._f = f
+        self.name: str = name
         self._lock = threading.Lock()
 
     def read(self, offset: int, size: int) -> bytearray:
@@ -97,7 +98,8 @@ def read(
     """
     native = dtype.newbyteorder("=")
     if not shape:
-        return np.frombuffer(file.read(offset, dtype.itemsize), dtype).astype(native)[0]
+        scalar = np.frombuffer(file.read(offset, dtype.itemsize), dtype)
+        return np.asarray(scalar.astype(native)[0])
     first, *rest = key
     n, row = shape[0], int(np.prod(shape[1:], dtype=np.int64))
     one = not isinstance(first, slice)
@@ -192,7 +194,7 @@ class RowFile:
     ) -> None:
         """Make the file, with all the room that it needs where the system can say so."""
         place = Path(tempfile.gettempdir() if folder is None else folder)
-        self.size = 8 * sum(lengths.values())
+        self.size: int = 8 * sum(lengths.values())
         try:
             f = tempfile.TemporaryFile(dir=place, prefix="apu-casadi-", buffering=0)  # noqa: SIM115
             if hasattr(os, "posix_fallocate") and self.size:
@@ -202,7 +204,7 @@ class RowFile:
                 f"{place}: no temporary file of {self.size / 2**20:.0f} MiB can be made there: "
                 f"{e.strerror or e}"
             ) from e
-        self.file = File(f, f"temporary file in {place}")
+        self.file: File = File(f, f"temporary file in {place}")
         ends = np.cumsum([0, *lengths.values()])
         self._rows = {
             name: (int(8 * at), n) for (name, n), at in zip(lengths.items(), ends, strict=False)

@@ -44,6 +44,11 @@ def own(yes: bool) -> None:
     _owned = yes
 
 
+def owned() -> bool:
+    """Return whether a handler that records is in force for good."""
+    return _owned
+
+
 def check() -> None:
     """Raise KeyboardInterrupt if a signal is recorded."""
     if _recorded:

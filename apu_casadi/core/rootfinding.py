@@ -46,6 +46,13 @@ class Newton:
         tol: largest acceptable max-norm of r.
     """
 
+    scale: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    tol: float
+    max_iterations: int
+    max_step: float
+
     def __init__(
         self,
         residual: ca.Function,

@@ -23,7 +23,7 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar, cast, overload
 
 import casadi as ca
 
@@ -84,9 +84,12 @@ if hasattr(os, "register_at_fork"):
     )
 
 
+_IDENTITY: Any = object.__hash__
+
+
 def _by_identity(owner: Any) -> bool:
     """Whether nothing else can be equal to ``owner``."""
-    return isinstance(owner, ca.Function) or type(owner).__hash__ is object.__hash__
+    return isinstance(owner, ca.Function) or type(owner).__hash__ is _IDENTITY
 
 
 def twin(owner: Any) -> Any:
@@ -116,7 +119,8 @@ def _find(owner: Any) -> Store:
     own = owner.__dict__
     with _TABLES:
         if _by_identity(owner):
-            return own.setdefault(_STORE, Store())
+            own_store: Store = own.setdefault(_STORE, Store())
+            return own_store
         key = object.__new__(type(owner))
         key.__dict__.update({f.name: getattr(owner, f.name) for f in dataclasses.fields(owner)})
         store = _stores.get((type(owner), key))
@@ -161,7 +165,7 @@ def keep(
                 with _TABLES:
                     if key in table:
                         table.move_to_end(key)
-            return found
+            return cast(T, found)
     store = _store_of(owner)
     if locked:
         with BUILDING:
@@ -173,7 +177,7 @@ def _entered(store: Store, which: Hashable, key: Hashable, make: Callable[[], T]
     with _TABLES:
         table = store.results.setdefault(which, OrderedDict())
         if key in table:
-            return table[key]
+            return cast(T, table[key])
     made = make()
     with _TABLES:
         made = table.setdefault(key, made)
@@ -188,11 +192,15 @@ class derived(Generic[T]):  # noqa: N801 - a decorator, like cached_property
     Equal models share the value; it is built under the lock.
     """
 
+    make: Callable[[Any], T]
+    name: str
+
     def __init__(self, make: Callable[[Any], T]) -> None:
         self.make, self.__doc__ = make, make.__doc__
 
     def _build(self, owner: Any) -> T:
-        return _recorded(getattr, self.make, (owner,), {}, (owner, self.name))
+        made: T = _recorded(getattr, self.make, (owner,), {}, (owner, self.name))
+        return made
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name

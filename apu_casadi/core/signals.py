@@ -8,10 +8,10 @@ and missing names, wrong shapes and values that are not finite.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, overload
 
 import casadi as ca
 import numpy as np
@@ -47,10 +47,10 @@ class Signal:
             raise SignalError(f"signal {self.name}: nominal must be > 0, got {self.nominal!r}")
 
 
-class Signals(Sequence[Signal]):
+class Signals(Sized):
     """An ordered set of :class:`Signal`, with packing and unpacking by name."""
 
-    def __init__(self, signals: Sequence[Signal] = ()) -> None:
+    def __init__(self, signals: Iterable[Signal] = ()) -> None:
         """Keep the signals; a name given twice is a :class:`SignalError`."""
         self._signals = tuple(signals)
         names = [s.name for s in self._signals]
@@ -73,7 +73,11 @@ class Signals(Sequence[Signal]):
     def __iter__(self) -> Iterator[Signal]:
         return iter(self._signals)
 
-    def __getitem__(self, key: Any) -> Any:
+    @overload
+    def __getitem__(self, key: str | int) -> Signal: ...
+    @overload
+    def __getitem__(self, key: slice) -> tuple[Signal, ...]: ...
+    def __getitem__(self, key: str | int | slice) -> Signal | tuple[Signal, ...]:
         """Return the signal of that name or position."""
         if isinstance(key, str):
             return self._signals[self.index(key)]

@@ -12,7 +12,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -22,6 +23,7 @@ from apu_casadi.core.checked import array
 from apu_casadi.core.errors import SignalError, SimulationError, nearest
 from apu_casadi.core.interrupts import watched
 from apu_casadi.core.means import Term
+from apu_casadi.core.runloop import run
 from apu_casadi.core.sharing import PerThread, Rebuilt, building, keep, twin
 from apu_casadi.core.statespace import StateSpace
 
@@ -364,7 +366,7 @@ def simulate(
     theta: Any = (),
     *,
     switches: Sequence[Switch] = (),
-    solver: str = "cvodes",
+    solver: str = "auto",
     rtol: float = RTOL,
     atol: float = ATOL,
 ) -> Any:
@@ -376,7 +378,7 @@ def simulate(
         u, theta: inputs and parameters.  An array of shape (nu, n - 1) holds one column over each
             interval of ``t_grid`` (sampled noise); the integration restarts at each of them.
         switches: changes, in any order, within (t_grid[0], t_grid[-1]) or at its start.
-        solver, rtol, atol: as for :class:`Stepper`.
+        solver, rtol, atol: as for :class:`Stepper`; ``"auto"`` is CVODES.
 
     Returns:
         xarray.Dataset: a variable for each output and state, with ``units`` and ``long_name``, over
@@ -395,33 +397,66 @@ def simulate(
             raise SimulationError(
                 f"switch at t = {s.t:g} s is outside the simulated [{t[0]:g}, {t[-1]:g}) s"
             )
-    x = _vector(ss.name, "x0", x0, len(ss.x))
-    pieces: list[tuple[StateSpace, np.ndarray, np.ndarray, np.ndarray]] = []
-    nsteps, start = 0, float(t[0])
-    for k in range(len(plan) + 1):
-        stop = plan[k].t if k < len(plan) else float(t[-1])
-        if stop > start:
-            inside = t[(t > start) & (t < stop)]
-            # an output instant that differs from a switching instant by rounding is that instant
-            inside = inside[np.minimum(inside - start, stop - inside) > 1e-12 * max(1.0, abs(stop))]
-            instants = np.concatenate([[start], inside, [stop]])
-            y0 = ss.g(x, _column(ss, u, t, start), theta).full()
-            pieces.append((ss, instants[:1], x[:, None], y0))
-            for a, b in _intervals(instants, u, t):
-                res = _run(ss, x, instants[a : b + 1], _column(ss, u, t, instants[a]), theta,
-                           solver, rtol, atol)  # fmt: skip
-                nsteps += int(res.stats["nsteps"])
-                x = res.x_end
-                keep = slice(None) if b < instants.size - 1 or k == len(plan) else slice(-1)
-                pieces.append((ss, instants[a + 1 : b + 1][keep], res.x[:, keep], res.y[:, keep]))
-        if k < len(plan):
-            switch = plan[k]
-            if switch.transfer is not None:
-                x = np.asarray(switch.transfer(x), dtype=float)
-            ss = switch.ss or ss
-            x = _vector(ss.name, "x after the switch", x, len(ss.x))
-            u, theta, start = switch.u, switch.theta, switch.t
-    return _dataset(pieces, {"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps})
+    solver = "cvodes" if solver == "auto" else solver
+    edges = np.unique([t[0], *(s.t for s in plan), t[-1]])
+    over = partial(_over, solver=solver, rtol=rtol, atol=atol)
+    system = _Piecewise(ss, _vector(ss.name, "x0", x0, len(ss.x)), t, edges, u, theta, over)
+    pieces = list[_Piece]()
+    run(system, edges, plan, record=lambda _k, _n, made: pieces.extend(made))
+    how = {"solver": solver, "rtol": rtol, "atol": atol, "nsteps": system.nsteps}
+    return _dataset(pieces, how)
+
+
+class _Piece(NamedTuple):
+    """A model's states and outputs at some instants."""
+
+    ss: StateSpace
+    t: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+
+@dataclass
+class _Piecewise:
+    """One model after the other, with output instants ``t``, from edge to edge."""
+
+    ss: StateSpace
+    x: np.ndarray
+    t: np.ndarray
+    edges: np.ndarray
+    u: Any
+    theta: Any
+    over: Callable[..., StepResult]
+    nsteps: int = 0
+
+    def switch(self, events: Sequence[Switch], t: float) -> None:
+        """Go over to another model, other inputs and parameters."""
+        for event in events:
+            if event.transfer is not None:
+                self.x = np.asarray(event.transfer(self.x), dtype=float)
+            self.ss = event.ss or self.ss
+            self.x = _vector(self.ss.name, "x after the switch", self.x, len(self.ss.x))
+            self.u, self.theta = event.u, event.theta
+
+    def advance(self, k: int, until: float) -> tuple[int, list[_Piece]]:
+        """Integrate up to the next switch or the end."""
+        ss, t, start = self.ss, self.t, float(self.edges[k])
+        inside = t[(t > start) & (t < until)]
+        # an output instant that differs from a switching instant by rounding is that instant
+        apart = np.minimum(inside - start, until - inside)
+        instants = np.concatenate([[start], inside[apart > 1e-12 * max(1.0, abs(until))], [until]])
+        y0 = ss.g(self.x, _column(ss, self.u, t, start), self.theta).full()
+        pieces = [_Piece(ss, instants[:1], self.x[:, None], y0)]
+        for a, b in _intervals(instants, self.u):
+            u = _column(ss, self.u, t, instants[a])
+            made = self.over(ss, self.x, instants[a : b + 1], u, self.theta)
+            self.nsteps += int(made.stats["nsteps"])
+            self.x = made.x_end
+            # at a switch the values are those just after it
+            last = b == instants.size - 1 and until < t[-1]
+            at = slice(-1) if last else slice(None)
+            pieces.append(_Piece(ss, instants[a + 1 : b + 1][at], made.x[:, at], made.y[:, at]))
+        return int(np.searchsorted(self.edges, until)) - k, pieces
 
 
 #: Outputs in one call of an integrator at most; bounds its memory.
@@ -440,14 +475,14 @@ def _column(ss: StateSpace, u: Any, t: np.ndarray, at: float) -> np.ndarray:
     return _vector(ss.name, "u", a, len(ss.u))
 
 
-def _intervals(instants: np.ndarray, u: Any, t: np.ndarray) -> list[tuple[int, int]]:
+def _intervals(instants: np.ndarray, u: Any) -> list[tuple[int, int]]:
     """Return index pairs of ``instants`` between which the inputs are constant."""
     n = instants.size - 1
     step = 1 if np.ndim(u) == 2 else _CHUNK
     return [(a, min(a + step, n)) for a in range(0, n, step)]
 
 
-def _run(
+def _over(
     ss: StateSpace,
     x: np.ndarray,
     instants: np.ndarray,
@@ -464,16 +499,14 @@ def _run(
     uniform = np.arange(1, n + 1) / n
     if np.max(np.abs(fractions - uniform)) < 1e-9:
         fractions = uniform
-    run = stepper(ss, fractions, solver=solver, rtol=rtol, atol=atol)
-    return run(x, u, theta, dt, t0=float(instants[0]))
+    step = stepper(ss, fractions, solver=solver, rtol=rtol, atol=atol)
+    return step(x, u, theta, dt, t0=float(instants[0]))
 
 
-def _dataset(
-    pieces: list[tuple[StateSpace, np.ndarray, np.ndarray, np.ndarray]], attrs: dict[str, Any]
-) -> Any:
+def _dataset(pieces: Sequence[_Piece], attrs: dict[str, Any]) -> Any:
     import xarray as xr  # slow to import, and the multi-rate loop does not need it
 
-    time = np.concatenate([p[1] for p in pieces])
+    time = np.concatenate([p.t for p in pieces])
     columns: dict[str, tuple[np.ndarray, dict[str, str]]] = {}
     at = 0
     for ss, t, x, y in pieces:
@@ -486,5 +519,5 @@ def _dataset(
         at += t.size
     variables = {name: ("time", data, meta) for name, (data, meta) in columns.items()}
     coords = {"time": ("time", time, {"units": "s", "long_name": "time"})}
-    attrs["models"] = ", ".join(dict.fromkeys(p[0].name for p in pieces))
+    attrs["models"] = ", ".join(dict.fromkeys(p.ss.name for p in pieces))
     return xr.Dataset(variables, coords, attrs)

@@ -6,15 +6,8 @@ standard deviation.  The numbers are those of
 on, as in :meth:`apu_casadi.unit.apu.Apu.change`.
 
 The fit is weighted least squares by a trust-region Gauss-Newton method with bounds
-(:func:`scipy.optimize.least_squares`).  Its derivatives are exact: map flow and efficiency enter
-the cycle just where the health factors do, so that
-
-    dr/dp = sum over maps of  dr/df_W f_W dlnW/dp + dr/df_eta f_eta dln(eta)/dp
-
-for every equation r, the two logarithmic derivatives at the point's place on the map; the implicit
-function theorem then gives the measured quantities'.  Only the values need the engine to be built
-anew for each trial, about a second: the numbers are constants of its equations, which keeps every
-other calculation fast.
+(:func:`scipy.optimize.least_squares`).  Its derivatives are exact, those of the cycle by its
+parameters (:attr:`~apu_casadi.gaspath.gasgenerator.GasGenerator.by_parameters`).
 """
 
 from __future__ import annotations
@@ -28,7 +21,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from apu_casadi.core import files
@@ -42,19 +34,20 @@ from apu_casadi.core.errors import (
     nearest,
 )
 from apu_casadi.gaspath.conditions import AMBIENT
-from apu_casadi.gaspath.cycle import reynolds_index
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from apu_casadi.gaspath.unitnumbers import GIVEN, MAPS
 
-SETS = ("compressor_map", "turbine_map")
+SETS = MAPS
 COLUMNS = ("point", "role", "name", "value", "sigma")
 ROLES = ("ambient", "health", "fixed", "measured")
 SINGULAR = 1e10  # condition above which the points are said not to determine the numbers
 WEAK = 1e3  # condition above which a combination is reported as weakly determined
 
 _FIELDS = tuple(f.name for f in dataclasses.fields(MapCalibration))
+_ALL = tuple(f"{s}.{f}" for s in SETS for f in _FIELDS)
 
 
 @dataclass(frozen=True)
@@ -159,7 +152,7 @@ class CalibrationResult:
         at_bound: numbers that ended at the edge of their range; the covariance does not hold for
             them.
         engine: the gas generator with the fitted numbers.
-        evaluations: engines built.
+        evaluations: engines tried.
     """
 
     names: tuple[str, ...]
@@ -190,8 +183,7 @@ class CalibrationResult:
 
 def numbers() -> tuple[str, ...]:
     """Return the names of all numbers that can be fitted."""
-    both = [f"{s}.{f}" for s in SETS for f in _FIELDS]
-    return tuple(n for n in both if n not in ("turbine_map.k_SM", "turbine_map.a_SM"))
+    return tuple(n for n in _ALL if n not in ("turbine_map.k_SM", "turbine_map.a_SM"))
 
 
 def _with(gg: GasGenerator, values: Mapping[str, float]) -> GasGenerator:
@@ -222,53 +214,17 @@ def sensitivity(gg: GasGenerator, point: OperatingPoint, fixed: Sequence[str]) -
         float array, shape (ny, 12): the numbers of the compressor map, then those of the turbine
         map.
     """
-    J = _jacobian(gg)(point.x, point.z, point.u, point.theta).full()
-    nz, ny = len(gg.z), len(gg.Y)
-    # rows: alg (nz), y (ny); columns: z (nz), N, Wf, PW, theta (4)
-    w, th = J[:, : nz + 3], J[:, nz + 3 :]
-    own = np.zeros((nz + ny, 2 * len(_FIELDS)))  # at unchanged z, N, Wf, PW
-    v, H = point.values, gg.THETA.unpack(point.theta)
-    d, z = gg.design.values, gg.z.unpack(point.z)
-    RNI_c = reynolds_index(P=v["P2"], T=v["T2"], P_ref=d["P2"], T_ref=d["T2"])
-    P4_guess = v["P2"] * v["PR_c"] * (1 - gg.parameters.dp_burner)
-    RNI_t = reynolds_index(P=P4_guess, T=v["T41"], P_ref=d["P4"], T_ref=d["T41"])
-    places = ((v["n_c"], z["beta_c"], float(RNI_c)), (v["n_t"], z["beta_t"], float(RNI_t)))
-    for k, (s, m, place, tag) in enumerate(zip(SETS, gg.maps, places, "ct", strict=True)):
-        cal = np.array([getattr(m.cal, f) for f in _FIELDS])
-        value, jac = (o.full() for o in _map_jacobian(m.calibrated)(*place, cal))
-        eta = value[1, 0] * H[f"f_eta_{tag}"]
-        if abs(eta / v[f"eta_{tag}"] - 1) > 1e-9:
-            raise AssertionError(f"{s} read at another place than the cycle reads it: eta {eta}")
-        block = slice(k * len(_FIELDS), (k + 1) * len(_FIELDS))
-        for row, factor in enumerate((f"f_W_{tag}", f"f_eta_{tag}")):
-            by_log = th[:, gg.THETA.index(factor)] * H[factor]
-            own[:, block] += np.outer(by_log, jac[row] / value[row, 0])
-        if tag == "c":
-            own[nz + gg.Y.index("SM"), block] = jac[2]
-    held = [nz + gg.Y.index(n) for n in ("P_acceleration", *fixed)]
-    rows = [*range(nz), *held]
-    dw = -np.linalg.solve(w[rows], own[rows])
-    return np.asarray(own[nz:] + w[nz:] @ dw)
-
-
-def _jacobian(gg: GasGenerator) -> ca.Function:
-    """(x, z, u, theta) -> d(alg, y)/d(z, N, Wf, PW, theta)."""
-    x, z = ca.MX.sym("x", len(gg.X)), ca.MX.sym("z", len(gg.z))
-    flows, around = ca.MX.sym("flows", 2), ca.MX.sym("around", len(gg.U) - 2)
-    u, theta = ca.vertcat(flows, around), ca.MX.sym("theta", len(gg.THETA))
-    _, alg, y = gg.equations(x, z, u, theta)
-    J = ca.densify(ca.jacobian(ca.vertcat(alg, y), ca.vertcat(z, x, flows, theta)))
-    inner = ca.Function("J", [x, z, flows, around, theta], [J])
-    us = ca.MX.sym("u", len(gg.U))
-    return ca.Function("J", [x, z, us, theta], [inner(x, z, us[:2], us[2:], theta)])
-
-
-def _map_jacobian(calibrated: ca.Function) -> ca.Function:
-    """(n, beta, RNI, cal) -> W, eta and SM, and their derivatives by cal."""
-    args = [ca.MX.sym("a", calibrated.size1_in(i)) for i in range(4)]
-    out = dict(zip(calibrated.name_out(), calibrated.call(args), strict=True))
-    rows = ca.vertcat(*(out[n] for n in ("W", "eta", "SM") if n in out))
-    return ca.Function("map_jacobian", args, [rows, ca.densify(ca.jacobian(rows, args[3]))])
+    given = gg.numbers[: len(GIVEN)]
+    w = np.concatenate([point.theta, given])
+    _, _, xdot_w, y_w, _ = (
+        np.asarray(a.full()) for a in gg.by_parameters.sensitivities(point.x, point.z, point.u, w)
+    )
+    names = (*gg.X.names, *gg.U.names, *gg.by_parameters.theta.names)
+    own = [names.index(n) for n in _ALL]
+    open_ = [names.index(n) for n in ("N", "Wf", "PW")]  # what may move: the point stays steady
+    held = np.vstack([xdot_w, y_w[gg.Y.indices(tuple(fixed))]])
+    moved = -np.linalg.solve(held[:, open_], held[:, own])
+    return np.asarray(y_w[:, own] + y_w[:, open_] @ moved)
 
 
 def calibrate(
@@ -284,7 +240,7 @@ def calibrate(
         gg: engine with the map shapes; numbers that are not free keep its values.
         points: steady points with measurements.
         free: numbers to fit, such as ``"compressor_map.n_Re"``; see :func:`numbers`.
-        max_evaluations: engines built at most.
+        max_evaluations: engines tried at most.
 
     Raises:
         ParameterError: unknown or doubled numbers, fewer measurements than numbers, or points that
@@ -295,73 +251,78 @@ def calibrate(
 
     points, names = tuple(points), tuple(free)
     _check_free(names, points)
-    targets = [(p, n, *p.measured[n]) for p in points for n in p.measured]
-    sigma = np.array([t[3] for t in targets])
-    measured = np.array([t[2] for t in targets])
-    index = [SETS.index(n.partition(".")[0]) * len(_FIELDS) + _FIELDS.index(n.partition(".")[2])
-             for n in names]  # fmt: skip
+    trial = _Trials(gg, points, names)
     fields = {f.name: f.metadata for f in dataclasses.fields(MapCalibration)}
     lower, upper = (
-        np.array([fields[n.partition(".")[2]][side] for n in names]) for side in ("lo", "hi")
+        np.array([fields[n.partition(".")[2]][side] for n in names], float) for side in ("lo", "hi")
     )
-    built: dict[bytes, tuple[GasGenerator, list[OperatingPoint]]] = {}
-
-    def solved(p: np.ndarray) -> tuple[GasGenerator, list[OperatingPoint]]:
-        key = p.tobytes()
-        if key not in built:
-            engine = _with(gg, dict(zip(names, p.tolist(), strict=True)))
-            built[key] = engine, [point.trim(engine) for point in points]
-        return built[key]
-
-    def model(p: np.ndarray) -> np.ndarray:
-        _, trims = solved(p)
-        return np.array(
-            [t[n] for t, point in zip(trims, points, strict=True) for n in point.measured]
-        )
-
-    def errors(p: np.ndarray) -> np.ndarray:
-        try:
-            return (model(p) - measured) / sigma
-        except ApuError:
-            if len(built) == 0:  # at the start there is nowhere to go back to
-                raise
-            return np.full(sigma.shape, np.inf)  # makes the trust region shrink
-
-    def jacobian(p: np.ndarray) -> np.ndarray:
-        engine, trims = solved(p)
-        rows = []
-        for t, point in zip(trims, points, strict=True):
-            S = sensitivity(engine, t, tuple(point.fixed))[:, index]
-            rows += [S[engine.Y.index(n)] for n in point.measured]
-        return np.array(rows) / sigma[:, None]
-
     # off the edge by a hundredth: some numbers are at their identity, and at their limit, when 0
     start = np.clip(_current(gg, names), lower + 0.01, upper - 0.01)
-    fit = least_squares(
-        errors, start, jacobian, bounds=(lower, upper), xtol=1e-13, ftol=1e-13, gtol=1e-13,
-        max_nfev=max_evaluations,
-    )  # fmt: skip
+    stop = {**dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13), "max_nfev": max_evaluations}
+    fit = least_squares(trial.errors, start, trial.jacobian, bounds=(lower, upper), **stop)
     if fit.status <= 0:
         raise OperatingPointError(
-            f"calibration did not converge in {len(built)} evaluations: sum of squared errors "
-            f"{2 * fit.cost:.4g} at " + _listing(names, fit.x)
+            f"calibration did not converge in {len(trial.built)} evaluations: sum of squared "
+            f"errors {2 * fit.cost:.4g} at " + _listing(names, fit.x)
         )
-    J = np.asarray(fit.jac)
-    covariance, condition, weak = _determined(J, names)
+    covariance, condition, weak = _determined(np.asarray(fit.jac), names)
     edge = 1e-9 * (upper - lower)
-    at_bound = tuple(
-        n for n, v, lo, hi, e in zip(names, fit.x, lower, upper, edge, strict=True)
-        if v - lo <= e or hi - v <= e
-    )  # fmt: skip
-    engine, _ = solved(fit.x)
+    bound = (fit.x - lower <= edge) | (upper - fit.x <= edge)
+    at_bound = tuple(n for n, b in zip(names, bound, strict=True) if b)
+    engine, _ = trial.solved(fit.x)
     residuals = tuple(
         Residual(p.name, n, value, float(m), s)
-        for (p, n, value, s), m in zip(targets, model(fit.x), strict=True)
+        for (p, n, value, s), m in zip(trial.targets, trial.model(fit.x), strict=True)
     )
     values = dict(zip(names, fit.x.tolist(), strict=True))
-    return CalibrationResult(
-        names, values, covariance, residuals, condition, weak, at_bound, engine, len(built)
-    )
+    told = covariance, residuals, condition, weak, at_bound, engine, len(trial.built)
+    return CalibrationResult(names, values, *told)
+
+
+class _Trials:
+    """The engines that a fit tries, and their errors at the points."""
+
+    def __init__(
+        self, gg: GasGenerator, points: tuple[CalibrationPoint, ...], names: tuple[str, ...]
+    ) -> None:
+        self.gg, self.points, self.names = gg, points, names
+        self.targets = [(p, n, *p.measured[n]) for p in points for n in p.measured]
+        self.sigma = np.array([t[3] for t in self.targets])
+        self.measured = np.array([t[2] for t in self.targets])
+        self.columns = [_ALL.index(n) for n in names]
+        self.built: dict[bytes, tuple[GasGenerator, list[OperatingPoint]]] = {}
+
+    def solved(self, p: np.ndarray) -> tuple[GasGenerator, list[OperatingPoint]]:
+        """Return the engine with the numbers p, trimmed at the points."""
+        key = p.tobytes()
+        if key not in self.built:
+            engine = _with(self.gg, dict(zip(self.names, p.tolist(), strict=True)))
+            self.built[key] = engine, [point.trim(engine) for point in self.points]
+        return self.built[key]
+
+    def model(self, p: np.ndarray) -> np.ndarray:
+        """Return what the engine says for each measurement."""
+        _, trims = self.solved(p)
+        pairs = zip(trims, self.points, strict=True)
+        return np.array([t[n] for t, point in pairs for n in point.measured])
+
+    def errors(self, p: np.ndarray) -> np.ndarray:
+        """Return (model - measured)/sigma."""
+        try:
+            return (self.model(p) - self.measured) / self.sigma
+        except ApuError:
+            if len(self.built) == 0:  # at the start there is nowhere to go back to
+                raise
+            return np.full(self.sigma.shape, np.inf)  # makes the trust region shrink
+
+    def jacobian(self, p: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the errors by p."""
+        engine, trims = self.solved(p)
+        rows = []
+        for t, point in zip(trims, self.points, strict=True):
+            S = sensitivity(engine, t, tuple(point.fixed))[:, self.columns]
+            rows += [S[engine.Y.index(n)] for n in point.measured]
+        return np.array(rows) / self.sigma[:, None]
 
 
 def _check_free(names: tuple[str, ...], points: tuple[CalibrationPoint, ...]) -> None:
@@ -470,8 +431,8 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
     for p in points:
         for role in ("ambient", "health", "fixed"):
             rows += [(p.name, role, n, repr(float(v)), "") for n, v in getattr(p, role).items()]
-        rows += [(p.name, "measured", n, repr(float(v)), repr(float(s)))
-                 for n, (v, s) in p.measured.items()]  # fmt: skip
+        for n, pair in p.measured.items():
+            rows.append((p.name, "measured", n, *(repr(float(v)) for v in pair)))
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     files.write_text(path, text.getvalue())

@@ -34,23 +34,16 @@ class Condition(NamedTuple):
     source: str
 
 
+_ISA = "Table 3; the atmosphere's two lowest layers, below the lowest stratosphere"
+_ROWS = {
+    "altitude": (0.0, -1000.0, 15000.0, "m", "geopotential altitude", _ISA),
+    "Mach": (0.0, 0.0, 0.95, "1", "flight Mach number", "Table 3; subsonic intake, assumed"),
+    "dT_isa": (5.0, -60.0, 60.0, "K", "deviation from ISA", "Table 3; extreme days, assumed"),
+    "war": (0.0, 0.0, 0.1, "kg/kg", "water per dry air", "Table 4 (SNOx); beyond any wet day"),
+}
 CONDITIONS: Mapping[str, Condition] = MappingProxyType(
-    {
-        "altitude": Condition(
-            0.0, -1000.0, 15000.0, "m", "geopotential altitude",
-            "Table 3; the atmosphere's two lowest layers, below the lowest stratosphere",
-        ),
-        "Mach": Condition(
-            0.0, 0.0, 0.95, "1", "flight Mach number", "Table 3; subsonic intake, assumed",
-        ),
-        "dT_isa": Condition(
-            5.0, -60.0, 60.0, "K", "deviation from ISA", "Table 3; extreme days, assumed",
-        ),
-        "war": Condition(
-            0.0, 0.0, 0.1, "kg/kg", "water per dry air", "Table 4 (SNOx); beyond any wet day",
-        ),
-    }
-)  # fmt: skip
+    {name: Condition(*row) for name, row in _ROWS.items()}
+)
 """The ambient conditions by name, in the order of the engine's inputs."""
 
 AMBIENT = tuple(CONDITIONS)
@@ -79,6 +72,5 @@ def day_words(values: Mapping[str, float] | None = None) -> str:
 
 def assumed_words(given: Mapping[str, object]) -> str:
     """Return the conditions that nobody gave, with the values taken; "" where all were given."""
-    left = [f"{n} = {v:g} {CONDITIONS[n].unit}".removesuffix(" 1")
-            for n, v in DEFAULT_DAY.items() if given.get(n) is None]  # fmt: skip
-    return ", ".join(left)
+    left = [(n, v) for n, v in DEFAULT_DAY.items() if given.get(n) is None]
+    return ", ".join(f"{n} = {v:g} {CONDITIONS[n].unit}".removesuffix(" 1") for n, v in left)

@@ -73,9 +73,8 @@ def species(data: str) -> dict[str, tuple[float, np.ndarray]]:
 
 def _cp_over_R(a: Any, T: Any) -> Any:
     """cp/R of one NASA-9 range."""
-    return (
-        a[0] / T**2 + a[1] / T + a[2] + T * (a[3] + T * (a[4] + T * (a[5] + T * a[6])))
-    )  # fmt: skip
+    slope = a[3] + T * (a[4] + T * (a[5] + T * a[6]))
+    return a[0] / T**2 + a[1] / T + a[2] + T * slope
 
 
 def _h_over_R(a: Any, T: Any) -> Any:
@@ -88,6 +87,53 @@ def _s_over_R(a: Any, T: Any) -> Any:
     """s0/R at standard pressure of one NASA-9 range; ``a[8]`` is the constant b2."""
     poly = T * (a[3] + T * (a[4] / 2 + T * (a[5] / 3 + T * a[6] / 4)))
     return -a[0] / (2 * T**2) - a[1] / T + a[2] * ca.log(T) + poly + a[8]
+
+
+@once
+def _coefficients(data: str) -> dict[str, np.ndarray]:
+    """Coefficients of each species, shape (2, 9), with enthalpy 0 at T_REF and no jump."""
+    out = {}
+    for name, (_, given) in species(data).items():
+        c = given.copy()
+        # sensible enthalpy: zero at T_REF on the low range, same shift on the high one
+        c[:, 7] -= float(_h_over_R(c[0], T_REF))
+        # the printed digits leave jumps of 1e-9 at 1000 K; close them, Newton sees them
+        c[1, 7] += float(_h_over_R(c[0], T_MID) - _h_over_R(c[1], T_MID))
+        c[1, 8] += float(_s_over_R(c[0], T_MID) - _s_over_R(c[1], T_MID))
+        out[name] = c
+    return out
+
+
+def _per_kg(moles: dict[str, Any], mass: Any, data: str) -> Any:
+    """Coefficients times R, J/(kg K), of a mixture of so many moles in so many kg/kmol."""
+    given, kind = _coefficients(data), ca.DM if isinstance(mass, ca.SX | ca.MX) else np.asarray
+    total: Any = 0.0
+    for n, nu in moles.items():
+        total = total + nu * kind(given[n])
+    return total * R_UNIVERSAL / mass
+
+
+@once
+def used(data: str) -> np.ndarray:
+    """Return which coefficients some species has, shape (2, 9): nasa7 has two fewer."""
+    return np.any([c != 0 for c in _coefficients(data).values()], axis=0)
+
+
+@once
+def dry_and_wet(data: str) -> tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]:
+    """Return coefficients and gas constant, J/(kg K), of dry air and of water vapour."""
+    sp, norm = species(data), sum(DRY_AIR.values())
+    m_air = sum(y * sp[n][0] for n, y in DRY_AIR.items()) / norm
+    air = _per_kg({n: y / norm for n, y in DRY_AIR.items()}, m_air, data)
+    water = _per_kg({"H2O": 1.0}, sp["H2O"][0], data)
+    return (air, R_UNIVERSAL / m_air), (water, R_UNIVERSAL / sp["H2O"][0])
+
+
+def fuel_burning(x: Any, data: str) -> tuple[Any, Any]:
+    """Return coefficients and gas constant, J/(kg K), of burning 1 kg of CHx; x may be a symbol."""
+    mass = M_C + x * M_H
+    moles = {"CO2": 1.0, "H2O": x / 2, "O2": -(1 + x / 4)}
+    return _per_kg(moles, mass, data), R_UNIVERSAL * ((1 + x / 2 - (1 + x / 4)) / mass)
 
 
 @dataclass(frozen=True)
@@ -112,43 +158,38 @@ class Gas(Parametric):
         if not 0.0 <= self.x_HC <= 4.0:
             raise ParameterError(f"Gas.x_HC = {self.x_HC} is outside [0, 4]")
 
+    @classmethod
+    def of_symbols(cls, x_HC: Any, data: str, burning: tuple[Any, Any] | None = None) -> Gas:
+        """Return a gas whose fuel is given by symbols; nothing is checked.
+
+        Args:
+            x_HC, data: as in the class.
+            burning: as :meth:`burning` returns it, where that is known; it is made of x_HC if not.
+        """
+        air, water = dry_and_wet(data)
+        coefficients, R = fuel_burning(x_HC, data) if burning is None else burning
+        new = object.__new__(cls)
+        known = {"_pseudo": (air[0], water[0], coefficients), "_R": (air[1], water[1], R)}
+        new.__dict__.update(x_HC=x_HC, data=data, **known)
+        return new
+
     @derived
-    def _pseudo(self) -> np.ndarray:
-        """Coefficients times R in J/(kg K), shape (3, 2, 9), of air, water, burning."""
-        sp = species(self.data)
+    def burning(self) -> tuple[np.ndarray, float]:
+        """Coefficients, shape (2, 9), and gas constant of burning 1 kg of fuel, J/(kg K)."""
+        made: tuple[np.ndarray, float] = fuel_burning(self.x_HC, self.data)
+        return made
 
-        def per_kg(moles: dict[str, float], mass: float) -> np.ndarray:
-            total = np.zeros((2, 9))
-            for n, nu in moles.items():
-                c = sp[n][1].copy()
-                # sensible enthalpy: zero at T_REF on the low range, same shift on the high one
-                shift = float(_h_over_R(c[0], T_REF))
-                c[:, 7] -= shift
-                # the printed digits leave jumps of 1e-9 at 1000 K; close them, Newton sees them
-                c[1, 7] += float(_h_over_R(c[0], T_MID) - _h_over_R(c[1], T_MID))
-                c[1, 8] += float(_s_over_R(c[0], T_MID) - _s_over_R(c[1], T_MID))
-                total = total + nu * c
-            return np.asarray(total * R_UNIVERSAL / mass)
-
-        m_air = sum(y * sp[n][0] for n, y in DRY_AIR.items())
-        norm = sum(DRY_AIR.values())
-        x = self.x_HC
-        return np.array(
-            [
-                per_kg({n: y / norm for n, y in DRY_AIR.items()}, m_air / norm),
-                per_kg({"H2O": 1.0}, sp["H2O"][0]),
-                per_kg({"CO2": 1.0, "H2O": x / 2, "O2": -(1 + x / 4)}, M_C + x * M_H),
-            ]
-        )
+    @derived
+    def _pseudo(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coefficients times R in J/(kg K), each of shape (2, 9), of air, water, burning."""
+        air, water = dry_and_wet(self.data)
+        return air[0], water[0], self.burning[0]
 
     @derived
     def _R(self) -> tuple[float, float, float]:
         """Gas constants, J/(kg K), of air, water vapour and the burning of 1 kg of fuel."""
-        sp = species(self.data)
-        m_air = sum(y * sp[n][0] for n, y in DRY_AIR.items()) / sum(DRY_AIR.values())
-        x = self.x_HC
-        burn = (1 + x / 2 - (1 + x / 4)) / (M_C + x * M_H)
-        return R_UNIVERSAL / m_air, R_UNIVERSAL / sp["H2O"][0], R_UNIVERSAL * burn
+        air, water = dry_and_wet(self.data)
+        return air[1], water[1], self.burning[1]
 
     @property
     def FAR_stoichiometric(self) -> float:

@@ -10,24 +10,29 @@ Rotor speed is the one state.  The improved method of the paper (IGDM, Algorithm
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Never
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
-from apu_casadi.core.discretisation import linearly_implicit_midpoint
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import OperatingPointError, SimulationError
-from apu_casadi.core.sharing import Parametric, derived
+from apu_casadi.core.runloop import run
+from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
-from apu_casadi.gaspath import cycle
+from apu_casadi.gaspath import stations, unitnumbers
 from apu_casadi.gaspath.conditions import RANGES
-from apu_casadi.gaspath.cycle import RPM, Cycle, DesignPoint, GasGeneratorParameters, solve_design
+from apu_casadi.gaspath.cycle import Cycle
+from apu_casadi.gaspath.cyclefunctions import CycleFunctions
+from apu_casadi.gaspath.design import DesignPoint, solve_design
+from apu_casadi.gaspath.designdata import RPM, GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas
-from apu_casadi.gaspath.maps.mapfiles import MapTable, shipped
+from apu_casadi.gaspath.maps.mapfiles import shipped
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration, ScaledMap
 
 __all__ = [
@@ -39,7 +44,7 @@ __all__ = [
     "MapChoice",
 ]
 
-_MACH8 = cycle.Y.index("Mach8")
+_MACH8 = stations.Y.index("Mach8")
 RESIDUAL_TOL = 1e-9  # largest residual (dimensionless) with which any result is used
 
 
@@ -105,6 +110,17 @@ class GasGeneratorState:
     theta: np.ndarray
 
 
+@kept
+def caller(family: CycleFunctions, which: str, *, build: bool = False) -> Caller:
+    """Return a function of a family for calls from Python, shared by all its engines.
+
+    Args:
+        which: ``"f"``, ``"g"`` or ``"step"``.
+        build: compile it if no library is found.
+    """
+    return Caller(compiled(getattr(family, which), build=build))
+
+
 @dataclass(frozen=True)
 class GasGenerator(Parametric):
     """A gas generator: parameters and two maps; everything else is derived.
@@ -120,13 +136,13 @@ class GasGenerator(Parametric):
     turbine_map: MapChoice = field(default_factory=default_turbine)
     dt: float = 0.02
 
-    X: ClassVar[Signals] = cycle.X
-    U: ClassVar[Signals] = cycle.U
-    THETA: ClassVar[Signals] = cycle.THETA
-    Y: ClassVar[Signals] = cycle.Y
-    equation_names: ClassVar[tuple[str, ...]] = cycle.EQUATIONS
+    X: ClassVar[Signals] = stations.X
+    U: ClassVar[Signals] = stations.U
+    THETA: ClassVar[Signals] = stations.THETA
+    Y: ClassVar[Signals] = stations.Y
+    equation_names: ClassVar[tuple[str, ...]] = stations.EQUATIONS
 
-    # ------------------------------------------------------------------ equations
+    # ------------------------------------------------------------------ what follows
 
     @derived
     def gas(self) -> Gas:
@@ -140,7 +156,7 @@ class GasGenerator(Parametric):
         Raises:
             OperatingPointError: the design data admit no solution; names the worst equation.
         """
-        return solve_design(self.parameters, self.gas)
+        return solve_design(self.parameters)
 
     @derived
     def maps(self) -> tuple[ScaledMap, ScaledMap]:
@@ -152,9 +168,40 @@ class GasGenerator(Parametric):
         )
 
     @derived
-    def cycle(self) -> Cycle:
-        """The cycle equations with their exact Jacobians."""
-        return Cycle(self.parameters, self.gas, self.design, *self.maps)
+    def numbers(self) -> np.ndarray:
+        """All numbers of this engine, by :data:`~apu_casadi.gaspath.unitnumbers.NUMBERS`."""
+        return unitnumbers.vector(self.parameters, self.gas, self.design, self.maps)
+
+    def full(self, theta: Any) -> np.ndarray:
+        """Return the family's theta: the health factors, shape (4,), and this engine's numbers."""
+        return np.concatenate([theta, self.numbers])
+
+    # ------------------------------------------------------------------ equations
+
+    def _equations(self, *, held: bool) -> Cycle:
+        tables = self.compressor_map.table, self.turbine_map.table
+        return Cycle(self.parameters.gas_data, *tables, held)
+
+    @derived
+    def cycle(self) -> CycleFunctions:
+        """The cycle equations of this engine with their exact Jacobians."""
+        return CycleFunctions(self._equations(held=True), tuple(self.numbers.tolist()))
+
+    @derived
+    def family(self) -> CycleFunctions:
+        """The same functions for all engines of this structure: theta is :meth:`full`.
+
+        Compiled once, they serve every engine; no derivatives by the numbers.
+        """
+        return CycleFunctions(self._equations(held=True))
+
+    @derived
+    def by_parameters(self) -> CycleFunctions:
+        """The same functions with theta the health factors and all parameters by dotted name.
+
+        Exact derivatives by every parameter, the shift of the design point included.
+        """
+        return CycleFunctions(self._equations(held=False))
 
     @property
     def z(self) -> Signals:
@@ -168,96 +215,55 @@ class GasGenerator(Parametric):
 
     @property
     def solve(self) -> ca.Function:
-        """Function (z0, x, u, theta) -> z: see :class:`~apu_casadi.gaspath.cycle.Cycle`."""
+        """Function (z0, x, u, theta) -> z: see :attr:`.CycleFunctions.solve`."""
         return self.cycle.solve
 
     @property
     def similar(self) -> ca.Function:
-        """Function (x, u) -> first guess of z: see :class:`~apu_casadi.gaspath.cycle.Cycle`."""
+        """Function (x, u) -> first guess of z: see :attr:`.CycleFunctions.similar`."""
         return self.cycle.similar
 
     @derived
     def state_space(self) -> StateSpace:
-        """The continuous model as :class:`StateSpace`; z is started by similarity."""
-        x, z, u, theta = self.cycle.symbols()
-        ode, alg, _ = self.equations(x, z, u, theta)
-        z_sol = self.solve(self.similar(x, u), x, u, theta)
-        f, _, g = self.equations(x, z_sol, u, theta)
-        return StateSpace.of(
-            "gas_generator",
-            (self.X, self.z, self.U, self.THETA, self.Y),
-            (x, z, u, theta),
-            dae=(ode, alg), f=f, g=g, z=z_sol,
-        )  # fmt: skip
+        """The continuous model as :class:`StateSpace`; its family is that of :attr:`family`."""
+        own, family = self.cycle.state_space, self.family.state_space
+        return replace(own, family=family, numbers=tuple(self.numbers.tolist()))
 
-    # ------------------------------------------------------------------ discrete model (eq. 12)
-
-    @derived
+    @property
     def f(self) -> ca.Function:
-        """State update of eq. (12): (x, u, theta, dt, z0) -> (x1, z, residual).
+        """State update of eq. (12): (x, u, theta, dt, z0) -> (x1, z, residual)."""
+        return self.cycle.f
 
-        ``x1 = f(x(k-1), u(k), theta(k), Pe(k))`` with Pe = ``u.PW``, by the linearly implicit
-        midpoint rule.  ``z0`` starts the root finder; z and its re-evaluated residual come back.
-        """
-        x, z0, u, theta = self.cycle.symbols()
-        dt = ca.MX.sym("dt")
-        z = self.solve(z0, x, u, theta)
-        ode, A, residual, _ = self.cycle.dfdx(x, z, u, theta)
-        x1 = linearly_implicit_midpoint(x, ode, A, dt)
-        return ca.Function(
-            "gas_generator_f",
-            [x, u, theta, dt, z0],
-            [x1, z, residual],
-            ["x", "u", "theta", "dt", "z0"],
-            ["x1", "z", "residual"],
-        )
-
-    @derived
+    @property
     def step(self) -> ca.Function:
-        """State update and output in one: (x, u, theta, dt, z0) -> (x1, y, z, residual).
+        """State update and output in one: (x, u, theta, dt, z0) -> (x1, y, z, residual)."""
+        return self.cycle.step
 
-        Eq. (12) as a hot loop needs it; ``residual`` is the sum of update and output.
-        """
-        x, z0, u, theta = self.cycle.symbols()
-        dt = ca.MX.sym("dt")
-        z = self.solve(z0, x, u, theta)
-        ode, A, r, z_x = self.cycle.dfdx(x, z, u, theta)
-        x1 = linearly_implicit_midpoint(x, ode, A, dt)
-        y, z1 = self.g(x1, u, theta, z + ca.mtimes(z_x, x1 - x))  # started along the tangent
-        # a sum, not fmax, which would swallow NaN
-        r = r + y[self.Y.index("residual")]
-        names = ["x", "u", "theta", "dt", "z0"], ["x1", "y", "z", "residual"]
-        return ca.Function("gas_generator_step", [x, u, theta, dt, z0], [x1, y, z1, r], *names)
-
-    @derived
+    @property
     def g(self) -> ca.Function:
         """Output of eq. (12): (x, u, theta, z0) -> (y, z); y holds the residual."""
-        x, z0, u, theta = self.cycle.symbols()
-        z = self.solve(z0, x, u, theta)
-        _, _, y = self.equations(x, z, u, theta)
-        return ca.Function(
-            "gas_generator_g", [x, u, theta, z0], [y, z], ["x", "u", "theta", "z0"], ["y", "z"]
-        )
+        return self.cycle.g
 
     # ------------------------------------------------------------------ IGDM (Algorithm 2)
 
+    # Callers belong to the family.  A single run is not worth seconds of compiling, but takes a
+    # library that is there.
     @derived
     def _f_call(self) -> Caller:
-        return Caller(compiled(self.f, build=False))
+        return caller(self.family, "f")
 
     @derived
     def _g_call(self) -> Caller:
-        return Caller(compiled(self.g, build=False))
-
-    @derived
-    def stepper(self) -> Caller:
-        """:attr:`step` for hot loops: generated C where there is a compiler, compiled once."""
-        return Caller(compiled(self.step))
+        return caller(self.family, "g")
 
     @derived
     def _step_call(self) -> Caller:
-        # a single run is not worth seconds of compiling, but takes a library that is there
-        return Caller(compiled(self.step, build=False))
+        return caller(self.family, "step")
+
+    @derived
+    def stepper(self) -> Caller:
+        """The family's step for hot loops: generated C where there is a compiler."""
+        return caller(self.family, "step", build=True)
 
     def advance(
         self,
@@ -276,7 +282,7 @@ class GasGenerator(Parametric):
         Raises:
             SimulationError: the cycle could not be solved, or the exhaust is choked.
         """
-        x1, y, z, r = (step or self._step_call)(x, u, theta, dt, z0)
+        x1, y, z, r = (step or self._step_call)(x, u, self.full(theta), dt, z0)
         self._check(float(r[0]), x1 if np.isfinite(x1).all() else x, u, theta, "step")
         self._check_exit(y)
         return x1, y, z
@@ -319,8 +325,9 @@ class GasGenerator(Parametric):
         Raises:
             SimulationError: the cycle could not be solved; names the residual.
         """
-        start = self.similar(x, u).full().ravel() if z0 is None else z0
-        x1, z, r = self._f_call(x, u, theta, self.dt if dt is None else dt, start)
+        th = self.full(theta)
+        start = self._similar(x, u, th) if z0 is None else z0
+        x1, z, r = self._f_call(x, u, th, self.dt if dt is None else dt, start)
         self._check(float(r[0]), x, u, theta, "state update")
         return x1, z
 
@@ -332,11 +339,15 @@ class GasGenerator(Parametric):
         Raises:
             SimulationError: the cycle could not be solved, or the exhaust is choked.
         """
-        start = self.similar(x, u).full().ravel() if z0 is None else z0
-        y, z = self._g_call(x, u, theta, start)
+        th = self.full(theta)
+        start = self._similar(x, u, th) if z0 is None else z0
+        y, z = self._g_call(x, u, th, start)
         self._check(float(y[self.Y.index("residual")]), x, u, theta, "output")
         self._check_exit(y)
         return y, z
+
+    def _similar(self, x: np.ndarray, u: np.ndarray, full: np.ndarray) -> np.ndarray:
+        return self.family.similar(x, u, full).full().ravel()
 
     def _check_exit(self, y: np.ndarray) -> None:
         Mach8 = float(y[_MACH8])
@@ -386,17 +397,43 @@ class GasGenerator(Parametric):
         K = inputs.shape[1]
         th = start.theta if theta is None else np.asarray(theta, float)
         th = np.broadcast_to(th.reshape(len(self.THETA), -1), (len(self.THETA), K))
-        x, z = start.x, start.z
-        y, z = self.output(x, start.u, start.theta, z0=z)
-        X, Y = [x], [y]
-        for k in range(1, K + 1):
-            u, t = inputs[:, k - 1], th[:, k - 1]
-            x, z = self.state_update(x, u, t, z0=z, dt=dt)
-            if hook is not None:
-                x = np.asarray(hook(k, x), float).reshape(len(self.X))
-            y, z = self.output(x, u, t, z0=z)
-            if output_noise is not None:
-                y = y + output_noise(k)
-            X.append(x)
-            Y.append(y)
+        dt = self.dt if dt is None else dt
+        system = _Discrete(self, start, inputs, th, hook, dt)
+        rows = [(system.x, system.y)]
+
+        def record(k: int, _n: int, row: tuple[np.ndarray, np.ndarray]) -> None:
+            x, y = row
+            rows.append((x, y if output_noise is None else y + output_noise(k)))
+
+        run(system, dt * np.arange(K + 1), record=record)
+        X, Y = zip(*rows, strict=True)
         return np.array(X).T, np.array(Y).T
+
+
+class _Discrete:
+    """The discrete model on its way through a run: inputs and health of each step, and a hook."""
+
+    def __init__(
+        self,
+        gg: GasGenerator,
+        start: GasGeneratorState,
+        inputs: np.ndarray,
+        theta: np.ndarray,
+        hook: Callable[[int, np.ndarray], np.ndarray] | None,
+        dt: float,
+    ) -> None:
+        self.gg, self.inputs, self.theta, self.hook, self.dt = gg, inputs, theta, hook, dt
+        self.x = start.x
+        self.y, self.z = gg.output(start.x, start.u, start.theta, z0=start.z)
+
+    def switch(self, events: Sequence[Never], t: float) -> None:
+        """Nothing comes but inputs."""
+
+    def advance(self, k: int, _until: float) -> tuple[int, tuple[np.ndarray, np.ndarray]]:
+        """Update the state, process it, compute the output."""
+        u, theta = self.inputs[:, k], self.theta[:, k]
+        x, z = self.gg.state_update(self.x, u, theta, z0=self.z, dt=self.dt)
+        if self.hook is not None:
+            x = np.asarray(self.hook(k + 1, x), float).reshape(len(self.gg.X))
+        self.x, (self.y, self.z) = x, self.gg.output(x, u, theta, z0=z)
+        return 1, (self.x, self.y)

@@ -349,7 +349,7 @@ class Generator(Parametric):
         w_r: float | None = None,
         V_ref: float | None = None,
         dt_out: float = 50e-6,
-        solver: str = "cvodes",
+        solver: str = "auto",
         rtol: float = simulation.RTOL,
         atol: float = simulation.ATOL,
     ) -> Any:

@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
-from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
+from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
@@ -450,7 +451,7 @@ class MeanStep(Rebuilt):
         within: where this step begins in a longer one, and which share of it it is; for weights.
 
     Raises:
-        SimulationError: the model is not linear in its windings, a series does not converge or has
+        NotApplicable: the model is not linear in its windings, a series does not converge or has
             more than ``HARMONICS``, or the step is so short that samples cannot be spared.
     """
 
@@ -470,13 +471,13 @@ class MeanStep(Rebuilt):
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
         if not ss.linear:
-            raise SimulationError(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: its load is not linear")
         self.ss, self.dt, self.quad = ss, dt, tuple(quad)
         given = np.array(theta, dtype=float)
         self.theta = ss.full(given)
         w_rated = gen.machine.w_rated
         if dt * w_rated < 4 * math.pi:
-            raise SimulationError(f"{ss.name}: a step of {dt:g} s has less than two turns")
+            raise NotApplicable(f"{ss.name}: a step of {dt:g} s has less than two turns")
         self.constant = symmetry(ss, u, given, w_rated)
         if self.constant:
             tables = [cached_table(ss, u, given, w_rated, h=dt * share / 4) for _, share in PANELS]
@@ -486,7 +487,7 @@ class MeanStep(Rebuilt):
             tables = [cached_table(ss, u, given, w_rated, angle=angle)]
             harmonics = next((k for k in HARMONICS if k >= tables[0].harmonics), 0)
             if not harmonics:
-                raise SimulationError(
+                raise NotApplicable(
                     f"{ss.name}: {tables[0].harmonics} harmonics of the rotor angle, "
                     f"{HARMONICS[-1]} fit"
                 )
@@ -512,18 +513,18 @@ class MeanStep(Rebuilt):
         """Advance one step; return the state at its end and the means.
 
         Raises:
-            SimulationError: the exciter moves too fast, the samples do not resolve the windings, a
+            NotApplicable: the exciter moves too fast, the samples do not resolve the windings, a
                 result is not finite, or the speed is outside the table.
         """
         w = float(u[self._iw])
         if not self.valid(w):
-            raise SimulationError(f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table")
+            raise NotApplicable(f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table")
         call = self._compiled
         if call is None:
             call = self._compiled = _caller(*self.layout, backend_in_use())
         x, mean, miss = call(x0, self.parameters, u, self.theta, self.dt)
         if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):
-            raise SimulationError(
+            raise NotApplicable(
                 f"{self.ss.name}: step from {t0:.6g} s: errors of E_fd and of the state at the end "
                 f"{miss.tolist()} > {self.limits.tolist()}, or values that are not finite"
             )

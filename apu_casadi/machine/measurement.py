@@ -11,6 +11,7 @@ import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError, SignalError
+from apu_casadi.core.measuring import measure
 
 
 @dataclass(frozen=True)
@@ -54,5 +55,4 @@ class MeasurementNoise:
         if missing:
             raise SignalError(f"to be measured but absent: {', '.join(missing)}")
         for n, sigma in sigmas.items():
-            v = np.asarray(y[n], dtype=float)
-            yield n, v + sigma * rng.standard_normal(v.shape)
+            yield n, measure(y[n], sigma, rng)

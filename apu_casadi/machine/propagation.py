@@ -29,8 +29,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
-from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
+from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.core.simulation import StepResult
@@ -333,7 +334,7 @@ class Propagator(Rebuilt):
         fine: the exciter steps at every sample; for the steps that the usual strides refuse.
 
     Raises:
-        SimulationError: the model is not linear in its windings, or the series does not converge;
+        NotApplicable: the model is not linear in its windings, or the series does not converge;
             use :func:`apu_casadi.core.simulation.stepper` there.
     """
 
@@ -352,9 +353,9 @@ class Propagator(Rebuilt):
     ) -> None:
         """Compute or fetch the table, build or fetch the functions."""
         if not ss.linear:
-            raise SimulationError(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: its load is not linear")
         if n_out < 10:
-            raise SimulationError(f"{ss.name}: at least 10 samples are needed, got {n_out}")
+            raise NotApplicable(f"{ss.name}: at least 10 samples are needed, got {n_out}")
         self.ss, self.n_out, self.dt = ss, n_out, dt
         self.outputs, self.quad = tuple(outputs), tuple(quad)
         self.h = dt / n_out
@@ -401,12 +402,12 @@ class Propagator(Rebuilt):
             arrays are overwritten by the thread's next call.
 
         Raises:
-            SimulationError: the exciter moves too fast for the samples, a result is not finite, or
+            NotApplicable: the exciter moves too fast for the samples, a result is not finite, or
                 the speed is outside the table; use a ``Stepper`` for this step.
         """
         w = float(u[self._iw])
         if not self.valid(w):
-            raise SimulationError(
+            raise NotApplicable(
                 f"{self.ss.name}: w_r = {w:.6g} rad/s is outside the table's "
                 f"[{self._w_ok[0]:.6g}, {self._w_ok[1]:.6g}]"
             )
@@ -434,7 +435,7 @@ class Propagator(Rebuilt):
             np.matmul(O.view(float), odd, out=Q.T)
             x, y, mean, miss = call(x0, P, Q, u, self.theta, self.h)
         if not (float(miss[0]) <= self.tol and math.isfinite(float(x.sum()))):
-            raise SimulationError(
+            raise NotApplicable(
                 f"{self.ss.name}: step from {t0:.6g} s: E_fd moves so fast that a sample of "
                 f"{self.h:.3g} s misses it by {float(miss[0]):.1e} > {self.tol:.0e}"
             )

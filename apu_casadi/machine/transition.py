@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
-from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
+from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.sharing import keep, kept, once
 from apu_casadi.machine.generatormodel import GeneratorModel
 
@@ -66,7 +67,7 @@ def coefficients(ss: GeneratorModel) -> ca.Function:
     own = ca.vertcat(x[s.linear], x[s.drive])
     J = ca.jacobian(rate, own)
     if any(ca.which_depends(ca.vec(ca.densify(J)), own, 1, True)):
-        raise SimulationError(f"{ss.name} is not linear in its windings: use another integrator")
+        raise NotApplicable(f"{ss.name} is not linear in its windings: use another integrator")
     n = len(s.linear)
     rest = ca.substitute(rate, own, ca.SX.zeros(n + 1))
     M = ca.SX.zeros(n + EXTRA, n + EXTRA)
@@ -221,14 +222,14 @@ def symmetry(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray, w_rated: floa
     """Return whether the coefficients are constant; check that half a turn reverses the phases.
 
     Raises:
-        SimulationError: it does not, and :class:`Parity` would not hold.
+        NotApplicable: it does not, and :class:`Parity` would not hold.
     """
     M = _scaled(ss, u, theta)(np.append(_PROBE, _PROBE + np.pi), np.full(6, w_rated))
     sign = parity(ss, 1).sign
     turned = M[3:] * np.outer(sign, sign) - M[:3]
     largest = np.abs(M).max()
     if np.abs(turned).max() > 1e-9 * largest:
-        raise SimulationError(
+        raise NotApplicable(
             f"{ss.name}: half a turn does not reverse the phases; process noise in the zero "
             "sequence? Use another integrator"
         )
@@ -286,7 +287,7 @@ def transition_table(
         leaps: the matrices are those over one leap, two leaps, and so on, one below the other.
 
     Raises:
-        SimulationError: the Fourier series or the steps do not converge, or a noise in the zero
+        NotApplicable: the Fourier series or the steps do not converge, or a noise in the zero
             sequence does not change its sign with the phases.
     """
     n = len(ss.linear)
@@ -315,7 +316,7 @@ def transition_table(
     steps, error, last = 1, math.inf, trial(1)
     while error > STEP_TOL:
         if steps >= 64:
-            raise SimulationError(
+            raise NotApplicable(
                 f"{ss.name}: transition matrices over {length(nodes).max():.3g} s do not converge "
                 f"(error {error:.1e} with {steps} steps)"
             )
@@ -352,7 +353,7 @@ def transition_table(
         if highest < resolved - 1:
             break
     else:
-        raise SimulationError(
+        raise NotApplicable(
             f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s has over {highest} "
             f"harmonics of the rotor angle above {TAIL:g}: the load is too light for this step"
         )

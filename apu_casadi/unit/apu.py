@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.errors import OperatingPointError, ParameterError, SignalError, nearest
 from apu_casadi.core.parameters import Parameters, par
-from apu_casadi.core.sharing import Parametric
+from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator, GeneratorPoint
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.control import Governor, GovernorParameters
 from apu_casadi.unit.events import Ambient
+from apu_casadi.unit.exchange import Link
 
 if TYPE_CHECKING:
     from apu_casadi.machine.loads.load import Load
@@ -29,13 +30,20 @@ class CouplingParameters(Parameters):
     """Gearbox between gas generator and the two generators (paper, eqs. 1 and 2)."""
 
     gear: float = par(
-        36050.0 / 12000.0, unit="1", source="Table 3 speed over 400 Hz with two pole pairs",
-        doc="speed ratio Omega_gtSg", lo=0.01,
-    )  # fmt: skip
+        36050.0 / 12000.0,
+        unit="1",
+        source="Table 3 speed over 400 Hz with two pole pairs",
+        doc="speed ratio Omega_gtSg",
+        lo=0.01,
+    )
     eta_gtSg: float = par(
-        1.0, unit="1", source="assumed: only eta_sg eta_gtSg = 0.90 follows from the tables",
-        doc="power transfer efficiency of the gearbox", lo=0.01, hi=1.0,
-    )  # fmt: skip
+        1.0,
+        unit="1",
+        source="assumed: only eta_sg eta_gtSg = 0.90 follows from the tables",
+        doc="power transfer efficiency of the gearbox",
+        lo=0.01,
+        hi=1.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -57,12 +65,12 @@ class Apu(Parametric):
 
     Args:
         gas_generator, generator: the two models.
-        governor, coupling: parameters of speed control and gearbox.
+        governor, coupling: speed control and gearbox.
     """
 
     gas_generator: GasGenerator = field(default_factory=GasGenerator)
     generator: Generator = field(default_factory=Generator)
-    governor: GovernorParameters = field(default_factory=GovernorParameters)
+    governor: Governor = field(default_factory=GovernorParameters)
     coupling: CouplingParameters = field(default_factory=CouplingParameters)
 
     @property
@@ -70,13 +78,21 @@ class Apu(Parametric):
         """Governed rotor speed, rad/s."""
         return self.gas_generator.parameters.N
 
+    @derived
+    def link(self) -> Link:
+        """What couples the models: eqs. (1) and (2), and the governor."""
+        gearbox = self.coupling
+        return Link(
+            self.governor, self.N_ref, gearbox.gear, gearbox.eta_gtSg, self.generator.machine.n_pp
+        )
+
     def w_r(self, N: Any) -> Any:
         """Electrical speed of the generators, rad/s, at rotor speed N (eq. 2)."""
-        return self.generator.machine.n_pp * N / self.coupling.gear
+        return self.link.w_r(N)
 
     def PW(self, P_total: Any) -> Any:
         """Shaft power, W, that the two generators' mean power P_total asks for (eq. 1)."""
-        return P_total / self.coupling.eta_gtSg
+        return self.link.PW(P_total)
 
     def _sets(self) -> dict[str, Parameters]:
         gg, gen = self.gas_generator, self.generator

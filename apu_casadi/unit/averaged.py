@@ -40,24 +40,16 @@ from apu_casadi.machine.generator import Generator, GeneratorPoint, load_of_kind
 from apu_casadi.machine.generatormodel import DRIVES
 from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.unit.apu import Apu, JointPoint
-from apu_casadi.unit.control import governor
+from apu_casadi.unit.exchange import coupled
 
 # The angle enters f and g, and their derivatives by h at h = 0, through its first and second
 # harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.
 _ANGLES = 6
 
-_SEVERITY = Signals(
-    [
-        Signal(
-            "h", "1", "severity mu/(k_rf + 1 - mu) of a TTSC of one phase with kappa = mu",
-            default=0.0, nominal=0.01,
-        )
-    ]
-)  # fmt: skip
+_H = "severity mu/(k_rf + 1 - mu) of a TTSC of one phase with kappa = mu"
+_SEVERITY = Signals([Signal("h", "1", _H, default=0.0, nominal=0.01)])
 
-_KEPT = (
-    "V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"
-)  # fmt: skip
+_KEPT = ["V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"]
 _AXES = Signals(
     [
         Signal("v_q", "V", "terminal voltage, q axis", nominal=300.0),
@@ -127,7 +119,7 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
         fault = full.theta.stack(values)
     angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES if faulty else np.zeros(1)
     rate: Any = 0
-    mean: dict[str, Any] = dict.fromkeys((*_KEPT, "v_q", "v_d", "i_q", "i_d"), ca.SX(0))
+    mean: dict[str, Any] = dict.fromkeys([*_KEPT, "v_q", "v_d", "i_q", "i_d"], ca.SX(0))
     for angle in angles:
         x_full = full.x.stack({**x, "theta_e": ca.SX(float(angle))})
         rate += full.f(x_full, u_full, fault) / angles.size
@@ -143,14 +135,9 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
     f, g = X.stack({n: rates[n] for n in X.names}), Y.stack(mean)
 
     name = f"averaged_generator_{load_kind}" + ("" if gen.neutral == "grounded" else "_isolated")
-    no_z = ca.SX.sym("z", 0)
+    signals, symbols = (X, Signals(), U, TH, Y), (xv, ca.SX.sym("z", 0), uv, tv)
     none = ca.SX(0, 1)
-    return StateSpace.of(
-        name,
-        (X, Signals(), U, TH, Y),
-        (xv, no_z, uv, tv),
-        dae=(f, none), f=f, g=g, z=none, cse=True,
-    )  # fmt: skip
+    return StateSpace.of(name, signals, symbols, dae=(f, none), f=f, g=g, z=none, cse=True)
 
 
 def load_kind(point: GeneratorPoint) -> str:
@@ -186,12 +173,10 @@ def generator_vectors(
 def _joint_signals(apu: Apu, load_kind: str) -> tuple[Signals, Signals, Signals, Signals]:
     """Return x, u, theta and y of the averaged unit."""
     gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
-    X = Signals([*gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x])
-    U = Signals([
-        *(gg.U[n] for n in AMBIENT),
-        Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0),
-        *(s for s in gen.u if s.name != "w_r"),
-    ])  # fmt: skip
+    X = Signals([*gg.X, *apu.governor.X, *gen.x])
+    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
+    own = [s for s in gen.u if s.name != "w_r"]
+    U = Signals([*(gg.U[n] for n in AMBIENT), N_ref, *own])
     return X, U, Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
 
@@ -202,25 +187,18 @@ def _joint(apu: Apu, load_kind: str) -> tuple[ca.Function, ca.Function]:
     X, U, TH, _ = _joint_signals(apu, load_kind)
     x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
     u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
-    N, Wf_I, x_gen = x[0], x[1], x[2:]
+    N, x_gov, x_gen = ca.vertsplit(x, [0, 1, 1 + len(apu.governor.X), len(X)])
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
     health, h = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
-    u_gen = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
-    y_gen = gen.g(x_gen, u_gen, h)
-    fuel = governor(N=N, N_ref=inputs["N_ref"], Wf_I=Wf_I, par=apu.governor)
-    PW = apu.PW(y_gen[gen.y.index("P_total")])
-    u_gg = ca.vertcat(fuel.Wf, PW, *(inputs[n] for n in AMBIENT))
+    link = dataclasses.replace(apu.link, N_ref=inputs["N_ref"])
+    u_gg, rates, y_gen = coupled(link, gen, N=N, x=x_gov, x_gen=x_gen, inputs=inputs, fault=h)
     N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
-    ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_gen, u_gen, h))
+    ode = ca.vertcat(N_dot, rates)
     z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
-    name = f"joint_averaged_{load_kind}"
-    return (
-        ca.Function(
-            f"{name}_equations", [x, z, u, theta], [ode, alg, ca.vertcat(y_gg, y_gen)],
-            ["x", "z", "u", "theta"], ["ode", "alg", "y"],
-        ),
-        ca.Function(f"{name}_z", [x, u, theta], [z_sol], ["x", "u", "theta"], ["z"]),
-    )  # fmt: skip
+    name, y = f"joint_averaged_{load_kind}", ca.vertcat(y_gg, y_gen)
+    names = ["x", "z", "u", "theta"], ["ode", "alg", "y"]
+    equations = ca.Function(f"{name}_equations", [x, z, u, theta], [ode, alg, y], *names)
+    return equations, ca.Function(f"{name}_z", [x, u, theta], [z_sol], ["x", "u", "theta"], ["z"])
 
 
 def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
@@ -232,7 +210,7 @@ def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
 def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
     """Return the whole unit with averaged generators, continuous in time.
 
-    States are the rotor speed N, the governor's integrator Wf_I and those of the averaged
+    States are the rotor speed N, those of the governor (Wf_I) and those of the averaged
     generator; inputs the ambient conditions, N_ref, V_ref and the load of each generator; theta
     the health factors and h, which stands for the same fault in both machines, as (8) counts
     them; outputs those of both models.  Shaft power is that of the very instant, (1), and the
@@ -270,6 +248,6 @@ def joint_vectors(
         "N_ref": apu.N_ref,
         **{n: v for n, v in gen_ss.u.unpack(u_gen).items() if n != "w_r"},
     }
-    x = np.concatenate([point.gas.x, [gas["Wf"]], x_gen])
+    x = np.concatenate([point.gas.x, apu.governor.start(gas["Wf"]), x_gen])
     theta = np.concatenate([point.gas.theta, np.zeros(len(gen_ss.theta))])
     return ss, x, ss.u.pack(values), theta

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
     return checked
 
 
-SAME_INSTANT = 1e-9  # s; events closer than this are at one instant
+def all_factors(factors: Mapping[str, float] | None) -> dict[str, float]:
+    """Return every health factor by name: the checked ones that are given, one for the others."""
+    return {**dict.fromkeys(HEALTH_FACTORS, 1.0), **health_factors(factors or {})}
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -21,34 +22,33 @@ import numpy as np
 from apu_casadi.core.errors import SimulationError, ValidityWarning
 from apu_casadi.core.means import RMS, Term, as_dict, settled, wanted
 from apu_casadi.core.results import dataset
+from apu_casadi.core.runloop import run
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
-from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.control import governor
 from apu_casadi.unit.events import (
     Ambient,
     Event,
     FaultChange,
     HealthChange,
     LoadChange,
-    health_factors,
+    all_factors,
     in_order,
 )
-from apu_casadi.unit.multirate import MEANS, exchange_grid
+from apu_casadi.unit.exchange import coupled
+from apu_casadi.unit.multirate import exchange_grid
+from apu_casadi.unit.stepmeans import MEANS, rms_at_rest
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
-
-_GRID_TOL = 1e-9  # s; instants closer than this are one
 
 
 @kept
@@ -60,10 +60,10 @@ def joint_state_space(
 ) -> StateSpace:
     """Return the unit as one :class:`StateSpace`.
 
-    States are the rotor speed N, the governor's integrator Wf_I and those of the generator
-    variant; algebraic unknowns those of the gas path (the generator's are eliminated, being
-    linear); inputs the ambient conditions and those of the generator but its speed; parameters
-    the health factors and those of the stator fault; outputs those of both models.
+    States are the rotor speed N, those of the governor (Wf_I) and those of the generator variant;
+    algebraic unknowns those of the gas path (the generator's are eliminated, being linear); inputs
+    the ambient conditions and those of the generator but its speed; parameters the health factors
+    and those of the stator fault; outputs those of both models.
 
     Args:
         apu: the unit.
@@ -75,37 +75,31 @@ def joint_state_space(
             path once more.
     """
     gg, gen = apu.gas_generator, apu.generator.state_space(load, fault)
-    own_u = Signals([s for s in gen.u if s.name != "w_r"])
-    clock_signal = Signal("t_step", "s", "time since the step's start", nominal=0.02)
-    X = Signals([
-        *gg.X, Signal("Wf_I", "kg/s", "integrator of the governor", nominal=0.05), *gen.x,
-        *([clock_signal] if integrals else []),
-        *(_integral(gen, name) for name in integrals),
-    ])  # fmt: skip
-    length = [Signal("h_step", "s", "length of the step", nominal=0.02)] if integrals else []
+    own_u = [s for s in gen.u if s.name != "w_r"]
+    clock = [Signal("t_step", "s", "time since the step's start", nominal=0.02)]
+    length = [Signal("h_step", "s", "length of the step", nominal=0.02)]
+    if not integrals:
+        clock, length = [], []
+    sums = [_integral(gen, name) for name in integrals]
+    X = Signals([*gg.X, *apu.governor.X, *gen.x, *clock, *sums])
     U = Signals([*(gg.U[n] for n in AMBIENT), *own_u, *length])
     TH, Y = Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
 
     x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
     u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
-    N, Wf_I, x_sg = x[0], x[1], x[2 : 2 + len(gen.x)]
-    n_health = len(gg.THETA)
-    health, severity = theta[:n_health], theta[n_health:]
-    own = u[len(AMBIENT) : len(AMBIENT) + len(own_u)]
-    inputs = dict(zip(own_u.names, ca.vertsplit(own), strict=True))
-    u_sg = ca.vertcat(*(apu.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
-    y_sg = gen.g(x_sg, u_sg, severity)
-    fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=Wf_I, par=apu.governor)
-    PW = apu.PW(y_sg[gen.y.index("P_total")])
-    u_gg = ca.vertcat(fuel.Wf, PW, u[: len(AMBIENT)])
-
-    clock = [ca.MX(1.0)] if integrals else []
+    ends = np.cumsum([0, 1, len(apu.governor.X), len(gen.x)]).tolist()
+    N, x_gov, x_sg = (x[i:j] for i, j in pairwise(ends))
+    health, severity = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
+    inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
+    u_gg, moves, y_sg = coupled(
+        apu.link, gen, N=N, x=x_gov, x_gen=x_sg, inputs=inputs, fault=severity
+    )
     share = x[X.index("t_step")] / u[U.index("h_step")] if integrals else ca.MX(0)
 
     def model(z: Any) -> tuple[Any, Any, Any]:
         N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
         rates = [Term.of(name).expression(gen, x_sg, y_sg, share) for name in integrals]
-        ode = ca.vertcat(N_dot, fuel.Wf_I_dot, gen.f(x_sg, u_sg, severity), *clock, *rates)
+        ode = ca.vertcat(N_dot, moves, *(ca.MX(1.0) for _ in clock), *rates)
         return ode, alg, ca.vertcat(y_gg, y_sg)
 
     z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
@@ -162,120 +156,150 @@ def simulate_monolithic(
     Warns:
         ValidityWarning: as ``simulate_joint``.
     """
-    gg, gen = apu.gas_generator, apu.generator
-    ambient = Ambient() if ambient is None else ambient
-    factors = {**dict.fromkeys(gg.THETA.names, 1.0), **health_factors(health or {})}
-    events, first_load = in_order(events, duration), load
-    pending = list(events)
-    grid = exchange_grid(duration, dt, pending)
-    point = apu.steady_state(load, ambient=ambient, health=factors)
-    V_ref, w_r = point.generator.V_ref, apu.w_r(apu.N_ref)
-    amb = dataclasses.astuple(ambient)
-    fault: Fault | None = None
-
-    def symmetric() -> bool:
-        return fault is None and load.balanced
-
-    def asked() -> tuple[str, ...]:
-        """Return the means that this load and fault need."""
-        return (*MEANS, *wanted(phasors=False, short=True, symmetric=symmetric()))
-
-    def variant() -> tuple[StateSpace, GeneratorModel, np.ndarray, np.ndarray]:
-        """Return joint model, generator model, inputs and parameters of load and fault now."""
-        ss = joint_state_space(apu, load.kind, gen.fault_kind(load, fault), asked())
-        u_sg = gen.inputs(load, w_r=w_r, V_ref=V_ref)
-        rest = np.delete(u_sg, gen.variant(load, fault).u.index("w_r"))
-        theta = np.concatenate([gg.THETA.pack(factors), gen.fault_vector(load, fault)])
-        return ss, gen.variant(load, fault), np.concatenate([amb, rest, [dt]]), theta
-
-    (ss, sg, u, theta), quad = variant(), asked()
-    x = np.concatenate([point.gas.x, [point.gas["Wf"]], point.generator.x, np.zeros(1 + len(quad))])
-    K = grid.size - 1
-    Y = np.empty((len(gg.Y), K + 1))
-    averages = {name: np.empty(K + 1) for name in (*MEANS, *RMS)}
-    Y[:, 0] = point.gas.y
-    y0 = point.generator.y
-    I = math.sqrt(sum(y0[f"i_{p}"] ** 2 for p in "abc") / 3)
-    for name in averages:
-        averages[name][0] = y0.get(name, y0["V_t"] if name[0] == "V" else I)
-    worst, nsteps = 0.0, 0
-    for k in range(1, K + 1):
-        t0, h = float(grid[k - 1]), float(grid[k] - grid[k - 1])
-        n_sg = len(sg.x)
-        old_load, old_fault, old, changed = load, fault, sg, False
-        while pending and pending[0].t <= t0 + _GRID_TOL:
-            event, changed = pending.pop(0), True
-            if isinstance(event, HealthChange):
-                factors.update(event.factors)
-            elif isinstance(event, LoadChange):
-                load = event.load
-            elif isinstance(event, FaultChange):
-                fault = event.fault
-        if changed:  # all that comes at one instant is one switch
-            w_r = apu.w_r(float(x[0]))
-            (ss, sg, u, theta), quad = variant(), asked()
-            x_sg = gen.transfer(
-                x[2 : 2 + n_sg], old, sg,
-                u=gen.inputs(old_load, w_r=w_r, V_ref=V_ref),
-                theta=gen.fault_vector(old_load, old_fault),
-                u_target=gen.inputs(load, w_r=w_r, V_ref=V_ref),
-                theta_target=gen.fault_vector(load, fault),
-            )  # fmt: skip
-            x, n_sg = np.concatenate([x[:2], x_sg, np.zeros(1 + len(quad))]), len(sg.x)
-        x[2 + n_sg :], u[-1] = 0.0, h
-        angle = float(x[ss.x.index("theta_e")])
-        fine = load.fineness
-        run = stepper(ss, 1, solver=solver, rtol=fine * rtol, atol=fine * atol)
-        try:
-            r = run(x, u, theta, h, t0=t0)
-        except SimulationError as error:
-            raise _explained(apu, error, x, Y[:, :k], ambient, factors, grid[: k + 1]) from None
-        x = r.x_end.copy()
-        j = ss.x.index("theta_e")
-        turn = (x[j] - angle) / (2 * math.pi)
-        x[j] = math.remainder(x[j], 2 * math.pi)
-        nsteps += int(r.stats["nsteps"])
-        Y[:, k] = r.y[: len(gg.Y), -1]
-        means = as_dict(quad, x[3 + n_sg :, None] / h)
-        rms = settled(means, turn=turn, symmetric=symmetric(), phasors=False)
-        for name, value in zip(averages, (*(means[n] for n in MEANS), *rms), strict=True):
-            averages[name][k] = value.item()
-        worst = max(worst, float(Y[gg.Y.index("residual"), k]))
-        if not worst <= RESIDUAL_TOL:
-            failed = SimulationError(f"{ss.name}: cycle residual {worst:.1e} > {RESIDUAL_TOL:.0e}")
-            raise _explained(apu, failed, x, Y[:, :k], ambient, factors, grid[: k + 1])
-        if progress is not None:
-            progress(float(grid[k]), duration)
-    values = dict(zip(gg.Y.names, Y, strict=True))
-    values |= averages
-    told = runrecord.asked(load=first_load, fault=None, ambient=ambient, events=events)
-    ds = dataset(
-        {"time": grid},
-        {"time": values},
-        signals=gg.Y,
-        attrs={"solver": solver, "rtol": rtol, "atol": atol, "nsteps": nsteps, **told},
+    events = in_order(events, duration)
+    grid = exchange_grid(duration, dt, events)
+    system = _OneModel(
+        apu,
+        grid,
+        load=load,
+        ambient=Ambient() if ambient is None else ambient,
+        health=all_factors(health),
+        how={"solver": solver, "rtol": rtol, "atol": atol},
     )
+    rows = np.empty((system.at_start().size, grid.size))
+    rows[:, 0] = system.at_start()
+
+    def record(k: int, n: int, row: np.ndarray) -> None:
+        rows[:, k] = row
+
+    run(system, grid, events, record=record, progress=progress)
+    gg = apu.gas_generator
+    values = dict(zip((*gg.Y.names, *MEANS, *RMS), rows, strict=True))
+    told = runrecord.asked(load=load, fault=None, ambient=system.ambient, events=events)
+    attrs = {**system.how, "nsteps": system.nsteps, **told}
+    ds = dataset({"time": grid}, {"time": values}, signals=gg.Y, attrs=attrs)
     starved = validity.fuel_limited(apu, grid, values["N"], values["Wf"])
-    unserved = validity.unserved(first_load, events, grid, values["P_e"])
+    unserved = validity.unserved(load, events, grid, values["P_e"])
     notes = [ValidityWarning(words) for words in (starved, unserved) if words]
     return validity.conclude(ds, validity.departures(gg, grid, values), notes)
 
 
-def _explained(
-    apu: Apu,
-    error: SimulationError,
-    x: np.ndarray,
-    Y: np.ndarray,
-    ambient: Ambient,
-    health: Mapping[str, float],
-    t: np.ndarray,
-) -> SimulationError:
-    """Return the error at t[-1] with the overload where that is the reason; Y is before it."""
-    N = float(x[0])
-    fuel = governor(N=N, N_ref=apu.N_ref, Wf_I=float(x[1]), par=apu.governor)
-    PW = float(Y[apu.gas_generator.Y.index("PW"), -1])
-    more = validity.overload(
-        apu, N=N, Wf=fuel.Wf, PW=PW, ambient=dataclasses.asdict(ambient), health=health
-    )
-    last = validity.before(apu.gas_generator, t[-2], Y[:, -1])
-    return SimulationError(f"at t = {t[-1]:.6g} s: {more or f'{error}; {last}'}")
+class _OneModel:
+    """The unit as one model on its way through a run.
+
+    Args:
+        load, ambient, health: at the start.
+        how: solver, rtol and atol.
+    """
+
+    def __init__(
+        self,
+        apu: Apu,
+        grid: np.ndarray,
+        *,
+        load: Load,
+        ambient: Ambient,
+        health: dict[str, float],
+        how: dict[str, Any],
+    ) -> None:
+        self.apu, self.grid, self.ambient, self.how = apu, grid, ambient, how
+        self.load, self.factors = load, health
+        self.fault: Fault | None = None
+        self.point = apu.steady_state(load, ambient=ambient, health=health)
+        self.y, self.nsteps, self.worst = self.point.gas.y, 0, 0.0
+        own = (*apu.governor.start(self.point.gas["Wf"]), *self.point.generator.x)
+        self.x = np.array([*self.point.gas.x, *own])  # without the integrals
+        self._first = 1 + len(apu.governor.X)  # of the generator's states
+        self._prepare()
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the phases differ by rotation only."""
+        return self.fault is None and self.load.balanced
+
+    def _prepare(self) -> None:
+        """Choose the models of load and fault, with their inputs and parameters."""
+        gen, gg = self.apu.generator, self.apu.gas_generator
+        self.quad = (*MEANS, *wanted(phasors=False, short=True, symmetric=self.symmetric))
+        kind = gen.fault_kind(self.load, self.fault)
+        self.ss = joint_state_space(self.apu, self.load.kind, kind, self.quad)
+        self.sg = gen.variant(self.load, self.fault)
+        rest = np.delete(self._u_sg(), self.sg.u.index("w_r"))
+        self.u = np.concatenate([dataclasses.astuple(self.ambient), rest, [0.0]])
+        fault = gen.fault_vector(self.load, self.fault)
+        self.theta = np.concatenate([gg.THETA.pack(self.factors), fault])
+
+    def _u_sg(self) -> np.ndarray:
+        w_r, V_ref = self.apu.w_r(float(self.x[0])), self.point.generator.V_ref
+        return self.apu.generator.inputs(self.load, w_r=w_r, V_ref=V_ref)
+
+    def at_start(self) -> np.ndarray:
+        """Outputs and means at the first instant."""
+        point = self.point.generator
+        means = [*(point.y[n] for n in MEANS), *rms_at_rest(point).values()]
+        return np.concatenate([self.point.gas.y, means])
+
+    def switch(self, events: Sequence[Event], t: float) -> None:
+        """Take the events of an instant, s, which are one switch."""
+        if not events:
+            return
+        gen, old, u_old = self.apu.generator, self.sg, self._u_sg()
+        theta_old = gen.fault_vector(self.load, self.fault)
+        for event in events:
+            if isinstance(event, HealthChange):
+                self.factors = {**self.factors, **event.factors}
+            elif isinstance(event, LoadChange):
+                self.load = event.load
+            elif isinstance(event, FaultChange):
+                self.fault = event.fault
+        self._prepare()
+        theta = gen.fault_vector(self.load, self.fault)
+        x_sg = gen.transfer(
+            self.x[self._first :],
+            old,
+            self.sg,
+            u=u_old,
+            theta=theta_old,
+            u_target=self._u_sg(),
+            theta_target=theta,
+        )
+        self.x = np.concatenate([self.x[: self._first], x_sg])
+
+    def advance(self, k: int, _until: float) -> tuple[int, np.ndarray]:
+        """Integrate over one output interval."""
+        t, h = float(self.grid[k]), float(self.grid[k + 1] - self.grid[k])
+        gg, at, fine = self.apu.gas_generator, self.ss.x.index("theta_e"), self.load.fineness
+        self.u[-1] = h
+        how = self.how | {n: fine * self.how[n] for n in ("rtol", "atol")}
+        x0 = np.concatenate([self.x, np.zeros(1 + len(self.quad))])
+        try:
+            r = stepper(self.ss, 1, **how)(x0, self.u, self.theta, h, t0=t)
+        except SimulationError as error:
+            raise self._explained(error, k) from None
+        n = self.x.size
+        self.x, y = r.x_end[:n].copy(), r.y[: len(gg.Y), -1]
+        turn = (self.x[at] - x0[at]) / (2 * math.pi)
+        self.x[at] = math.remainder(self.x[at], 2 * math.pi)
+        self.nsteps += int(r.stats["nsteps"])
+        means = as_dict(self.quad, r.x_end[n + 1 :, None] / h)
+        rms = settled(means, turn=turn, symmetric=self.symmetric, phasors=False)
+        self.worst = max(self.worst, float(y[gg.Y.index("residual")]))
+        if not self.worst <= RESIDUAL_TOL:
+            words = f"{self.ss.name}: cycle residual {self.worst:.1e} > {RESIDUAL_TOL:.0e}"
+            raise self._explained(SimulationError(words), k)
+        self.y = y
+        return 1, np.concatenate([y, *(means[n] for n in MEANS), *rms])
+
+    def _explained(self, error: SimulationError, k: int) -> SimulationError:
+        """Return the error of the interval from k with the overload where that is the reason."""
+        N, gg = float(self.x[0]), self.apu.gas_generator
+        more = validity.overload(
+            self.apu,
+            N=N,
+            Wf=self.apu.link.fuel(N, self.x[1 : self._first].tolist()).Wf,
+            PW=float(self.y[gg.Y.index("PW")]),
+            ambient=dataclasses.asdict(self.ambient),
+            health=self.factors,
+        )
+        last = validity.before(gg, self.grid[k], self.y)
+        return SimulationError(f"at t = {self.grid[k + 1]:.6g} s: {more or f'{error}; {last}'}")

@@ -9,24 +9,14 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from apu_casadi.core.sharing import once
+from apu_casadi.core.version import installed
 from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.events import Ambient, Event, FaultChange, LoadChange
 
-__all__ = ["asked", "installed", "load_words"]
-
-
-@once
-def installed() -> str:
-    """Return the installed version; "unknown" in a checkout that is not installed."""
-    try:
-        return version("apu-casadi")
-    except PackageNotFoundError:
-        return "unknown"
+__all__ = ["asked", "load_words"]
 
 
 def load_words(load: Load) -> str:

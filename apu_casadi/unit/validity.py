@@ -28,6 +28,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ApuWarning, ExchangeWarning, OperatingPointError, ValidityWarning
@@ -35,7 +36,6 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.control import GovernorParameters, governor
 from apu_casadi.unit.events import Event, LoadChange
 
 if TYPE_CHECKING:
@@ -69,9 +69,10 @@ PAPER_ERROR = 0.1
 SETTLED = 0.1  # s after which a constant-power load should have its power
 _STILL = 1e-5  # of the governed speed: a smaller excursion is none
 _WORDS = {
-    "SM": "beyond surge", "T4": "hot", "T5": "hot", "off_c": "off the compressor map",
-    "off_t": "off the turbine map", "Mach8": "exhaust exit choked", "Wf": "no flame",
-}  # fmt: skip
+    **dict.fromkeys(("T4", "T5"), "hot"),
+    **{"SM": "beyond surge", "Mach8": "exhaust exit choked", "Wf": "no flame"},
+    **{"off_c": "off the compressor map", "off_t": "off the turbine map"},
+}
 
 
 # ------------------------------------------------------------------------------ limits
@@ -133,12 +134,8 @@ def departures(
         if not out.any():
             continue
         k, first = int(np.argmax(beyond)), int(np.argmax(out))
-        found.append(
-            Departure(
-                name, gg.Y[name].unit, float(limit), float(values[k]), float(t[first]),
-                float(t[k]), float(steps[out].sum()),
-            )
-        )  # fmt: skip
+        instants = float(t[first]), float(t[k]), float(steps[out].sum())
+        found.append(Departure(name, gg.Y[name].unit, float(limit), float(values[k]), *instants))
     return found
 
 
@@ -200,10 +197,8 @@ def overload(
         return None
     asked = f"{PW / 1e3:.1f} kW of shaft power" if math.isfinite(PW) else "more shaft power"
     try:
-        most = trim_gas_generator(
-            apu.gas_generator, {"N": apu.N_ref, "Wf": high}, theta=health, limits=Limits.none(),
-            **ambient,
-        )  # fmt: skip
+        at, free = {"N": apu.N_ref, "Wf": high}, Limits.none()
+        most = trim_gas_generator(apu.gas_generator, at, theta=health, limits=free, **ambient)
         gives = (
             f"gives {most['PW'] / 1e3:.1f} kW at the governed speed (T4 = {most['T4']:.0f} K, "
             f"SM = {most['SM']:.3f})"
@@ -255,26 +250,107 @@ def exchange_error(
         t, N, Wf: exchange instants (s), speed there (rad/s), and the fuel flow (kg/s) held over the
             step that ends there, shape (K,).
     """
-    a, b = _rotor(apu.gas_generator, point)
-    n, I = 0.0, float(Wf[0])  # speed from its start, governor's integrator
-    error = excursion = 0.0
+    rotor = _Rotor(apu, point, float(N[0]), float(Wf[0]))
     for first in range(0, t.size - 1, _CHUNK):
         at = slice(first, min(first + _CHUNK + 1, t.size))
         h, run = np.diff(t[at]), N[at] - N[0]
-        e = np.exp(a * h)
-        g = np.expm1(a * h) / a if a else h
-        d = (run[1:] - e * run[:-1]) / g - b * (Wf[at][1:] - Wf[0])
-        n, I, error, excursion = _continuous(
-            apu.governor, apu.N_ref, float(N[0]), (a, b, float(Wf[0])), h, d, run[1:],
-            (n, I, error, excursion),
-        )  # fmt: skip
-    return ExchangeError(error / max(excursion, _STILL * apu.N_ref), excursion)
+        e = np.exp(rotor.a * h)
+        g = np.expm1(rotor.a * h) / rotor.a if rotor.a else h
+        d = (run[1:] - e * run[:-1]) / g - rotor.b * (Wf[at][1:] - Wf[0])
+        rotor.drive(h, d, run[1:])
+    return ExchangeError(rotor.error / max(rotor.excursion, _STILL * apu.N_ref), rotor.excursion)
 
 
 _CHUNK = 8192  # steps at a time: the memory of a long run stays small
 
 
-def _rotor(gg: GasGenerator, point: OperatingPoint) -> tuple[float, float]:
+class _Rotor:
+    """The linear rotor under the continuous governor.
+
+    Exact where the fuel is within its limits and the law is linear in speed and states, as it is
+    linearised at the start; by Heun's rule in small parts of the step where a limit is met.
+    """
+
+    def __init__(self, apu: Apu, point: OperatingPoint, N_0: float, Wf_0: float) -> None:
+        self.link, self.N_0, self.Wf_0 = apu.link, N_0, Wf_0
+        self.a, self.b = _slopes(apu.gas_generator, point)
+        self.state = np.array([0.0, *apu.governor.start(Wf_0)])  # speed from its start, governor's
+        self.error = self.excursion = 0.0
+        self._matrix, self._demand = self._linear()
+        self._moves: dict[float, np.ndarray] = {}
+
+    def _linear(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rates of (n, x) and demand under the unlimited governor: factors of n, x, d and 1."""
+        law, m = self.link.governor, self.state.size
+        s = ca.SX.sym("s", m)
+        e = (self.link.N_ref - self.N_0 - s[0]) / self.link.N_ref
+        x = ca.vertsplit(s[1:])
+        own = ca.vertcat(law.demand(e, x), *law.rates(e, x, 0.0))
+        value, slope = (
+            v.full() for v in ca.Function("own", [s], [own, ca.jacobian(own, s)])(self.state)
+        )
+        rows = np.zeros((m, m + 2))
+        rows[:, :m], rows[:, -1] = slope, value.ravel() - slope @ self.state
+        M = np.zeros((m + 2, m + 2))
+        M[0] = self.b * rows[0]
+        M[0, 0] += self.a
+        M[0, -2:] += 1.0, -self.b * self.Wf_0
+        M[1:m] = rows[1:]
+        return M, rows[0]
+
+    def _move(self, h: float) -> np.ndarray:
+        """Exact step of (n, x) over h, and the demand at its end: factors of n, x, d and 1."""
+        M, m = self._matrix, self.state.size
+        # scaled, Taylor's series, squared again; scipy's expm costs a hundred times as much
+        halvings = max(0, math.ceil(math.log2(float(np.abs(M).sum(1).max()) * h)) + 2)
+        part = M * (h / 2**halvings)
+        E = term = np.eye(m + 2)
+        for k in range(1, 13):
+            term = term @ part / k
+            E = E + term
+        for _ in range(halvings):
+            E = E @ E
+        return np.vstack([E[:m], self._demand @ E])
+
+    def drive(self, h: np.ndarray, d: np.ndarray, run: np.ndarray) -> None:
+        """Go on over steps of lengths h by their disturbances; compare with the speeds of a run."""
+        low, high = self.link.governor.Wf_min, self.link.governor.Wf_max
+        m, v = self.state.size, np.append(self.state, [0.0, 1.0])
+        now = float(self._demand @ v)
+        steps = np.round(h, 12).tolist()  # equal but for rounding: one exponential
+        for step, dist, seen in zip(steps, d.tolist(), run.tolist(), strict=True):
+            if step not in self._moves:
+                if len(self._moves) > 64:
+                    self._moves.clear()
+                self._moves[step] = self._move(step)
+            v[m] = dist
+            after = self._moves[step] @ v
+            then = float(after[m])
+            if low < min(now, then) and max(now, then) < high:
+                v[:m] = after[:m]
+            else:
+                v[:m] = self._by_parts(v[:m], step, dist)
+                then = float(self._demand @ v)
+            now, n = then, float(v[0])
+            self.error = max(self.error, abs(seen - n))
+            self.excursion = max(self.excursion, abs(n))
+        self.state = v[:m].copy()
+
+    def _by_parts(self, state: np.ndarray, h: float, dist: float) -> np.ndarray:
+        def rates(s: np.ndarray) -> np.ndarray:
+            n, *x = s.tolist()
+            fuel = self.link.fuel(self.N_0 + n, x)
+            return np.array([self.a * n + self.b * (fuel.Wf - self.Wf_0) + dist, *fuel.rates])
+
+        parts = max(8, math.ceil(h / 2e-3))
+        for _ in range(parts):
+            k1 = rates(state)
+            k2 = rates(state + h / parts * k1)
+            state = state + h / parts / 2 * (k1 + k2)
+        return state
+
+
+def _slopes(gg: GasGenerator, point: OperatingPoint) -> tuple[float, float]:
     """Return d(dN/dt)/dN, 1/s, and d(dN/dt)/dWf, (rad/s2)/(kg/s), at a steady point."""
     x, u, theta = point.x, np.array(point.u, float), point.theta
     ode, slope, *_ = gg.cycle.dfdx(x, point.z, u, theta)
@@ -282,74 +358,6 @@ def _rotor(gg: GasGenerator, point: OperatingPoint) -> tuple[float, float]:
     z = gg.solve(point.z, x, u, theta)
     more, *_ = gg.cycle.dfdx(x, z, u, theta)
     return float(slope), (float(more) - float(ode)) / (step * float(point.u[0]))
-
-
-def _continuous(
-    par: GovernorParameters,
-    N_ref: float,
-    N_0: float,
-    rotor: tuple[float, float, float],
-    h: np.ndarray,
-    d: np.ndarray,
-    run: np.ndarray,
-    state: tuple[float, float, float, float],
-) -> tuple[float, float, float, float]:
-    """Drive rotor and continuous governor by the disturbances of some steps.
-
-    Exact where the fuel is within its limits, by Heun's rule in small parts of the step where it
-    meets one.  ``state`` and the answer: speed, integrator, largest error, largest excursion.
-    """
-    a, b, Wf_0 = rotor
-    n, I, error, excursion = state
-    moves: dict[float, tuple[float, ...]] = {}
-
-    def rates(n: float, I: float, dist: float) -> tuple[float, float]:
-        fuel = governor(N=N_0 + n, N_ref=N_ref, Wf_I=I, par=par)
-        return a * n + b * (fuel.Wf - Wf_0) + dist, fuel.Wf_I_dot
-
-    steps = np.round(h, 12).tolist()  # equal but for rounding: one exponential
-    for step, dist, seen in zip(steps, d.tolist(), run.tolist(), strict=True):
-        if step not in moves:
-            if len(moves) > 64:
-                moves.clear()
-            moves[step] = _move(a, b, Wf_0, N_0, N_ref, par, step)
-        m = moves[step]
-        n1 = m[0] * n + m[1] * I + m[2] * dist + m[3]
-        I1 = m[4] * n + m[5] * I + m[6] * dist + m[7]
-        now = par.Kp * (N_ref - N_0 - n) / N_ref + I
-        then = par.Kp * (N_ref - N_0 - n1) / N_ref + I1
-        if not (par.Wf_min < min(now, then) and max(now, then) < par.Wf_max):
-            n1, I1 = n, I
-            parts = max(8, math.ceil(step / 2e-3))
-            for _ in range(parts):
-                k1, q1 = rates(n1, I1, dist)
-                part = step / parts
-                k2, q2 = rates(n1 + part * k1, I1 + part * q1, dist)
-                n1, I1 = n1 + part / 2 * (k1 + k2), I1 + part / 2 * (q1 + q2)
-        n, I = n1, I1
-        error = max(error, abs(seen - n))
-        excursion = max(excursion, abs(n))
-    return n, I, error, excursion
-
-
-def _move(
-    a: float, b: float, Wf_0: float, N_0: float, N_ref: float, par: GovernorParameters, h: float
-) -> tuple[float, ...]:
-    """Exact step of (n, I) under the unlimited governor: factors of n, I, d and 1."""
-    e_0 = (N_ref - N_0) / N_ref
-    M = np.zeros((4, 4))
-    M[0] = a - b * par.Kp / N_ref, b, 1.0, b * (par.Kp * e_0 - Wf_0)
-    M[1] = -par.Ki / N_ref, 0.0, 0.0, par.Ki * e_0
-    # scaled, Taylor's series, squared again; scipy's expm costs a hundred times as much for 4 x 4
-    halvings = max(0, math.ceil(math.log2(float(np.abs(M).sum(1).max()) * h)) + 2)
-    part = M * (h / 2**halvings)
-    E = term = np.eye(4)
-    for k in range(1, 13):
-        term = term @ part / k
-        E = E + term
-    for _ in range(halvings):
-        E = E @ E
-    return tuple(E[:2].ravel().tolist())
 
 
 def accepted(error: float, exchange: str, dt: float) -> bool:

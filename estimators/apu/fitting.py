@@ -27,11 +27,20 @@ from apu_casadi.core.simulation import stepper
 from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.unit.control import GovernorParameters, governor
-from estimators.apu.sensors import GAS_PATH, SensorSet
-from estimators.batch.fit import FitProblem, FitResult, quantile
-from estimators.information.intervals import share_interval
-from estimators.models.filtermodel import FilterModel, biases, gains, measure, measured_inputs
+from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.unit.exchange import moved
+from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
+from estimators.batch.fit import FitProblem
+from estimators.batch.fitresult import FitResult
+from estimators.information.consistency import coverage as shares_covered
+from estimators.models.filtermodel import (
+    FilterModel,
+    biases,
+    gains,
+    lagging,
+    measure,
+    measured_inputs,
+)
 from estimators.models.lifting import Lifted, lift
 from estimators.models.recording import Recording, plain_numbers, record
 
@@ -48,25 +57,19 @@ __all__ = [
     "words",
 ]
 
-HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
-INPUTS = ("Wf", "PW")
+HEALTH = GasGenerator.THETA.names
+OUTPUTS = GAS_PATH.outputs
+INPUTS = tuple(n for n in GAS_PATH.names if n not in OUTPUTS)
 OPEN = 10.0  # standard deviation of an input that is not measured, of its magnitude: tells nothing
 SMOOTH = 0.4  # s; readings are averaged over this to find the noise that is relative to them
 MAX_DT = 0.2  # s; the model takes one step from sample to sample
-
-_WORDS = {
-    "f_eta_c": "compressor efficiency",
-    "f_W_c": "compressor flow",
-    "f_eta_t": "turbine efficiency",
-    "f_W_t": "turbine flow capacity",
-}
 
 
 def words(name: str) -> str:
     """Return what a parameter is, in words."""
     base = name.partition("[")[0]
-    if base in _WORDS:
-        return _WORDS[base]
+    if base in HEALTH:
+        return GasGenerator.THETA[base].doc.removesuffix(" factor")
     kind, _, sensor = base.partition("_")
     return {"gain": f"gain of the {sensor} sensor", "bias": f"bias of the {sensor} sensor"}[kind]
 
@@ -84,17 +87,24 @@ def engine_model(
     gain: tuple[str, ...] = (),
     bias: tuple[str, ...] = (),
     steady: bool = False,
+    sensors: tuple[Sensor, ...] = (),
 ) -> Lifted:
     """Return the lifted model of an engine for fits.
 
     Args:
         outputs: measured outputs besides fuel flow and power.
         gain, bias: those whose sensors have an unknown gain error or bias.
-        steady: every sample is an operating point.
+        steady: every sample is an operating point, where no lag shows.
+        sensors: those of the outputs that are no outputs of the engine themselves.
     """
+    own = {s.name: s for s in sensors}
+
+    def read(m: FilterModel) -> FilterModel:
+        of = [own.get(n) or Sensor(n, 0.0, False, 0.0, gg.Y[n].unit, "") for n in outputs]
+        return lagging(m, [(s.signal, s.expression, s.reads, 0.0 if steady else s.tau) for s in of])
 
     def build(m: FilterModel) -> FilterModel:
-        m = measured_inputs(measure(m, outputs), INPUTS)
+        m = measured_inputs(read(m) if own else measure(m, outputs), INPUTS)
         m = gains(m, gain) if gain else m
         return biases(m, bias) if bias else m
 
@@ -138,7 +148,7 @@ def _level(t: np.ndarray, v: np.ndarray, steady: bool) -> np.ndarray:
     there = np.isfinite(v)
     full = np.interp(t, t[there], v[there])
     if steady or t.size < 3:
-        return full
+        return np.asarray(full)
     half = max(1, round(SMOOTH / 2 / float(np.median(np.diff(t)))))
     sums = np.concatenate([[0.0], np.cumsum(full)])
     k = np.arange(t.size)
@@ -173,7 +183,7 @@ def to_recording(
         )
 
     def sigma(name: str, v: np.ndarray) -> np.ndarray:
-        return np.array([sensors.sigma(name, r) for r in _level(t, v, steady)]) / root
+        return np.asarray(sensors.sigma(name, _level(t, v, steady)) / root * np.ones(v.size))
 
     outputs, noise = {}, {}
     for name in lifted.model.y.names:
@@ -193,8 +203,10 @@ def to_recording(
         wide = np.full(t.size, OPEN * design)
         if there.any():
             inputs[name] = (t, np.interp(t, t[there], v[there]))
-            inputs[f"sigma_{name}"] = (t, np.where(there, np.maximum(sigma(name, v), 1e-9 * design),
-                                                   wide))  # fmt: skip
+            inputs[f"sigma_{name}"] = (
+                t,
+                np.where(there, np.maximum(sigma(name, v), 1e-9 * design), wide),
+            )
         else:
             inputs[name], inputs[f"sigma_{name}"] = (t, np.full(t.size, design)), (t, wide)
     for name, value in data.ambient.items():
@@ -203,13 +215,7 @@ def to_recording(
             raise DataError(f"{data.name}: {name} has gaps; ambient conditions are needed always")
         inputs[name] = float(a) if a.ndim == 0 else (t, a)
     p = dict.fromkeys(lifted.model.p.names, 0.0) | dict.fromkeys(HEALTH, 1.0)
-    return record(
-        lifted.model,
-        outputs=outputs,
-        sigma=noise,
-        inputs=inputs,
-        p=p,
-    )
+    return record(lifted.model, outputs=outputs, sigma=noise, inputs=inputs, p=p)
 
 
 def _read(lifted: Lifted, r: Recording, name: str) -> np.ndarray:
@@ -317,7 +323,10 @@ def fit_engine(
         )
     every = [*estimate, *own, *(consider or ())]
     gain, bias = split_names(every, outputs)
-    lifted = engine_model(gg, outputs, gain=tuple(gain), bias=tuple(bias), steady=steady)
+    own_model = tuple(s.model() for s in sensors.only(outputs).sensors if not s.direct)
+    lifted = engine_model(
+        gg, outputs, gain=tuple(gain), bias=tuple(bias), steady=steady, sensors=own_model
+    )
     recordings = [to_recording(gg, lifted, d, sensors, averaged=averaged) for d in data]
     values = dict(fixed or {})
     split_names(list(values), ())
@@ -330,11 +339,7 @@ def fit_engine(
         p[i] = list(values.values())
         recordings[k] = dataclasses.replace(r, p=p)
     problem = FitProblem(
-        lifted,
-        [r.size for r in recordings],
-        estimate,
-        own=own,
-        consider=tuple(consider or ()),
+        lifted, [r.size for r in recordings], estimate, own=own, consider=tuple(consider or ())
     )
     result = problem.solve(recordings, prior=prior, bounds=bounds, consider=consider)
     # an input left open is an unknown without a reading
@@ -345,7 +350,6 @@ def fit_engine(
 
 # ------------------------------------------------------------------------------ coverage
 
-OUTPUTS = ("N", "P3", "T3", "T5")
 POWERS = (100e3, 175e3, 250e3, 325e3, 400e3)  # W; the steady points of the study
 READINGS = 25  # of each sensor at each steady point, half a second at 20 ms
 STEP = (150e3, 350e3)  # W; before and after the load step of the transient
@@ -365,7 +369,7 @@ def steady_truth(gg: GasGenerator, theta: np.ndarray) -> EngineData:
             gg, {"N": gg.parameters.N, "PW": PW}, theta=dict(zip(HEALTH, theta, strict=True))
         )
         for PW in POWERS
-    ]  # fmt: skip
+    ]
     readings = {n: np.array([p[n] for p in points]) for n in (*OUTPUTS, *INPUTS)}
     return EngineData("steady", np.arange(len(points), dtype=float), readings, dict(DEFAULT_DAY))
 
@@ -380,18 +384,18 @@ def transient_truth(
     ss, par = gg.state_space, GovernorParameters()
     start = trim_gas_generator(
         gg, {"N": gg.parameters.N, "PW": STEP[0]}, theta=dict(zip(HEALTH, theta, strict=True))
-    )  # fmt: skip
+    )
     run = stepper(ss, 1, rtol=1e-9, atol=1e-11)
-    x, Wf_I = start.x.copy(), float(start["Wf"])
+    x, x_gov = start.x.copy(), par.start(float(start["Wf"]))
     t, rows = np.arange(K) * dt, []
     for k in range(K):
         PW = STEP[0] if t[k] < 0.3 else STEP[1]
-        out = governor(N=float(x[0]), N_ref=gg.parameters.N, Wf_I=Wf_I, par=par)
-        u = ss.u.pack({"Wf": out.Wf, "PW": PW})
+        Wf, moves = par.law(float(x[0]), gg.parameters.N, x_gov)
+        u = ss.u.pack({"Wf": Wf, "PW": PW})
         y = ss.y.unpack(np.array(ss.g(x, u, theta)).ravel())
         rows.append([y[n] for n in (*OUTPUTS, *INPUTS)])
         x = run(x, u, theta, dt).x_end
-        Wf_I += dt * float(out.Wf_I_dot)
+        x_gov = moved(x_gov, dt, moves)
     values = np.array(rows).T
     readings = dict(zip((*OUTPUTS, *INPUTS), values, strict=True))
     return EngineData("load step", t, readings, dict(DEFAULT_DAY))
@@ -406,11 +410,9 @@ def noisy(
     sensors: SensorSet = GAS_PATH,
 ) -> EngineData:
     """Return the data as sensors would read them; the noise is relative to the true reading."""
-    out = {}
-    for name, v in data.readings.items():
-        sigma = np.array([sensors.sigma(name, x) for x in v]) / np.sqrt(averaged)
-        out[name] = v * (1 + (gain or {}).get(name, 0.0)) + sigma * rng.standard_normal(v.size)
-    return dataclasses.replace(data, readings=out)
+    true = data.readings
+    read = sensors.measure(true, rng, gains=gain, averaged=averaged, noise_of="true")
+    return dataclasses.replace(data, readings=read)
 
 
 KINDS = ("steady", "transient", "steady, gains considered", "steady, gains ignored")
@@ -448,22 +450,25 @@ def coverage(
     began = time.perf_counter()
     gg = _engine()
     steady = kind != "transient"
-    gained = ("P3", "T3", "T5") if "gains" in kind else ()
+    gained = OUTPUTS[1:] if "gains" in kind else ()
     lifted = engine_model(gg, OUTPUTS, gain=gained, steady=steady)
     considered = {f"gain_{g}": GAS_PATH[g].gain for g in gained} if "considered" in kind else {}
     healths = _healths(seed0)
     truth = [(steady_truth if steady else transient_truth)(gg, th) for th in healths]
     averaged = READINGS if steady else 1
     problem = FitProblem(
-        lifted, [truth[0].t.size], HEALTH, consider=tuple(considered),
+        lifted,
+        [truth[0].t.size],
+        HEALTH,
+        consider=tuple(considered),
         build=(not steady) if build is None else build,
-    )  # fmt: skip
+    )
     error, sigma = np.full((n, 4), np.nan), np.full((n, 4), np.nan)
     chi2, freedom, failed = [], 0, 0
     for i in range(n):
         rng = np.random.default_rng([seed0, 1, i])
         who = i % ENGINES
-        gain = {g: GAS_PATH[g].gain * float(rng.standard_normal()) for g in gained}
+        gain = GAS_PATH.draw_gains(rng, gained)
         data = noisy(truth[who], rng, averaged=averaged, gain=gain)
         rec = to_recording(gg, lifted, data, averaged=averaged)
         try:
@@ -476,25 +481,11 @@ def coverage(
             freedom = r.freedom
         if progress is not None:
             progress(i + 1, n)
-    inside = np.abs(error) <= quantile(level) * sigma  # a failed fit covers nothing
-    rows = []
-    for j, name in enumerate(HEALTH):
-        k = int(inside[:, j].sum())
-        low, high = share_interval(k, n)
-        rows.append(
-            {
-                "name": name,
-                "covered": k / n,
-                "low": low,
-                "high": high,
-                "rms_error": float(np.sqrt(np.nanmean(error[:, j] ** 2))),
-                "mean_sigma": float(np.nanmean(sigma[:, j])),
-                "bias_over_its_error": float(
-                    np.nanmean(error[:, j])
-                    / (np.nanstd(error[:, j]) / np.sqrt(np.isfinite(error[:, j]).sum()))
-                ),
-            }
-        )
+    # a failed fit covers nothing
+    rows = [
+        {"name": name, **shares_covered(error[:, j], sigma[:, j], level)}
+        for j, name in enumerate(HEALTH)
+    ]
     return {
         "kind": kind,
         "n": n,

@@ -6,9 +6,7 @@ noise is that of the sensor table, averaged over ``samples`` of 20 ms; the noise
 is not averaged, since the electrical filter's errors last longer than a snapshot.  Efficiency of
 the generators (reading of PW over its true value) and gain errors of the sensors are considered:
 uncertain, not estimated.
-
-Generator: severity (mu, k_rf) of a turn-to-turn short circuit from the current of the faulty phase
-at given voltages, through the equivalent shunt of :mod:`apu_casadi.machine.faults.ttsc`.
+The generator's side is in :mod:`estimators.apu.severity`.
 """
 
 from __future__ import annotations
@@ -21,28 +19,26 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import scipy.stats
 
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
-from apu_casadi.core.sharing import kept, last
+from apu_casadi.core.measuring import measure
+from apu_casadi.core.sharing import last
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.machine.faults.ttsc import Ttsc
-from apu_casadi.machine.generator import Generator
-from apu_casadi.machine.loads.series import SeriesLoad
-from estimators.apu.sensors import ELECTRICAL, GAS_PATH, Sensor, SensorSet
+from estimators.apu.sensors import GAS_PATH, SensorSet
 from estimators.filters.belief import Belief
-from estimators.information.identifiability import (
-    Identifiability,
+from estimators.information import consistency
+from estimators.information.identifiability import Identifiability, identify
+from estimators.information.sensitivities import (
     Sensitivities,
-    identify,
     recording_sensitivities,
     steady_sensitivities,
     together,
 )
-from estimators.models.filtermodel import Unknown, augment, discretise, measure, noisy_inputs
+from estimators.models import filtermodel
+from estimators.models.filtermodel import Unknown, augment, discretise, noisy_inputs
 from estimators.models.recording import Recording
 
 __all__ = [
@@ -50,7 +46,6 @@ __all__ = [
     "BASE",
     "CANDIDATES",
     "POINTS",
-    "Severity",
     "Trials",
     "findings",
     "gas_path",
@@ -58,8 +53,6 @@ __all__ = [
     "limiting_gains",
     "limiting_noises",
     "needed_samples",
-    "severity",
-    "severity_study",
     "shaft_power_snapshot",
     "snapshot_sweep",
     "snapshot_trials",
@@ -75,17 +68,10 @@ POINTS: dict[str, dict[str, float]] = {
 }
 
 #: What a gas-path filter has without the generators.
-BASE = ("N", "P3", "T3", "T5", "Wf")
+BASE = tuple(n for n in GAS_PATH.names if n != "PW")
 
 #: The sensors of the gas-path table, and some that could be added.
-CANDIDATES = SensorSet(
-    (
-        *GAS_PATH.sensors,
-        Sensor("W2", 0.01, True, 0.01, "kg/s", "assumed: bellmouth, 1 %"),
-        Sensor("P5", 0.005, True, 0.005, "Pa", "assumed: as P3"),
-        Sensor("T41", 0.01, True, 0.01, "K", "assumed: pyrometer, 1 %"),
-    )
-)
+CANDIDATES = GAS_PATH.add("W2", "P5", "T41")
 
 SAMPLES = 50  # of 20 ms: a snapshot of 1 s
 PRIOR = 0.02  # standard deviation of each health factor before the snapshot
@@ -176,6 +162,20 @@ def gas_path(
     return together(parts, shared=constant)
 
 
+def _readings(
+    gg: GasGenerator, sensors: SensorSet, at: OperatingPoint
+) -> tuple[np.ndarray, np.ndarray]:
+    """Readings of sensors at a steady point, where no lag shows, and their derivatives by Y."""
+    for s in sensors.sensors:
+        if not set(s.reads) <= set(gg.Y.names):
+            raise ParameterError(f"sensor {s.name!r} measures no output of the gas generator")
+    y = ca.SX.sym("y", len(gg.Y))
+    seen = ca.vertcat(*(s.of(gg.Y.unpack(y)) for s in sensors.sensors))
+    values = np.array([at[n] for n in gg.Y.names])
+    read, along = ca.Function("readings", [y], [seen, ca.jacobian(seen, y)])(values)
+    return read.full().ravel(), along.full()
+
+
 def _gas_path(
     point: str,
     gg: GasGenerator,
@@ -187,10 +187,7 @@ def _gas_path(
     gain_errors: bool,
 ) -> Sensitivities:
     at, H, _ = _derivatives(point, gg)
-    unknown = [n for n in sensors.names if n not in gg.Y]
-    if unknown:
-        raise ParameterError(f"sensor {unknown[0]!r} measures no output of the gas generator")
-    y = np.array([at[n] for n in sensors.names])
+    y, along = _readings(gg, sensors, at)
     sigma = np.array([sensors.sigma(n, v) for n, v in zip(sensors.names, y, strict=True)])
     sigma /= math.sqrt(samples)
     if "PW" in sensors.names:
@@ -202,7 +199,7 @@ def _gas_path(
         *(Signal(s.name, s.unit, s.doc) for s in gg.THETA),
     ]
     priors = dict.fromkeys(gg.THETA.names, prior)
-    columns = [H[gg.Y.indices(sensors.names)]]
+    columns = [along @ H]
     gains = {
         s.name: (eta_bias if s.name == "PW" else s.gain if gain_errors else 0.0)
         for s in sensors.sensors
@@ -214,9 +211,13 @@ def _gas_path(
             priors[f"gain_{name}"] = gain
             columns.append(np.eye(len(y))[:, [i]] * y[i])
     return Sensitivities.of(
-        Signals(signals), sensors.names, np.hstack(columns), sigma,
-        faults=gg.THETA.names, prior=priors,
-    )  # fmt: skip
+        Signals(signals),
+        sensors.names,
+        np.hstack(columns),
+        sigma,
+        faults=gg.THETA.names,
+        prior=priors,
+    )
 
 
 #: Of the transient: s from the start of the ramp to its end, and proportional fuel control that
@@ -235,6 +236,7 @@ def gas_path_transient(
     prior: float = PRIOR,
     sensors: SensorSet = GAS_PATH,
     backend: str | None = None,
+    gas_generator: GasGenerator | None = None,
 ) -> Sensitivities:
     """Return what a recording through a load ramp tells of the four health factors.
 
@@ -249,11 +251,12 @@ def gas_path_transient(
         prior: standard deviation of each health factor before.
         sensors: the sensor table.
         backend: see :func:`apu_casadi.core.backend.compiled`.
+        gas_generator: the engine; the paper's by default.
 
     Raises:
         OperatingPointError, EstimationError: the engine does not run, or is lost, on the way.
     """
-    gg = _DEFAULT
+    gg = gas_generator or _DEFAULT
     ss = gg.state_space
     dt, K = 0.02, round(seconds / 0.02)
     t = dt * np.arange(K)
@@ -262,7 +265,7 @@ def gas_path_transient(
     Wf = np.interp(PW, [from_power, to_power], [e["Wf"] for e in ends])
     noise = {"Wf": sensors["Wf"].noise * ends[1]["Wf"]}
     noise["PW"] = power_noise * to_power if power else UNKNOWN_PW
-    model = measure(discretise(ss), ["N", "P3", "T3", "T5"])
+    model = filtermodel.measure(discretise(ss), GAS_PATH.outputs)
     model = augment(noisy_inputs(model, noise), {n: Unknown() for n in gg.THETA.names})
     x = np.ones((len(model.x), K))
     x[0, 0] = ends[0]["N"]
@@ -296,6 +299,7 @@ def shaft_power_snapshot(
     eta_bias: float = 0.0,
     samples: int = SAMPLES,
     gain_errors: bool = False,
+    gas_generator: GasGenerator | None = None,
 ) -> dict[str, Any]:
     """Return how much measured shaft power reduces the health factors' standard deviations.
 
@@ -310,14 +314,14 @@ def shaft_power_snapshot(
     Raises:
         ParameterError: numbers out of range.
     """
-    g = gas_path(
-        point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
-        eta_bias=eta_bias, gain_errors=gain_errors,
-    )  # fmt: skip
+    how: dict[str, Any] = {"sensors": GAS_PATH, "samples": samples, "prior": prior}
+    how["gas_generator"] = gas_generator
+    errors: dict[str, Any] = {"power_noise": power_noise, "eta_bias": eta_bias}
+    g = gas_path(point, **how, **errors, gain_errors=gain_errors)
     without = g.only(BASE)
     C0, C1 = without.covariance(), g.covariance()
     # with gain errors considered it is no longer exactly invisible: take it without them
-    plain = gas_path(point, sensors=GAS_PATH, samples=samples, prior=prior).only(BASE)
+    plain = gas_path(point, **how).only(BASE)
     v = np.linalg.svd(plain.signatures())[2][-1]
     v = v * np.sign(v[np.abs(v).argmax()])
     s0, s1 = np.sqrt(np.diag(C0)), np.sqrt(np.diag(C1))
@@ -363,10 +367,7 @@ def snapshot_sweep(
     """
     chosen = VARIANTS if variants is None else variants
     return [
-        {
-            "variant": label,
-            **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options),
-        }
+        {"variant": label, **shaft_power_snapshot(point, prior=prior, power_noise=noise, **options)}
         for label, options in chosen.items()
         for noise in power_noises
         for prior in priors
@@ -498,6 +499,7 @@ def snapshot_trials(
     power_noise: float = GAS_PATH["PW"].noise,
     eta_bias: float = 0.0,
     samples: int = SAMPLES,
+    gas_generator: GasGenerator | None = None,
 ) -> Trials:
     """Estimate the health factors from random snapshots of the nonlinear engine.
 
@@ -508,14 +510,19 @@ def snapshot_trials(
     Raises:
         EstimationError: a draw has no steady readings, or the iteration does not converge.
     """
-    gg = _DEFAULT
+    gg = gas_generator or _DEFAULT
     at = _steady(point, gg)
     read = _Reader(gg, at)
     rows = gg.Y.indices(GAS_PATH.names)
     g = gas_path(
-        point, sensors=GAS_PATH, samples=samples, prior=prior, power_noise=power_noise,
+        point,
+        sensors=GAS_PATH,
+        samples=samples,
+        prior=prior,
+        power_noise=power_noise,
         eta_bias=eta_bias,
-    )  # fmt: skip
+        gas_generator=gas_generator,
+    )
     nominal = np.array([at[n] for n in GAS_PATH.names])
     sigma = np.array([GAS_PATH.sigma(n, v) for n, v in zip(GAS_PATH.names, nominal, strict=True)])
     sigma /= math.sqrt(samples)
@@ -533,11 +540,12 @@ def snapshot_trials(
         rng = np.random.default_rng(seed)
         true = start.copy()
         true[2:] += prior * rng.standard_normal(4)
-        y = read(true)[0][rows] + sigma * rng.standard_normal(len(rows))
+        y = measure(read(true)[0][rows], sigma, rng)
         y[power] += bias * rng.standard_normal()
         for label, use in (("before", without), ("after", list(range(len(rows))))):
-            found, cov = _most_probable(read, start, y[use], [rows[i] for i in use],
-                                        claimed[use], prior)  # fmt: skip
+            found, cov = _most_probable(
+                read, start, y[use], [rows[i] for i in use], claimed[use], prior
+            )
             e = (found - true)[2:]
             errors[label].append(e)
         nees.append(float(e @ np.linalg.solve(cov[2:, 2:], e)) / 4)
@@ -554,7 +562,7 @@ def snapshot_trials(
     square = np.array([(e**2).sum(1) for e in (before, after)])
     drawn = 1 - np.sqrt(square[1][pick].sum(1) / square[0][pick].sum(1))
     low, high = (float(q) for q in np.quantile(drawn, [0.025, 0.975]))
-    band = scipy.stats.chi2.ppf([0.025, 0.975], 4 * n) / (4 * n)
+    band = consistency.band(n, 4)
     return Trials(
         seeds=n,
         rms_before=rms(before),
@@ -564,7 +572,7 @@ def snapshot_trials(
         reduction=1 - rms(after) / rms(before),
         interval=(low, high),
         nees=float(np.mean(nees)),
-        nees_band=(float(band[0]), float(band[1])),
+        nees_band=(band[0] / 4, band[1] / 4),
         null_before=rms(before @ null),
         null_after=rms(after @ null),
     )
@@ -593,172 +601,6 @@ def _most_probable(
         f"the most probable health was not found in 20 steps; last step "
         f"{np.abs(step / start).max():.1e} of the nominal values"
     )
-
-
-# ---------------------------------------------------------------------- generator
-
-
-@dataclass(frozen=True)
-class Severity:
-    """What one fault's severity looks like from the terminals.
-
-    Args:
-        fault: the short circuit.
-        h: its severity h.
-        periods: electrical periods that were averaged.
-        sigma_mu, sigma_k_rf: bounds on the standard deviations of log mu and log k_rf, both
-            unknown; inf on the ridge.
-        sigma_h: bound on that of log h.
-        correlation: of the estimates of log mu and log k_rf; NaN on the ridge.
-        rank, rank_with_kappa: combinations of (mu, k_rf), and of (mu, k_rf, kappa), that show.
-        ratio: reactance over resistance of the equivalent shunt, w L/R: what tells mu from k_rf.
-    """
-
-    fault: Ttsc
-    h: float
-    periods: int
-    sigma_mu: float
-    sigma_k_rf: float
-    sigma_h: float
-    correlation: float
-    rank: int
-    rank_with_kappa: int
-    ratio: float
-
-
-@kept
-def _shunt(machine: Generator) -> ca.Function:
-    """Function (log mu, log k_rf, kappa, V, w, t) -> current of the shunt, A, steady state.
-
-    Terminal voltage sqrt(2) V cos(w t); current out of the terminal counts positive.
-    """
-    p = machine.machine
-    log_mu, log_k, kappa, V, w, t = (ca.SX.sym(n) for n in ("m", "k", "kappa", "V", "w", "t"))
-    mu, k_rf = ca.exp(log_mu), ca.exp(log_k)
-    R = p.r_s * (k_rf + 1 - mu) / mu
-    X = w * (kappa - mu) * p.L_ls / mu
-    i = -math.sqrt(2.0) * V * (R * ca.cos(w * t) + X * ca.sin(w * t)) / (R**2 + X**2)
-    args = [log_mu, log_k, kappa, V, w, t]
-    names = ["log_mu", "log_k_rf", "kappa", "V", "w", "t"]
-    along = ca.jacobian(i, ca.vertcat(log_mu, log_k, kappa))
-    return ca.Function("shunt", args, [i, along, X / R], names, ["i", "i_theta", "ratio"])
-
-
-def severity(
-    fault: Ttsc,
-    *,
-    periods: int = 8,
-    gain_error: bool = True,
-    kappa_known: bool = True,
-    generator: Generator | None = None,
-    load: float = 225e3,
-) -> tuple[Sensitivities, float]:
-    """Return the sensitivities of the faulty phase's current to the severity, and w L/R.
-
-    The generator is the healthy machine with a shunt from terminal to neutral, R = r_s/h,
-    L = (kappa - mu) L_ls/mu; at given voltages the healthy part does not depend on the fault.
-    Voltages are balanced, sinusoidal and taken as known, so that the bounds are optimistic:
-    voltage noise comes on top.  If kappa = mu it is tied to mu, the paper's own model.
-
-    Args:
-        fault: the short circuit.
-        periods: electrical periods, sampled at 10 kHz.
-        gain_error: consider the gain error of the current's sensor.
-        kappa_known: otherwise kappa is unknown as well, without a prior.
-        generator, load: the machine, and its load, W, balanced and resistive.
-
-    Raises:
-        ParameterError: periods not positive, or k_rf = 0, which has no logarithm.
-    """
-    if periods < 1 or not fault.k_rf > 0:
-        raise ParameterError(f"periods >= 1 and k_rf > 0 expected, got {periods!r}, {fault!r}")
-    gen = Generator() if generator is None else generator
-    at = gen.steady_state(SeriesLoad.from_power(load))
-    w, V = float(at.u[0]), at.V_t
-    n = round(periods * 2 * math.pi / w / 1e-4)
-    t = 1e-4 * np.arange(n)
-    tied = fault.kappa == fault.mu
-    args = (math.log(fault.mu), math.log(fault.k_rf), fault._kappa, V, w, t[None, :])
-    i, along, ratio = (a.full() for a in _shunt(gen)(*args))
-    J = along.reshape(3, n, order="F").T if along.shape[0] == 3 else along.reshape(n, 3)
-    if tied:  # kappa = mu moves with mu
-        J = np.column_stack([J[:, 0] + fault.mu * J[:, 2], J[:, 1]])
-    current = math.sqrt(2.0) * load / 3 / V * np.cos(w * t) + i[0]
-    signals = [
-        Signal("log_mu", "1", "logarithm of the shorted fraction of turns"),
-        Signal("log_k_rf", "1", "logarithm of fault over shorted-turn resistance"),
-    ]
-    if not tied and not kappa_known:
-        signals.append(Signal("kappa", "1", "leakage partition"))
-    faults = [s.name for s in signals]
-    J = J[:, : len(signals)]
-    prior = {}
-    sensor = ELECTRICAL["i_a"]
-    if gain_error:
-        signals.append(Signal("gain_i_a", "1", "gain error of the current sensor"))
-        J = np.column_stack([J, current])
-        prior["gain_i_a"] = sensor.gain
-    return (
-        Sensitivities.of(
-            Signals(signals), ["i_a"] * n, J, np.full(n, sensor.noise), faults=faults,
-            prior=prior, size=dict.fromkeys(faults, 0.1),
-        ),
-        float(ratio.ravel()[0]),
-    )  # fmt: skip
-
-
-#: Severities of the study: (mu, k_rf).
-SEVERITIES = ((0.05, 1.0), (0.02, 1.0), (0.01, 1.0), (0.01, 10.0), (0.002, 20.0))
-
-
-def severity_study(
-    severities: Sequence[tuple[float, float]] = SEVERITIES,
-    kappas: Sequence[float | None] = (None, 0.5, 1.0),
-    *,
-    periods: int = 8,
-    gain_error: bool = True,
-) -> list[Severity]:
-    """Return what is known of log mu and log k_rf, for every severity and kappa (None: mu).
-
-    Raises:
-        ParameterError: see :func:`severity`.
-    """
-    out = []
-    for mu, k_rf in severities:
-        for kappa in kappas:
-            fault = Ttsc(mu, k_rf, kappa)
-            options: dict[str, Any] = {"periods": periods, "gain_error": gain_error}
-            g, ratio = severity(fault, **options)
-            found = identify(g)
-            three = identify(severity(fault, kappa_known=False, **options)[0])
-            # log h = log mu - log(k_rf + 1 - mu)
-            a = np.array([1 + mu / (k_rf + 1 - mu), -k_rf / (k_rf + 1 - mu)])
-            out.append(
-                Severity(
-                    fault=fault,
-                    h=fault.h,
-                    periods=periods,
-                    sigma_mu=float(found.sigma_flat[0]),
-                    sigma_k_rf=float(found.sigma_flat[1]),
-                    sigma_h=_along(g, a),
-                    correlation=float(found.correlation[0, 1]) if found.rank == 2 else math.nan,
-                    rank=found.rank,
-                    rank_with_kappa=three.rank,
-                    ratio=ratio,
-                )
-            )
-    return out
-
-
-def _along(g: Sensitivities, a: np.ndarray) -> float:
-    """Return the bound on the standard deviation of a' theta without priors; inf if unseen."""
-    M = g.signatures()
-    _, s, Vt = np.linalg.svd(M, full_matrices=False)
-    seen = s > 1e-8 * s[0]
-    c = Vt @ a
-    if np.abs(a - Vt[seen].T @ c[seen]).max() > 1e-6 * np.abs(a).max():
-        return math.inf
-    return float(np.linalg.norm(c[seen] / s[seen]))
 
 
 def findings(point: str, sensors: Sequence[str], **options: Any) -> Identifiability:

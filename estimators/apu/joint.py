@@ -34,24 +34,18 @@ import numpy as np
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
+from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES, VOLTAGES
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import FAULT_LEVEL
-from estimators.apu.gaspath import (
-    DT,
-    HEALTH,
-    GasPathFilter,
-    JumpTest,
-    gas_path_filter,
-    samples,
-    track_jumps,
-    window_means,
-)
+from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples, window_means
+from estimators.apu.gaspathmodel import DT, HEALTH
+from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
-from estimators.filters.ekf import extended_kalman_filter
-from estimators.filters.filtering import FilterResult
+from estimators.filters.ekf import ekf_step
+from estimators.filters.filtering import FilterResult, StepMaker, run
 from estimators.models.recording import Recording
 
 if TYPE_CHECKING:
@@ -103,14 +97,9 @@ def electrical_samples(
     if "time_w" not in ds:
         raise DataError("the run has no waveforms; simulate with waveform_dt=1e-4")
     t = np.asarray(ds["time_w"].values, float)
-    truth = {n: np.asarray(ds[n].values, float) for n in (*VOLTAGES, *MEASURED)}
+    truth = {n: np.asarray(ds[n].values, float) for n in GAIN_SENSORS}
     truth["w_r"] = np.asarray(apu.w_r(np.interp(t, ds["time"].values, ds["N"].values)))
-    out = {"t": t}
-    for n, clean in truth.items():
-        s = sensors[n].noise * (np.abs(clean) if sensors[n].relative else 1.0)
-        e = 0.0 if rng is None else s * rng.standard_normal(t.size)
-        out[n] = (1 + (gains or {}).get(n, 0.0)) * clean + e
-    return out
+    return {"t": t} | sensors.measure(truth, rng, gains=gains)
 
 
 def loosened(sensors: SensorSet) -> SensorSet:
@@ -189,66 +178,71 @@ def _electrical_side(
     *,
     ttsc: bool,
     gain_errors: bool,
+    step: StepMaker,
     backend: str | None,
 ) -> _Electrical:
     """Run the electrical filters and put together what is known causally."""
+    known = loosened(sensors) if gain_errors else sensors
+
+    def filt(phases: tuple[str, ...]) -> ElectricalFilter:
+        return electrical_filter(apu.generator.machine, sensors=known, power=True, phases=phases)
 
     def windows(
-        filt: ElectricalFilter, begin: float
+        phases: tuple[str, ...], begin: float
     ) -> tuple[FilterResult, np.ndarray, np.ndarray, list[float]]:
+        of = filt(phases)
         own = {n: v[measured["t"] >= begin - 1e-9] for n, v in measured.items()}
-        prior = filt.prior(own)
         part = base.part(int(np.searchsorted(base.t, begin - 1e-9)), base.size)
         u = part.u.copy()
-        u[filt.model.u.index("dt_last"), 0] = 0.0
-        data = dataclasses.replace(part, u=u, p=filt.model.p.pack({}))
+        u[of.model.u.index("dt_last"), 0] = 0.0
+        data = dataclasses.replace(part, u=u, p=of.model.p.pack({}))
+        prior = of.prior(own)
         resets: list[float] = []
-        if any(n.startswith("h_") for n in filt.model.x.names):
-            r, resets = track(filt, prior, data, backend=backend, own_level=gain_errors or None)
+        if phases:
+            level = gain_errors or None
+            r, resets = track(of, prior, data, step=step, backend=backend, own_level=level)
         else:  # a healthy machine's filter has no step to look for
-            r = extended_kalman_filter(filt.model, prior, data, backend=backend)
-        ends, P, var = window_power(filt, r, data)
+            r = run(step(of.model), prior, data, backend=backend)
+        ends, P, var = window_power(of, r, data)
         if not np.allclose(ends, t[t > begin + 1e-9][: ends.size]) or ends[-1] < t[-1] - 1e-6:
             raise DataError(
                 f"{t.size - 1} windows of shaft power expected, the waveforms give {ends.size}"
             )
         return r, P, var, resets
 
-    def filt(phases: tuple[str, ...]) -> ElectricalFilter:
-        return electrical_filter(
-            apu.generator.machine, sensors=loosened(sensors) if gain_errors else sensors,
-            power=True, phases=phases,
-        )  # fmt: skip
-
     K = t.size
     # the inputs are the same for all: made once
     base = filt(()).recording(measured, window=DT, start=float(t[0]))
-    _, P, var, _ = windows(filt(()), float(t[0]))
+    _, P, var, _ = windows((), float(t[0]))
     severities, phase = np.zeros((2, 3, K)), np.zeros(K, dtype=int)
     if not ttsc:
         return _Electrical(P, var, severities, phase, (), ())
-    r, _, _, resets = windows(filt(PHASES), float(t[0]))
+    r, _, _, resets = windows(PHASES, float(t[0]))
     at = np.minimum(np.searchsorted(r.t, t - 1e-9), r.t.size - 1)
     for i, n in enumerate(PHASES):
         mean, sigma = r[f"h_{n}"]
         severities[:, i] = mean[at], np.hypot(sigma[at], H_GAIN if gain_errors else 0.0)
-    h, s = severities
-    floor = H_FLOOR if gain_errors else 0.0
-    sure = (h - floor > 0) & (((h - floor) / s) ** 2 > FAULT_LEVEL)
-    sure[:, 0] = False  # nothing is known yet
-    phase = np.where(sure.any(0), 1 + np.where(sure, h, 0).argmax(0), 0)
+    phase = _found(severities, H_FLOOR if gain_errors else 0.0)
     # the window in which a fault is found is the first with the power of a faulty machine
     changes = [k for k in range(1, K) if phase[k] and phase[k] != phase[k - 1]]
     for k in changes:
         begin = max([v for v in resets if v <= t[k] + 1e-9] + [float(t[0])])
         # whole windows: from the beginning of the one in which the machine changed
         first = int(np.floor((begin - t[0]) / DT + 1e-6))
-        _, P_k, var_k, _ = windows(filt((PHASES[phase[k] - 1],)), float(t[first]))
+        _, P_k, var_k, _ = windows((PHASES[phase[k] - 1],), float(t[first]))
         last = k
         while last + 1 < K and phase[last + 1] == phase[k]:
             last += 1
         P[k - 1 : last], var[k - 1 : last] = (v[k - 1 - first : last - first] for v in (P_k, var_k))
     return _Electrical(P, var, severities, phase, tuple(k - 1 for k in changes), tuple(resets))
+
+
+def _found(severities: np.ndarray, floor: float) -> np.ndarray:
+    """The phase found faulty at each instant, 1 to 3; 0 for none."""
+    h, s = severities
+    sure = (h - floor > 0) & (((h - floor) / s) ** 2 > FAULT_LEVEL)
+    sure[:, 0] = False  # nothing is known yet
+    return np.where(sure.any(0), 1 + np.where(sure, h, 0).argmax(0), 0)
 
 
 def _phase_of(ds: xr.Dataset) -> str:
@@ -274,6 +268,8 @@ def estimate_joint(
     electrical_gains: Mapping[str, float] | None = None,
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
+    step: StepMaker | None = None,
+    electrical_step: StepMaker = ekf_step,
     backend: str | None = None,
 ) -> xr.Dataset:
     """Measure a true joint run and estimate along it, causally.
@@ -294,6 +290,8 @@ def estimate_joint(
             are added to it.
         gain_errors: whether the filters take gain errors into account; False only where there are
             none.
+        step: makes the step of the gas-path filter for its model; its own by default.
+        electrical_step: the same of the electrical filters.
         backend: see :func:`apu_casadi.core.backend.compiled`.
 
     Returns:
@@ -307,77 +305,107 @@ def estimate_joint(
         DataError, EstimationError: as the two filters.
     """
     apu = Apu() if apu is None else apu
-    rng = None if seed is None else np.random.default_rng([seed, 1])
-    noise = None if seed is None else np.random.default_rng([seed, 2])
+    rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
     t, rows = samples(ds)
     measured = electrical_samples(ds, apu, rng, sensors=electrical_sensors, gains=electrical_gains)
     side = _electrical_side(
-        apu, electrical_sensors, measured, t, ttsc=ttsc, gain_errors=gain_errors, backend=backend
+        apu,
+        electrical_sensors,
+        measured,
+        t,
+        ttsc=ttsc,
+        gain_errors=gain_errors,
+        step=electrical_step,
+        backend=backend,
     )
-    P, var, found, resets = side.P, side.variance, side.severities, side.resets
-    # gas path: one measurement of shaft power for each window, eq. (1)
+    gas = _gas_filter(apu, gas_sensors, power, gain_errors, eta)
+    slow = _gas_recording(gas, apu, ds, noise, t, side, gas_gains or {})
+    if speed:
+        w_sigma = electrical_sensors.sigma("w_r", float(np.median(measured["w_r"])))
+        other = speed_from_generators(measured["t"], measured["w_r"], w_sigma, t, apu)
+        slow = better_speed(gas, slow, *other)
+    tracked = track_jumps(gas, slow, test=TEST, step=step, backend=backend)
+    return _as_dataset(ds, t, rows, side, gas, tracked)
+
+
+def _gas_filter(
+    apu: Apu, sensors: SensorSet, power: bool, gain_errors: bool, eta: float
+) -> GasPathFilter:
     common = math.hypot(eta, GAIN_SHARE if gain_errors else 0.0)
-    gas = gas_path_filter(
-        apu.gas_generator, gas_sensors, power="measured" if power else "unknown",
-        gains=gain_errors, eta=common if power and common else None, consider_eta=False,
+    return gas_path_filter(
+        apu.gas_generator,
+        sensors,
+        power="measured" if power else "unknown",
+        gains=gain_errors,
+        eta=common if power and common else None,
+        consider_eta=False,
         power_jumps=bool(power and common),
-    )  # fmt: skip
-    error = 1 + (gas_gains or {}).get("PW", 0.0)
-    mean, sigma = apu.PW(P) * error, np.sqrt(var) / apu.coupling.eta_gtSg
+    )
+
+
+def _gas_recording(
+    gas: GasPathFilter,
+    apu: Apu,
+    ds: xr.Dataset,
+    rng: np.random.Generator | None,
+    t: np.ndarray,
+    side: _Electrical,
+    gains: Mapping[str, float],
+) -> Recording:
+    """The gas path's recording, with one measurement of shaft power for each window, eq. (1)."""
+    mean = apu.PW(side.P) * (1 + gains.get("PW", 0.0))
+    sigma = np.sqrt(side.variance) / apu.coupling.eta_gtSg
     # the loss that belongs to the error of h, of both machines; the fault is a shunt r_s/h
     machine = apu.generator.machine
     ghost = 2 * machine.V_rated_rms**2 / machine.r_s / machine.eta_sg * H_GAIN
     new = {float(t[k]): float(np.hypot(sigma[k], ghost) / mean[k]) for k in side.found_at}
-    slow = gas.recording(
-        ds, noise, gains=gas_gains, power=(mean, sigma),
-        power_jumps=new if "jump_PW" in gas.model.u else None,
-    )  # fmt: skip
-    if speed:
-        w_sigma = electrical_sensors.sigma("w_r", float(np.median(measured["w_r"])))
-        slow = better_speed(
-            gas, slow, *speed_from_generators(measured["t"], measured["w_r"], w_sigma, t, apu)
-        )
-    tracked = track_jumps(gas, slow, test=TEST, backend=backend)
+    jumps = new if "jump_PW" in gas.model.u.names else None
+    return gas.recording(ds, rng, gains=gains, power=(mean, sigma), power_jumps=jumps)
+
+
+def _as_dataset(
+    ds: xr.Dataset,
+    t: np.ndarray,
+    rows: np.ndarray,
+    side: _Electrical,
+    gas: GasPathFilter,
+    tracked: Tracked,
+) -> xr.Dataset:
+    """Put estimates beside the truth."""
     r = tracked.result
     values: dict[str, Any] = {}
     signals: list[Signal] = []
 
-    def put(signal: Signal, estimate: Any, s: Any, true: Any) -> None:
-        n, unit, doc = signal.name, signal.unit, signal.doc
-        signals.extend([
-            Signal(n, unit, doc), Signal(f"{n}_sigma", unit, f"standard deviation of {n}"),
-            Signal(f"{n}_true", unit, f"true: {doc}"),
-        ])  # fmt: skip
-        values.update({n: estimate, f"{n}_sigma": s, f"{n}_true": true})
+    def put(n: str, unit: str, doc: str, estimate: Any, s: Any, true: Any) -> None:
+        of = {n: doc, f"{n}_sigma": f"standard deviation of {n}", f"{n}_true": f"true: {doc}"}
+        signals.extend(Signal(name, unit, text) for name, text in of.items())
+        values.update(zip(of, (estimate, s, true), strict=True))
 
     for name in ("N", *HEALTH):
-        put(gas.model.x[name], *r[name], ds[name].values[rows])
+        x = gas.model.x[name]
+        put(name, x.unit, x.doc, *r[name], ds[name].values[rows])
     true_phase = _phase_of(ds)
+    h, h_sigma = side.severities
     for i, phase in enumerate(PHASES):
         m, k_rf = ds["mu"].values[rows], ds["k_rf"].values[rows]
-        h = np.where(m > 0, m / (np.nan_to_num(k_rf) + 1 - m), 0.0) * (phase == true_phase)
+        true = np.where(m > 0, m / (np.nan_to_num(k_rf) + 1 - m), 0.0) * (phase == true_phase)
         doc = f"severity mu/(k_rf + 1 - mu) of a short circuit in phase {phase}"
-        put(Signal(f"h_{phase}", "1", doc), found[0, i], found[1, i], h)
+        put(f"h_{phase}", "1", doc, h[i], h_sigma[i], true)
     P_true = window_means(ds["time"].values, ds["P_total"].values, t)[:-1]
-    head = [np.nan]
-    put(
-        Signal("P_total", "W", "mean mechanical power of both generators over the window before"),
-        np.append(head, P), np.append(head, np.sqrt(var)), np.append(head, P_true),
-    )  # fmt: skip
+    P = (np.append(np.nan, v) for v in (side.P, np.sqrt(side.variance), P_true))
+    put("P_total", "W", "mean mechanical power of both generators over the window before", *P)
     signals += [
         Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c"),
         Signal("nis", "1", "normalised innovation squared of the gas-path filter"),
     ]
-    values["faulty_phase"] = side.phase
-    values["nis"] = r.nis
-    return dataset(
-        {"time": t}, {"time": values}, signals=signals,
-        attrs={
-            "resets": json.dumps(resets),
-            "alarms": json.dumps([float(t[i]) for i in tracked.alarms]),
-            "onsets": json.dumps([float(t[i]) for i in tracked.onsets]),
-        },
-    )  # fmt: skip
+    values |= {"faulty_phase": side.phase, "nis": r.nis}
+    at = {
+        "resets": side.resets,
+        "alarms": [float(t[i]) for i in tracked.alarms],
+        "onsets": [float(t[i]) for i in tracked.onsets],
+    }
+    attrs = {n: json.dumps(v) for n, v in at.items()}
+    return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)
 
 
 # ------------------------------------------------------------------------------ cross-talk
@@ -394,9 +422,9 @@ class JointCase:
 def joint_case(seed: int, *, electrical: bool = True) -> JointCase:
     """Draw the gain errors of a seed from the sensor sets, and the error of efficiency."""
     rng = np.random.default_rng([seed, 0])
-    gas = {n: GAS_PATH[n].gain * float(rng.standard_normal()) for n in ("P3", "T3", "T5", "Wf")}
+    gas = GAS_PATH.draw_gains(rng, GAS_PATH.uncertain)
     gas["PW"] = ETA_SIGMA * float(rng.standard_normal())
-    gains = {n: ELECTRICAL[n].gain * float(rng.standard_normal()) for n in (*VOLTAGES, *MEASURED)}
+    gains = ELECTRICAL.draw_gains(rng, GAIN_SENSORS)
     return JointCase(gas, gains if electrical else {})
 
 
@@ -417,17 +445,22 @@ def cross_talk(
         fault; RMSE of the factors, and RMS of error over claimed sigma, at the end of each phase.
     """
     variants: dict[str, dict[str, Any]] = {
-        "coupled": {}, "healthy machine": {"ttsc": False}, "no power": {"power": False},
-    }  # fmt: skip
+        "coupled": {},
+        "healthy machine": {"ttsc": False},
+        "no power": {"power": False},
+    }
     out: dict[str, Any] = {"seeds": len(seeds)}
     for name, options in variants.items():
         change, h_change, error, z, alarms, h_alarms = [], [], [], [], 0, 0
         for seed in seeds:
             case = joint_case(seed)
             e = estimate_joint(
-                ds, seed, gas_gains=case.gas_gains, electrical_gains=case.electrical_gains,
+                ds,
+                seed,
+                gas_gains=case.gas_gains,
+                electrical_gains=case.electrical_gains,
                 **options,
-            )  # fmt: skip
+            )
             t = e["time"].values
             k0, k1 = (int(np.searchsorted(t, v - 1e-9)) for v in (fault, fault + 3.0))
             k = np.array([int(np.searchsorted(t, v - 1e-9)) for v in (2.0, gas_fault, fault)])

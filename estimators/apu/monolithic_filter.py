@@ -20,19 +20,12 @@ import numpy as np
 
 from apu_casadi.core.sharing import Parametric, kept
 from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.tracking import window_power
-from estimators.apu.gaspath import (
-    AMBIENT,
-    DT,
-    GOVERNOR,
-    HEALTH,
-    GasPathFilter,
-    engine_function,
-    gas_path_filter,
-    samples,
-)
+from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples
+from estimators.apu.gaspathmodel import DT, GOVERNOR, HEALTH, engine_function
 from estimators.apu.joint import better_speed, electrical_samples, speed_from_generators
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief
@@ -138,24 +131,16 @@ def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter
     inputs: dict[str, Any] = {n: given[n] for n in AMBIENT} | {"PW": PW, "Wf": Wf}
     _, y_g, check_y, _ = engine(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), health)
     k1, _, check, _ = engine(N, gg.U.stack(inputs), health)
-    slope = (GOVERNOR.Ki * (gg.parameters.N - N) - GOVERNOR.Kp * k1) / gg.parameters.N
+    slope = GOVERNOR.slope(N, k1, gg.parameters.N)
     now = inputs | {"Wf": Wf + given["since"] * slope}
     k2, _, check_2, _ = engine(N, gg.U.stack(now), health)
     error = (1 - given["fresh"]) * at["error_Wf"] + given["fresh"] * w[len(W) - 1]
     x1 = ca.vertcat(x_e, N + dt * k2, health, error)
     y = ca.vertcat(y_e, apu.w_r(N), N, y_g)
-    free = np.full(len(X), np.inf)
-    model = FilterModel(
-        "unit", X, U, Signals(), W, Y,
-        transition=ca.Function(
-            "unit_f", [x, u, p, w, dt], [x1, check_e + check + check_2],
-            ["x", "u", "p", "w", "dt"], ["x1", "check"],
-        ),
-        output=ca.Function(
-            "unit_g", [x, u, p, w], [y, check_y], ["x", "u", "p", "w"], ["y", "check"]
-        ),
-        walk=np.concatenate([me.walk, mg.walk, [0.0]]), lower=-free, upper=free,
-    )  # fmt: skip
+    step, output = (x1, check_e + check + check_2), (y, check_y)
+    model = FilterModel.of("unit", (X, U, Signals(), W, Y), (x, u, p, w, dt), step, output)
+    walks = zip(X.names, np.concatenate([me.walk, mg.walk, [0.0]]), strict=True)
+    model = model.with_walk(dict(walks))
     return Monolithic(apu, electrical, gas, model)
 
 
@@ -186,9 +171,10 @@ def compare_monolithic(ds: xr.Dataset, seed: int, *, apu: Apu | None = None) -> 
     found = extended_kalman_filter(electrical.model, first, fast)
     _, P, var = window_power(electrical, found, fast)
     slow = gas.recording(
-        ds, np.random.default_rng([seed, 2]),
+        ds,
+        np.random.default_rng([seed, 2]),
         power=(apu.PW(P), np.sqrt(var) / apu.coupling.eta_gtSg),
-    )  # fmt: skip
+    )
     sigma = ELECTRICAL.sigma("w_r", float(np.median(samples_fast["w_r"])))
     speed = speed_from_generators(samples_fast["t"], samples_fast["w_r"], sigma, t, apu)
     before = gas.prior()

@@ -1,24 +1,60 @@
-"""What is measured, and how well: the 1-sigma tables of the estimation studies.
+"""What is measured, and how well: every sensor is one entry of a table.
 
-A table is data: take another one, or change single sensors, with :meth:`SensorSet.change`.
+An entry says what a sensor reads, its noise and gain error, the range of its readings, and the time
+constant of one that lags.  Filters, fits, identifiability, recorded files and studies take their
+lists from the tables: :data:`GAS_PATH` and :data:`ELECTRICAL`, whose numbers all studies use, and
+:data:`KNOWN`, all gas-path sensors by name.  A table is data: sensors are added by
+:meth:`SensorSet.add`, and their noise changed by :meth:`SensorSet.change`.
 
 >>> round(GAS_PATH.sigma("P3", 800e3))
 4000
 >>> GAS_PATH.change(T5=0.004).sigma("T5", 1000.0)
 4.0
+>>> GAS_PATH.add("P5").outputs
+('N', 'P3', 'T3', 'T5', 'P5')
+
+A sensor of one's own is registered by one line, in a file of one's own (:func:`load_sensors`)::
+
+    register(Sensor("dP", 0.005, True, 0.005, "Pa", "assumed", reads=("P3", "P5"),
+                    value=lambda P3, P5: P3 - P5))
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import runpy
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from apu_casadi.core.checked import number
-from apu_casadi.core.errors import ParameterError, nearest
+import numpy as np
 
-__all__ = ["ELECTRICAL", "GAS_PATH", "Sensor", "SensorSet"]
+from apu_casadi.core.checked import number
+from apu_casadi.core.errors import ApuError, DataError, ParameterError, nearest
+from apu_casadi.core.measuring import measure
+from apu_casadi.core.signals import Signal
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.machine.park import PHASES
+
+__all__ = [
+    "ELECTRICAL",
+    "GAS_PATH",
+    "KNOWN",
+    "RANGES",
+    "Sensor",
+    "SensorSet",
+    "gas_path_table",
+    "load_sensors",
+    "register",
+    "respond",
+    "unregister",
+]
+
+
+def _itself(value: Any) -> Any:
+    return value
 
 
 @dataclass(frozen=True)
@@ -26,12 +62,19 @@ class Sensor:
     """One sensor.
 
     Args:
-        name: the signal that it measures.
+        name: of its reading; the output that it reads, where nothing else is said.
         noise: standard deviation of its white noise, over the reading if ``relative``.
         relative: whether noise is a fraction of the reading.
         gain: standard deviation of its constant relative gain error, used where a study has one.
         unit: of the reading, SI.
         source: where the numbers come from.
+        plausible: lowest and highest reading of a running engine, SI; others are refused in files.
+        reads: outputs of the model; its own name by default.
+        value: its reading from those outputs, an expression; the one output itself by default.
+        tau: time constant of a first-order lag, s; its state is one more of a filter.
+
+    Raises:
+        ParameterError: a number out of range, several outputs without ``value``.
     """
 
     name: str
@@ -40,14 +83,55 @@ class Sensor:
     gain: float
     unit: str
     source: str
+    plausible: tuple[float, float] | None = None
+    reads: tuple[str, ...] = ()
+    value: Callable[..., Any] | None = None
+    tau: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are no standard deviations."""
-        for label in ("noise", "gain"):
-            value = getattr(self, label)
-            value = number(f"sensor {self.name}: {label}", value, error=ParameterError)
-            if not (math.isfinite(value) and value >= 0):
-                raise ParameterError(f"sensor {self.name}: {label} must be >= 0, got {value!r}")
+        for label in ("noise", "gain", "tau"):
+            v = number(f"sensor {self.name}: {label}", getattr(self, label), error=ParameterError)
+            if not (math.isfinite(v) and v >= 0):
+                raise ParameterError(f"sensor {self.name}: {label} must be >= 0, got {v!r}")
+        if self.plausible is not None and not self.plausible[0] < self.plausible[1]:
+            raise ParameterError(f"sensor {self.name}: no range: {self.plausible!r}")
+        object.__setattr__(self, "reads", tuple(self.reads) or (self.name,))
+        if self.value is None and len(self.reads) > 1:
+            raise ParameterError(
+                f"sensor {self.name} reads {', '.join(self.reads)}: give value, its reading from "
+                "them"
+            )
+
+    @property
+    def direct(self) -> bool:
+        """Whether it reads the output of its own name at once."""
+        return self.reads == (self.name,) and self.value is None and not self.tau
+
+    @property
+    def signal(self) -> Signal:
+        """Its reading as a signal of a model."""
+        Y = GasGenerator.Y
+        if self.direct and self.name in Y.names:
+            return Y[self.name]
+        nominal = next((Y[n].nominal for n in self.reads if Y[n].unit == self.unit), 1.0)
+        return Signal(self.name, self.unit, f"reading of {', '.join(self.reads)}", nominal=nominal)
+
+    @property
+    def expression(self) -> Callable[..., Any]:
+        """What it reads of the values of ``reads``, its lag left out."""
+        return _itself if self.value is None else self.value
+
+    def of(self, y: Mapping[str, Any]) -> Any:
+        """Return what it reads of outputs by name, its lag left out: numbers or expressions."""
+        return self.expression(*(y[n] for n in self.reads))
+
+    def sigma(self, reading: Any) -> Any:
+        """Return the standard deviation of the noise at a reading, in its unit."""
+        return self.noise * abs(reading) if self.relative else self.noise
+
+    def model(self) -> Sensor:
+        """Return the sensor with what its equations hang on, its errors left out."""
+        return dataclasses.replace(self, noise=0.0, gain=0.0, source="", plausible=None)
 
 
 @dataclass(frozen=True)
@@ -58,8 +142,21 @@ class SensorSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The measured signals in order."""
+        """Their names in order."""
         return tuple(s.name for s in self.sensors)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what the gas generator puts out; the others are its measured inputs."""
+        return tuple(n for n in self.names if n not in GasGenerator.U.names)
+
+    @property
+    def uncertain(self) -> tuple[str, ...]:
+        """Sensors whose gain error a filter may estimate.
+
+        A counted speed has none, and that of the shaft power is the generators' efficiency.
+        """
+        return tuple(n for n in self.names if n != "PW" and n not in GasGenerator.X.names)
 
     def __getitem__(self, name: str) -> Sensor:
         """Return a sensor; ParameterError with the nearest name if there is none."""
@@ -68,10 +165,12 @@ class SensorSet:
                 return s
         raise ParameterError(f"unknown sensor {name!r} {nearest(name, self.names)}")
 
-    def sigma(self, name: str, reading: float) -> float:
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def sigma(self, name: str, reading: Any) -> Any:
         """Return the standard deviation of the noise at a reading, unit of the signal."""
-        s = self[name]
-        return s.noise * abs(reading) if s.relative else s.noise
+        return self[name].sigma(reading)
 
     def change(self, **noise: float) -> SensorSet:
         """Return the set with other noise of some sensors.
@@ -79,46 +178,207 @@ class SensorSet:
         Raises:
             ParameterError: unknown sensor, or no standard deviation.
         """
-        for name in noise:
-            self[name]
-        return SensorSet(
-            tuple(
-                dataclasses.replace(s, noise=noise[s.name], source="changed by the user")
-                if s.name in noise
-                else s
-                for s in self.sensors
-            )
-        )
+        changed = {
+            n: dataclasses.replace(self[n], noise=s, source="changed by the user")
+            for n, s in noise.items()
+        }
+        return SensorSet(tuple(changed.get(s.name, s) for s in self.sensors))
+
+    def add(self, *sensors: str | Sensor) -> SensorSet:
+        """Return the set with more sensors, by name (of :data:`KNOWN`) or made.
+
+        Raises:
+            ParameterError: unknown name, or a sensor that is there.
+        """
+        out = list(self.sensors)
+        for given in sensors:
+            if isinstance(given, str) and given not in KNOWN:
+                raise ParameterError(f"unknown sensor {given!r} {nearest(given, KNOWN)}")
+            new = KNOWN[given] if isinstance(given, str) else given
+            if new.name in [s.name for s in out]:
+                raise ParameterError(f"sensor {new.name!r} is in the set already")
+            out.append(new)
+        return SensorSet(tuple(out))
+
+    def including(self, *names: str) -> SensorSet:
+        """Return the set with those of :data:`KNOWN` that are named and not in it."""
+        return self.add(*(n for n in names if n in KNOWN and n not in self))
+
+    def only(self, names: Sequence[str]) -> SensorSet:
+        """Return the set of some of the sensors, in the order of the names.
+
+        Raises:
+            ParameterError: unknown sensor.
+        """
+        return SensorSet(tuple(self[n] for n in names))
 
     def table(self) -> list[dict[str, Any]]:
         """Return one row for each sensor, for printing."""
-        return [dataclasses.asdict(s) for s in self.sensors]
+        shown = ("name", "noise", "relative", "gain", "unit", "source")
+        return [{n: getattr(s, n) for n in shown} for s in self.sensors]
 
+    def true(self, t: np.ndarray, y: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Return what the sensors would read without errors.
+
+        Args:
+            t: instants, s, (K,).
+            y: outputs of the model by name, (K,); where a lagging sensor's own name is among them,
+                that is taken.
+        """
+        out = {}
+        for s in self.sensors:
+            known = s.name in y and not s.direct
+            v = np.asarray(y[s.name] if known else s.of(y), float)
+            out[s.name] = respond(t, v, s.tau) if s.tau and not known else v
+        return out
+
+    def measure(
+        self,
+        true: Mapping[str, Any],
+        rng: np.random.Generator | None,
+        *,
+        gains: Mapping[str, float] | None = None,
+        averaged: int = 1,
+        noise_of: str = "reading",
+    ) -> dict[str, np.ndarray]:
+        """Return readings by name, of gain errors and white noise; drawn in the order of ``true``.
+
+        Args:
+            true: what the sensors would read without errors.
+            rng: draws the noise; None for none.
+            gains: actual relative gain errors, 0 where not given.
+            averaged: each reading is the mean of that many.
+            noise_of: relative noise is that of the ``"reading"``, gain error included, or of the
+                ``"true"`` value.
+        """
+        out = {}
+        for name, v in true.items():
+            gain = (gains or {}).get(name, 0.0)
+            size = v if noise_of == "true" else (1.0 + gain) * v
+            sigma = self.sigma(name, size)
+            out[name] = measure(v, sigma / math.sqrt(averaged), rng, gain=gain)
+        return out
+
+    def draw_gains(
+        self, rng: np.random.Generator, names: Sequence[str] | None = None
+    ) -> dict[str, float]:
+        """Draw the constant gain errors of some sensors (all by default), Gaussian."""
+        names = self.names if names is None else names
+        return {n: self[n].gain * float(rng.standard_normal()) for n in names}
+
+
+def respond(t: np.ndarray, v: np.ndarray, tau: float) -> np.ndarray:
+    """Return the response of a first-order lag, tau dx/dt = v - x, at rest in the beginning.
+
+    Exact where the input is linear from sample to sample.
+    """
+    x = np.array(v, float)
+    dt = np.diff(t)
+    slope, keep = np.diff(v) / dt, np.exp(-dt / tau)
+    for k in range(dt.size):
+        follow = v[k] - slope[k] * tau  # what the response tends to, less the ramp
+        x[k + 1] = follow + slope[k] * dt[k] + (x[k] - follow) * keep[k]
+    return x
+
+
+# ------------------------------------------------------------------------------ the tables
 
 _SIMON = (
     "per cent of the reading as in Simon and Garg (2010), J. Eng. Gas Turbines Power 132, 031601"
 )
+_COUNTED = _SIMON + "; a counted speed has no gain error"
 _CLASS = "assumed: transducer of accuracy class 0.5, noise of a 12-bit converter"
+_POWER = "assumed where no electrical filter delivers it"
 
 #: Gas-path sensors, sampled every 20 ms.  PW is the shaft power that the electrical side delivers.
 GAS_PATH = SensorSet(
     (
-        Sensor("N", 0.0025, True, 0.0, "rad/s", _SIMON + "; a counted speed has no gain error"),
-        Sensor("P3", 0.005, True, 0.005, "Pa", _SIMON),
-        Sensor("T3", 0.0075, True, 0.005, "K", _SIMON),
-        Sensor("T5", 0.0075, True, 0.005, "K", _SIMON),
-        Sensor("Wf", 0.01, True, 0.01, "kg/s", "assumed: turbine flow meter, 1 %"),
-        Sensor("PW", 0.01, True, 0.02, "W", "assumed where no electrical filter delivers it"),
+        Sensor("N", 0.0025, True, 0.0, "rad/s", _COUNTED, (1500.0, 4600.0)),  # 40 to 122 %
+        Sensor("P3", 0.005, True, 0.005, "Pa", _SIMON, (4e4, 2e6)),
+        Sensor("T3", 0.0075, True, 0.005, "K", _SIMON, (300.0, 800.0)),
+        Sensor("T5", 0.0075, True, 0.005, "K", _SIMON, (300.0, 1200.0)),
+        Sensor("Wf", 0.01, True, 0.01, "kg/s", "assumed: turbine flow meter, 1 %", (5e-4, 0.12)),
+        Sensor("PW", 0.01, True, 0.02, "W", _POWER, (-2e4, 9e5)),
     )
+)
+
+_COUPLE = "assumed: sheathed thermocouple, lag 0.5 s"
+#: A thermocouple before the rotor: what a pyrometer reads at once it follows with a lag.
+THERMOCOUPLE = Sensor(
+    "T41_tc", 0.005, True, 0.005, "K", _COUPLE, (400.0, 1900.0), reads=("T41",), tau=0.5
+)
+
+#: Sensors that could be added.
+MORE = (
+    Sensor("W2", 0.01, True, 0.01, "kg/s", "assumed: bellmouth, 1 %", (0.1, 10.0)),
+    Sensor("P5", 0.005, True, 0.005, "Pa", "assumed: as P3", (5e3, 2.5e5)),
+    Sensor("T41", 0.01, True, 0.01, "K", "assumed: pyrometer, 1 %", (400.0, 1900.0)),
+    THERMOCOUPLE,
 )
 
 #: Electrical sensors, sampled at 10 kHz.
 ELECTRICAL = SensorSet(
     (
-        *(Sensor(f"v_{k}", 0.5, False, 0.005, "V", _CLASS) for k in "abc"),
-        *(Sensor(f"i_{k}", 1.0, False, 0.005, "A", _CLASS) for k in "abc"),
+        *(Sensor(f"v_{k}", 0.5, False, 0.005, "V", _CLASS) for k in PHASES),
+        *(Sensor(f"i_{k}", 1.0, False, 0.005, "A", _CLASS) for k in PHASES),
         Sensor("V_fd", 0.2, False, 0.005, "V", _CLASS),
         Sensor("i_fd", 0.5, False, 0.005, "A", _CLASS),
         Sensor("w_r", 5e-4, True, 0.0, "rad/s", "assumed: speed pick-up, 0.05 %"),
     )
 )
+
+#: All gas-path sensors by name, registered ones among them.
+KNOWN: dict[str, Sensor] = {s.name: s for s in (*GAS_PATH.sensors, *MORE)}
+#: Range of the readings of each of them, SI.
+RANGES: dict[str, tuple[float, float]] = {n: s.plausible for n, s in KNOWN.items() if s.plausible}
+_registered: dict[str, Sensor] = {}
+
+
+def register(sensor: Sensor) -> Sensor:
+    """Make a sensor known by its name to filters, fits, files and commands; returns it.
+
+    Raises:
+        ParameterError: an output that the model does not have, or a name that is taken.
+    """
+    for n in sensor.reads:
+        if n not in GasGenerator.Y.names:
+            raise ParameterError(
+                f"sensor {sensor.name}: no output {n!r} {nearest(n, GasGenerator.Y.names)}"
+            )
+    if sensor.name in KNOWN and sensor.name not in _registered:
+        raise ParameterError(f"a sensor {sensor.name!r} is known already: take another name")
+    KNOWN[sensor.name] = _registered[sensor.name] = sensor
+    if sensor.plausible is not None:
+        RANGES[sensor.name] = sensor.plausible
+    return sensor
+
+
+def unregister(name: str) -> None:
+    """Forget a sensor that was registered; one of the tables stays."""
+    if _registered.pop(name, None) is not None:
+        del KNOWN[name]
+        RANGES.pop(name, None)
+
+
+def gas_path_table() -> SensorSet:
+    """Return the gas-path sensors that commands use: :data:`GAS_PATH` and what was registered."""
+    return GAS_PATH.add(*_registered.values())
+
+
+def load_sensors(path: str | Path) -> tuple[str, ...]:
+    """Run a Python file that registers sensors; returns their names.
+
+    Raises:
+        DataError: the file cannot be read or run, or registers nothing.
+    """
+    before = dict(_registered)
+    try:
+        runpy.run_path(str(path))
+    except ApuError:
+        raise
+    except Exception as e:
+        raise DataError(f"{path}: no sensors could be read: {type(e).__name__}: {e}") from None
+    new = tuple(n for n, s in _registered.items() if before.get(n) is not s)
+    if not new:
+        raise DataError(f"{path} registers no sensor: register(Sensor(...)) is expected")
+    return new

@@ -22,165 +22,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
-from scipy.special import ndtri
 
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
 from apu_casadi.core.sharing import Rebuilt, building
+from estimators.batch.fitresult import FitResult, FittedRecording, Profile
 from estimators.batch.transcription import Solution, Transcription
 from estimators.filters.belief import Belief
+from estimators.information.consistency import sigmas
 from estimators.models.filtermodel import FilterModel
 from estimators.models.lifting import Lifted, plain
 from estimators.models.recording import Recording
 
-__all__ = [
-    "FitProblem",
-    "FitResult",
-    "FittedRecording",
-    "Profile",
-    "fit",
-    "profile",
-    "quantile",
-]
+__all__ = ["FitProblem", "fit", "profile"]
 
 #: Eigenvalue of the information, parameters scaled to unit information each, below which a
 #: direction counts as undetermined; and below which it is reported as hardly determined.
 RANK_TOL = 1e-10
 WEAK_TOL = 1e-4
 _AT_BOUND = 1e-6  # of the parameter's magnitude
-
-
-def quantile(level: float) -> float:
-    """Return how many standard deviations on either side hold a share ``level`` of a Gaussian.
-
-    Raises:
-        ParameterError: a level outside (0, 1).
-    """
-    if not 0 < level < 1:
-        raise ParameterError(f"level = {level!r} must lie between 0 and 1")
-    return float(ndtri(0.5 + level / 2))
-
-
-@dataclass(frozen=True, eq=False)
-class FittedRecording:
-    """What the fit says of one recording of K samples.
-
-    Args:
-        t: instants, s, shape (K,).
-        x, w: most likely states and noises, shapes (nx, K), (nw, K).
-        y: outputs of the fitted model, shape (ny, K).
-        residual: (measured - y)/sigma, NaN where nothing was measured, shape (ny, K).
-    """
-
-    t: np.ndarray
-    x: np.ndarray
-    w: np.ndarray
-    y: np.ndarray
-    residual: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class FitResult:
-    """Estimated parameters and what is known of their errors.
-
-    Args:
-        names: the n estimated parameters; own ones of recording r are ``name[r]``.
-        estimate: their values, shape (n,).
-        covariance: shape (n, n), with the considered parameters' part.  Infinite variance and NaN
-            covariances where the data leave a direction open.
-        noise_covariance: without the considered parameters' part.
-        sensitivity: of the estimate to each considered parameter, shape (n, number considered).
-        considered: names of the considered parameters.
-        undetermined, weak: directions that the data do not, or hardly, determine, in words.
-        at_bound: parameters that ended at a bound; intervals do not hold for them.
-        loglik: log-likelihood at the estimate, states and noises at their most likely values.
-        chi2, freedom: sum of squared normalised residuals, noises and prior errors, and the number
-            of degrees of freedom that it should have.
-        recordings: fit of each recording.
-        iterations: of the optimiser.
-    """
-
-    names: tuple[str, ...]
-    estimate: np.ndarray
-    covariance: np.ndarray
-    noise_covariance: np.ndarray
-    sensitivity: np.ndarray
-    considered: tuple[str, ...]
-    undetermined: tuple[str, ...]
-    weak: tuple[str, ...]
-    at_bound: tuple[str, ...]
-    loglik: float
-    chi2: float
-    freedom: int
-    recordings: tuple[FittedRecording, ...]
-    iterations: int
-    _run: _Run = field(repr=False)
-
-    def _index(self, name: str) -> int:
-        if name not in self.names:
-            raise ParameterError(f"no estimate of {name!r} {nearest(name, self.names)}")
-        return self.names.index(name)
-
-    def __getitem__(self, name: str) -> tuple[float, float]:
-        """Return (estimate, standard error) of one parameter."""
-        i = self._index(name)
-        return float(self.estimate[i]), float(self.sigma[i])
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Estimates by name."""
-        return dict(zip(self.names, self.estimate.tolist(), strict=True))
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """Standard errors, shape (n,); infinite where undetermined."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def correlation(self) -> np.ndarray:
-        """Correlations of the estimates, shape (n, n); NaN where undetermined."""
-        s = np.where(np.isfinite(self.sigma), self.sigma, np.nan)
-        return self.covariance / np.outer(s, s)
-
-    def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
-        """Return the confidence interval of one parameter, from its standard error."""
-        m, s = self[name]
-        z = quantile(level)
-        return m - z * s, m + z * s
-
-    @cached_property
-    def p_value(self) -> float:
-        """Probability of a chi2 at least this large if model and sigmas are right."""
-        from scipy.stats import chi2
-
-        return float(chi2.sf(self.chi2, self.freedom)) if self.freedom > 0 else math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Profile likelihood of one parameter: everything else re-fitted at each value.
-
-    Args:
-        name: the parameter.
-        values: where it was held, increasing, shape (m,).
-        drop: twice the loss of log-likelihood there, shape (m,).
-        level: of the interval.
-        lower, upper: its ends; a bound where the threshold is not reached within it, infinite where
-            the likelihood never falls so far.
-    """
-
-    name: str
-    values: np.ndarray
-    drop: np.ndarray
-    level: float
-    lower: float
-    upper: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +78,16 @@ class FitProblem(Rebuilt):
         ParameterError: unknown or doubled names, nothing to estimate.
     """
 
+    lifted: Lifted
+    model: FilterModel
+    estimate: tuple[str, ...]
+    own: tuple[str, ...]
+    consider: tuple[str, ...]
+    program: Transcription
+    free: list[int]
+    held: list[int]
+    names: tuple[str, ...]
+
     @building
     def __init__(
         self,
@@ -231,8 +106,8 @@ class FitProblem(Rebuilt):
         self.model = m = self.lifted.model
         names = [*estimate, *consider, *own]
         for n in names:
-            if n not in m.p:
-                state = " (it is a state of this model)" if n in m.x else ""
+            if n not in m.p.names:
+                state = " (it is a state of this model)" if n in m.x.names else ""
                 raise ParameterError(f"{m.name}: no parameter {n!r}{state} {nearest(n, m.p.names)}")
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
@@ -293,10 +168,10 @@ class FitProblem(Rebuilt):
         """Guess of the states: as given, else what was measured under the same name, else known."""
         model, out = self.model, np.empty((len(self.model.x), data.size))
         for n in given:
-            if n not in model.x:
+            if n not in model.x.names:
                 raise ParameterError(f"guess of state {n!r} {nearest(n, model.x.names)}")
         for i, s in enumerate(model.x):
-            row = data.y[model.y.index(s.name)] if s.name in model.y else np.full(1, np.nan)
+            row = data.y[model.y.index(s.name)] if s.name in model.y.names else np.full(1, np.nan)
             there = ~np.isnan(row)
             if s.name in given:
                 out[i] = given[s.name]
@@ -464,7 +339,7 @@ class FitProblem(Rebuilt):
             freedom=n_e - (p.n_z - len(c) - p.n_g),
             recordings=fitted,
             iterations=s.iterations,
-            _run=_Run(self, s, lower, upper, tangent),
+            run=_Run(self, s, lower, upper, tangent),
         )
 
     def _fitted(self, s: Solution, recordings: Sequence[Recording]) -> tuple[FittedRecording, ...]:
@@ -665,11 +540,11 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
     Raises:
         ParameterError: unknown parameter. EstimationError : a re-fit did not converge.
     """
-    j = result._index(name)
-    run, i = result._run, result._run.problem.free[j]
+    j = result.index(name)
+    run, i = result.run, result.run.problem.free[j]
     program = run.problem.program
     scale = program.theta_scale[i]
-    best, target = run.solution, quantile(level)
+    best, target = run.solution, sigmas(level)
     at = best.z[i] * scale
     sigma = result.sigma[j] if np.isfinite(result.sigma[j]) and result.sigma[j] > 0 else None
     seen: dict[float, float] = {at: 0.0}
@@ -688,7 +563,7 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
         bound = float((run.upper if sign > 0 else run.lower)[i] * scale)
         step = target * sigma if sigma is not None else 0.01 * scale
         a, ra, near = at, 0.0, best
-        b = at + sign * step
+        b: float = at + sign * step
         for _ in range(points):
             b = min(b, bound) if sign > 0 else max(b, bound)
             rb, near = root_drop(b, near)
@@ -705,14 +580,15 @@ def profile(result: FitResult, name: str, *, level: float = 0.95, points: int = 
             # bracketed by a and b: false position, damped towards the middle
             lo, hi, rl, rh = a, b, ra, rb
             for _ in range(points):
-                x = lo + (target - rl) / (rh - rl) * (hi - lo)
-                x = min(max(x, min(lo, hi) + 0.05 * abs(hi - lo)),
-                        max(lo, hi) - 0.05 * abs(hi - lo))  # fmt: skip
+                x: float = lo + (target - rl) / (rh - rl) * (hi - lo)
+                x = min(
+                    max(x, min(lo, hi) + 0.05 * abs(hi - lo)), max(lo, hi) - 0.05 * abs(hi - lo)
+                )
                 r, near = root_drop(x, near)
                 if abs(r - target) <= 1e-3 * target or abs(hi - lo) <= 1e-9 * scale:
                     return x
                 lo, hi, rl, rh = (x, hi, r, rh) if r < target else (lo, x, rl, r)
-            return lo + (target - rl) / (rh - rl) * (hi - lo)
+            return float(lo + (target - rl) / (rh - rl) * (hi - lo))
         return sign * math.inf
 
     lower, upper = end(-1.0), end(1.0)

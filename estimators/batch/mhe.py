@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
 from apu_casadi.core.sharing import Rebuilt, building, kept
 from estimators.batch.transcription import Solution, Transcription
@@ -99,6 +100,11 @@ class HorizonEstimator(Rebuilt):
             estimate.
     """
 
+    model: FilterModel
+    horizon: int
+    max_iterations: int
+    program: Transcription
+
     @building
     def __init__(
         self,
@@ -165,8 +171,9 @@ class HorizonEstimator(Rebuilt):
             s = max(0, k - N + 1)
             i, at = k - s, slice(s, s + N)
             mean_pred[:, k], cov_pred[k] = mp, Lp @ Lp.T
-            now = _Along(*self._step(mp, Lp, mp, np.zeros(nw), u[:, k], data.p, y[:, k], R[:, k],
-                                     dt[k]))  # fmt: skip
+            now = _Along(
+                *self._step(mp, Lp, mp, np.zeros(nw), u[:, k], data.p, y[:, k], R[:, k], dt[k])
+            )
             there = ~missing[:, k]
             innovation[there, k] = now.nu[there]
             S[there, k] = np.diag(now.S.reshape(ny, ny))[there]
@@ -196,11 +203,10 @@ class HorizonEstimator(Rebuilt):
             z0 = self._shifted(solution, moved=i == N - 1)
             if progress is not None:
                 progress(k + 1, K)
-        return FilterResult(
-            model.x, model.y, data.t, mean, var, innovation, S, stats[0], stats[2],
-            float(stats[1].sum()), Belief(model.x, mean[:, -1].copy(), cov[-1]),
-            *((cov, mean_pred, cov_pred, cross) if full else ()),
-        )  # fmt: skip
+        final = Belief(model.x, mean[:, -1].copy(), cov[-1])
+        told = innovation, S, stats[0], stats[2], float(stats[1].sum()), final
+        more = (cov, mean_pred, cov_pred, cross) if full else ()
+        return FilterResult(model.x, model.y, data.t, mean, var, *told, *more)
 
     def _solve(
         self,

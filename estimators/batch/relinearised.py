@@ -57,22 +57,19 @@ def linearised(model: FilterModel) -> FilterModel:
     x1, F, check_x = forecast(at, given[:nu], p, dt)
     name = f"{model.name}_linearised"
     about = [
-        dataclasses.replace(q, name=f"at_{q.name}", doc=f"where it is linearised: {q.doc}",
-                            default=None) for q in model.x
-    ]  # fmt: skip
-    return dataclasses.replace(
-        model,
-        name=name,
-        u=model.u + Signals(about),
-        transition=ca.Function(
-            f"{name}_f", [x, given, p, w, dt], [x1 + ca.mtimes(F, beside), check_x],
-            ["x", "u", "p", "w", "dt"], ["x1", "check"],
-        ),
-        output=ca.Function(
-            f"{name}_g", [x, given, p, w], [y + ca.mtimes(H, beside), check_y],
-            ["x", "u", "p", "w"], ["y", "check"],
-        ),
-    )  # fmt: skip
+        dataclasses.replace(
+            q, name=f"at_{q.name}", doc=f"where it is linearised: {q.doc}", default=None
+        )
+        for q in model.x
+    ]
+    return FilterModel.of(
+        name,
+        (model.x, model.u + Signals(about), model.p, model.w, model.y),
+        (x, given, p, w, dt),
+        (x1 + ca.mtimes(F, beside), check_x),
+        (y + ca.mtimes(H, beside), check_y),
+        like=model,
+    )
 
 
 def relinearised_filter(

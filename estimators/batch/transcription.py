@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -30,112 +30,17 @@ import scipy.sparse as sp
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.errors import EstimationError
 from apu_casadi.core.interrupts import watched
-from apu_casadi.core.sharing import Rebuilt, building, derived, keep, kept
+from apu_casadi.core.sharing import Rebuilt, building, derived, keep
+from estimators.batch.stagekernel import Kernel, kernel
 from estimators.filters.belief import Belief
-from estimators.models.filtermodel import CHECK_TOL
+from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.lifting import Lifted
 from estimators.models.recording import Recording
 
-__all__ = ["CONSTRAINT_TOL", "Local", "Solution", "Transcription", "kernel", "square_root"]
+__all__ = ["CONSTRAINT_TOL", "Local", "Solution", "Transcription", "square_root"]
 
 #: Largest residual of a scaled constraint with which a solution is used.
 CONSTRAINT_TOL = 1e-8
-
-
-class Kernel(NamedTuple):
-    """Functions of one stage in scaled unknowns q = (x, s, w, xi, theta).
-
-    Args:
-        value: (q, d) -> (e, c): normalised residuals (y - g)/sigma, w, xi; next state, constraints.
-        first: (q, d) -> (e, c, nonzeros of de/dq, nonzeros of dc/dq, e' de/dq).
-        second: (q, d, lam_e, lam_c) -> nonzeros of the upper triangle of the Hessian of lam_e/2
-            |e|^2 + lam_c' c.
-        check: (q, d) -> residual of what is solved for inside, outputs in their units.
-        J_e, J_c, H: the sparsities.
-        sizes: of x, s, w, xi, theta.
-        scale: of q, shape (n,).
-        walk: rows of x with process noise.
-    """
-
-    value: ca.Function
-    first: ca.Function
-    second: ca.Function
-    check: ca.Function
-    J_e: ca.Sparsity
-    J_c: ca.Sparsity
-    H: ca.Sparsity
-    sizes: tuple[int, int, int, int, int]
-    scale: np.ndarray
-    walk: tuple[int, ...]
-
-
-@kept
-def kernel(lifted: Lifted, names: tuple[str, ...]) -> Kernel:
-    """Make the functions of one stage; ``names`` are the parameters that are unknowns."""
-    model = lifted.model
-    nx, nu, np_, nw, ny = model.sizes
-    moving = () if lifted.steady else tuple(int(i) for i in np.flatnonzero(model.walk > 0))
-    sizes = nx, len(lifted.s), nw, len(moving), len(names)
-    cols = model.p.indices(names)
-    scale = np.concatenate(
-        [model.x.nominals, lifted.s.nominals, np.ones(nw + len(moving)), model.p.nominals[cols]]
-    )
-    n = scale.size
-    kind = ca.SX if lifted.stage.is_a("SXFunction") else ca.MX
-    q, d = kind.sym("q", n), kind.sym("d", nu + np_ + 2 * ny + 1)
-    k = kind.sym("k", lifted.frozen.size1_out(0))
-    x, s, w, xi, th = ca.vertsplit(q * ca.DM(scale), [0, *np.cumsum(sizes).tolist()])
-    u, p0, y, weight, dt = ca.vertsplit(d, [0, *np.cumsum([nu, np_, ny, ny, 1]).tolist()])
-    place = {i: th[j] for j, i in enumerate(cols)}
-    p = ca.vertcat(kind(0, 1), *(place.get(i, p0[i]) for i in range(np_)))
-    g, x1, c, check = lifted.stage(x, s, u, p, w, dt, k)
-    spread = ca.DM(nx, len(moving))
-    for j, i in enumerate(moving):
-        spread[i, j] = model.walk[i]
-    if moving:
-        x1 = x1 + ca.sqrt(dt) * ca.mtimes(spread, xi)
-    e = ca.vertcat((y - g) * weight, w, xi)
-    c = ca.vertcat(x1 / model.x.nominals, c)
-    J_e, J_c = ca.jacobian(e, q), ca.jacobian(c, q)
-    le, lc = kind.sym("le"), kind.sym("lc", c.shape[0])
-    H = ca.triu(ca.hessian(le / 2 * ca.dot(e, e) + ca.dot(lc, c), q)[0])
-
-    def nz(J: Any) -> Any:
-        return ca.sparsity_cast(J, ca.Sparsity.dense(J.nnz(), 1))
-
-    tag = f"{model.name}_{'steady_' if lifted.steady else ''}stage"
-    # the same arguments in an MX graph, where the coefficients k are looked up
-    Q, D = ca.MX.sym("q", n), ca.MX.sym("d", d.shape[0])
-    X = ca.vertsplit(Q * ca.DM(scale), [0, *np.cumsum(sizes).tolist()])
-    U, P0, _, _, DT = ca.vertsplit(D, [0, *np.cumsum([nu, np_, ny, ny, 1]).tolist()])
-    P = ca.vertcat(
-        ca.MX(0, 1),
-        *(X[4][cols.index(i)] if i in place else P0[i] for i in range(np_)),
-    )
-    K = lifted.frozen(X[0], X[1], U, P, X[2], DT)
-
-    def function(name: str, more: Sequence[Any], out: Sequence[Any]) -> ca.Function:
-        values = [ca.densify(o) for o in out]
-        if kind is ca.SX:
-            values = ca.cse(values)
-        inner = ca.Function(f"{tag}_{name}", [q, d, *more, k], values)
-        if not k.shape[0]:
-            return ca.Function(f"{tag}_{name}", [q, d, *more], [*values])
-        others = [ca.MX.sym(f"l{i}", m.shape[0]) for i, m in enumerate(more)]
-        return ca.Function(f"{tag}_{name}_at", [Q, D, *others], inner.call([Q, D, *others, K]))
-
-    return Kernel(
-        function("value", [], [e, c]),
-        function("first", [], [e, c, nz(J_e), nz(J_c), J_e.T @ e]),
-        function("second", [le, lc], [nz(H)]),
-        function("check", [], [check, g]),
-        J_e.sparsity(),
-        J_c.sparsity(),
-        H.sparsity(),
-        sizes,
-        scale,
-        moving,
-    )
 
 
 def square_root(cov: np.ndarray) -> np.ndarray:
@@ -202,6 +107,22 @@ class Transcription(Rebuilt):
         backend, build: see :func:`apu_casadi.core.backend.compiled`.
     """
 
+    lifted: Lifted
+    model: FilterModel
+    sizes: tuple[int, ...]
+    shared: tuple[str, ...]
+    own: tuple[str, ...]
+    prior: bool
+    kernel: Kernel
+    n_theta: int
+    n_local: int
+    n_z: int
+    n_g: int
+    starts: np.ndarray
+    recording_of: np.ndarray
+    index: np.ndarray
+    linked: np.ndarray
+
     @building
     def __init__(
         self,
@@ -218,7 +139,9 @@ class Transcription(Rebuilt):
         self.sizes, self.shared, self.own = tuple(sizes), tuple(shared), tuple(own)
         self.prior = prior and not lifted.steady
         self.kernel = kernel(lifted, (*self.shared, *self.own))
-        self._compile = lambda f: compiled(f, backend=backend, build=build)
+        self._compile: Callable[[ca.Function], ca.Function] = lambda f: compiled(
+            f, backend=backend, build=build
+        )
         nx, ns, nw, nq, nt = self.kernel.sizes
         R, K = len(self.sizes), sum(self.sizes)
         self.n_theta = len(self.shared) + R * len(self.own)
@@ -357,9 +280,11 @@ class Transcription(Rebuilt):
         I, J = self.index[:, hr].ravel(), self.index[:, hc].ravel()
         fixed = np.arange(self.n_theta + (R * nx if self.prior else 0))
         hess = _placed(
-            [np.minimum(I, J), fixed], [np.maximum(I, J), fixed],
-            [np.ones(I.size), np.ones(fixed.size)], (self.n_z, self.n_z),
-        )  # fmt: skip
+            [np.minimum(I, J), fixed],
+            [np.maximum(I, J), fixed],
+            [np.ones(I.size), np.ones(fixed.size)],
+            (self.n_z, self.n_z),
+        )
         spread = sp.csc_matrix(
             (np.ones(self.index.size), (self.index.ravel(), np.arange(self.index.size))),
             shape=(self.n_z, self.index.size),
@@ -436,7 +361,7 @@ class Transcription(Rebuilt):
     @derived
     def _n_data(self) -> int:
         nx, nu, np_, _, ny = self.model.sizes
-        n = (nu + np_ + 2 * ny + 1) * sum(self.sizes) + 2 * self.n_theta
+        n: int = (nu + np_ + 2 * ny + 1) * sum(self.sizes) + 2 * self.n_theta
         return n + (len(self.sizes) * (nx + nx * nx) if self.prior else 0)
 
     def solver(self, warm: bool = False, max_iterations: int = 200) -> ca.Function:

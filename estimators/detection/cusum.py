@@ -62,12 +62,7 @@ def cusum_arl_siegmund(
 
 
 def cusum_arl_markov(
-    drift: float,
-    threshold: float,
-    shift: float = 0.0,
-    *,
-    two_sided: bool = True,
-    states: int = 400,
+    drift: float, threshold: float, shift: float = 0.0, *, two_sided: bool = True, states: int = 400
 ) -> float:
     """Return the average run length from a Markov chain over cells of the sum, samples.
 

@@ -317,13 +317,8 @@ def glr_threshold(
     size = float(sum(r.size - 1 for r in peaks))
     threshold, a, B, largest = fit(crossings.sum(0), size)
     # leave one part out in turn: the jackknife
-    left = [fit(crossings.sum(0) - crossings[i], size * (parts - 1) / parts)[0]
-            for i in range(parts)]  # fmt: skip
+    left = [
+        fit(crossings.sum(0) - crossings[i], size * (parts - 1) / parts)[0] for i in range(parts)
+    ]
     sigma = math.sqrt((parts - 1) / parts * float(np.sum((np.array(left) - np.mean(left)) ** 2)))
-    return {
-        "threshold": threshold,
-        "sigma": sigma,
-        "A": math.exp(a),
-        "B": B,
-        "largest": largest,
-    }
+    return {"threshold": threshold, "sigma": sigma, "A": math.exp(a), "B": B, "largest": largest}

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize
 
 from apu_casadi.core.errors import ParameterError, SignalError
 from estimators.detection.alarms import HOUR, Alarms, allowed_per_sample, rising
+from estimators.information import consistency
 from estimators.models.recording import plain_numbers
 
 __all__ = ["nis_test", "nis_threshold", "upcrossing_rate", "windowed_nis"]
@@ -35,8 +36,8 @@ def windowed_nis(
     """
     nis, measured = plain_numbers(nis, "nis"), plain_numbers(measured, "measured")
     if nis.ndim != 1 or nis.shape != measured.shape:
-        raise SignalError(f"nis and measured of one length expected, got {nis.shape} and "
-                          f"{measured.shape}")  # fmt: skip
+        shapes = f"{nis.shape} and {measured.shape}"
+        raise SignalError(f"nis and measured of one length expected, got {shapes}")
     if not np.isfinite(nis).all():
         raise SignalError(f"nis: {int((~np.isfinite(nis)).sum())} values are not finite")
     if not (isinstance(window, int | np.integer) and window >= 1):
@@ -63,13 +64,13 @@ def upcrossing_rate(threshold: float, dof: int, window: int) -> float:
         window: terms in the sum.
     """
     if window == 1:
-        return float(stats.chi2.cdf(threshold, dof) * stats.chi2.sf(threshold, dof))
+        return float(consistency.below(threshold, dof) * consistency.above(threshold, dof))
     # a = c - t^2: smooth at the edge also for one degree of freedom; beyond 40 sd nothing is left
     reach = math.sqrt(min(threshold, dof + 40 * math.sqrt(2 * dof) + 80))
     t, w = np.polynomial.legendre.leggauss(400)
     t, w = reach / 2 * (t + 1), reach / 2 * w
-    shared = stats.chi2.pdf(threshold - t**2, dof * (window - 1))
-    one = stats.chi2.cdf(t**2, dof) * stats.chi2.sf(t**2, dof)
+    shared = consistency.density(threshold - t**2, dof * (window - 1))
+    one = consistency.below(t**2, dof) * consistency.above(t**2, dof)
     return float(np.sum(w * 2 * t * shared * one))
 
 
@@ -93,7 +94,7 @@ def nis_threshold(
     allowed = allowed_per_sample(false_alarms_per_hour, rate)
     if not (dof >= 1 and window >= 1):
         raise ParameterError(f"dof and window must be >= 1, got {dof!r} and {window!r}")
-    mean = float(stats.chi2.median(dof * window))
+    mean = float(consistency.quantile(0.5, dof * window))
     if upcrossing_rate(mean, dof, window) <= allowed:
         raise ParameterError(
             f"a window of {window} samples crosses its own median only "
@@ -109,7 +110,7 @@ def nis_threshold(
         top,
         xtol=1e-10,
     )
-    return float(c), float(stats.chi2.sf(c, dof * window))
+    return float(c), float(consistency.above(c, dof * window))
 
 
 def nis_test(
@@ -140,7 +141,7 @@ def nis_test(
         raise SignalError("nothing was measured")
     _, p = nis_threshold(most, window, false_alarms_per_hour, rate)
     kinds, back = np.unique(dof, return_inverse=True)
-    limit = np.where(kinds > 0, stats.chi2.isf(p, np.maximum(kinds, 1)), np.inf)[back]
+    limit = np.where(kinds > 0, consistency.exceeded(p, np.maximum(kinds, 1)), np.inf)[back]
     return Alarms(
         f"NIS over {window} samples",
         total,

@@ -13,7 +13,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled, mapped
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import mapped
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.core.sharing import keep
 from estimators.filters.filtering import FilterResult
@@ -232,8 +233,9 @@ def linearised(
         else:
             size = j.scale * (h[:, i, 0] if j.kind == "gain" else 1.0)
             output[:, i, c] = size * ~missing[i]
-    names = tuple(j.name if j.kind in ("state", "parameter") else f"{j.kind} {j.name}"
-                  for j in jumps)  # fmt: skip
+    names = tuple(
+        j.name if j.kind in ("state", "parameter") else f"{j.kind} {j.name}" for j in jumps
+    )
     if len(set(names)) < q:
         raise SignalError(f"jumps are not distinct: {', '.join(names)}")
     return LinearFilter(names, Fx, L, Hx, S, nu, state, drift, output)

@@ -6,6 +6,7 @@ cost nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -23,6 +24,7 @@ __all__ = [
     "root_of",
     "root_update",
     "symmetric",
+    "without_gain",
 ]
 
 TINY = 1e-290  # below it a square counts as zero: its reciprocal would overflow
@@ -154,8 +156,9 @@ def graded_lower(A: ca.SX) -> ca.SX:
         per = ca.if_else(there, 1 / ca.sqrt(square), 0)
         unit = {j: rows[i][j] * per for j in filled}
         for r in range(i + 1, n):
-            along = sum((rows[r][j] * unit[j] for j in filled if not rows[r][j].is_zero()),
-                        ca.SX(0))  # fmt: skip
+            along = sum(
+                (rows[r][j] * unit[j] for j in filled if not rows[r][j].is_zero()), ca.SX(0)
+            )
             if along.is_zero():
                 continue
             L[r, i] = along
@@ -278,3 +281,19 @@ def root_of(cov: np.ndarray) -> np.ndarray:
         root = root * np.where(np.diag(root) < 0, -1.0, 1.0)
     L[np.ix_(rows, rows)] = sigma[:, None] * np.tril(root)
     return L
+
+
+def without_gain(gain: ca.SX, L: ca.SX, fixed: Sequence[int]) -> tuple[ca.SX, ca.SX]:
+    """Return gain and root of an update in which some rows (considered states) have no gain.
+
+    Each row of the optimal gain takes gain gain' off the variance; without gain it stays.
+    """
+    if not fixed:
+        return gain, L
+    kept = ca.SX(*gain.shape)
+    for i in fixed:
+        kept[i, :] = gain[i, :]
+        gain[i, :] = 0
+    for j in range(gain.shape[1]):
+        L = append_column(L, ca.sparsify(kept[:, j]))
+    return gain, L

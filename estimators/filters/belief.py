@@ -50,8 +50,11 @@ class Belief:
                 f"belief of {n} states: mean ({n},) and cov ({n}, {n}) expected, got "
                 f"{np.shape(self.mean)} and {np.shape(self.cov)}"
             )
-        bad = [s for s, m, v in zip(self.x.names, self.mean, np.diag(self.cov), strict=True)
-               if not (np.isfinite(m) and np.isfinite(v) and v >= 0)]  # fmt: skip
+        bad = [
+            s
+            for s, m, v in zip(self.x.names, self.mean, np.diag(self.cov), strict=True)
+            if not (np.isfinite(m) and np.isfinite(v) and v >= 0)
+        ]
         if bad:
             raise SignalError(
                 f"belief: mean not finite, or variance negative or not finite, of {', '.join(bad)}"

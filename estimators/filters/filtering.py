@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, SignalError
 from apu_casadi.core.results import dataset
 from apu_casadi.core.sharing import Parametric, derived, kept
@@ -35,6 +36,7 @@ __all__ = [
     "STEP_OUT",
     "FilterResult",
     "FilterStep",
+    "StepMaker",
     "block_of",
     "narrow",
     "padded",
@@ -74,6 +76,22 @@ class FilterStep(Parametric):
     root: bool = False
     wide: Callable[[], FilterStep] | None = None
 
+    def __post_init__(self) -> None:
+        f, (nx, nu, np_, _, ny) = self.function, self.model.sizes
+        want_in = (nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)
+        want_out = (nx, 1), (nx, nx), (nx, 1), (nx, nx), (nx, nx), (ny, 1), (ny, ny), (4, 1)
+        got_in = [f.size_in(i) for i in range(f.n_in())]
+        got_out = [f.size_out(i) for i in range(f.n_out())][: len(STEP_OUT)]
+        for what, names, got, want in (
+            ("inputs", STEP_IN, got_in, want_in),
+            ("outputs", STEP_OUT, got_out, want_out),
+        ):
+            if got != [*want]:
+                shown = ", ".join(f"{n} {s}" for n, s in zip(names, want, strict=True))
+                raise SignalError(
+                    f"step {f.name()} of {self.model.name}: {what} {shown} expected, got {got}"
+                )
+
     @property
     def gives_roots(self) -> bool:
         """Whether the function gives ``ROOT_OUT`` too."""
@@ -87,8 +105,12 @@ class FilterStep(Parametric):
         """
         if not self.root:
             return self
-        s = [ca.MX.sym(self.function.name_in(i), self.function.size1_in(i),
-                       self.function.size2_in(i)) for i in range(len(STEP_IN))]  # fmt: skip
+        s = [
+            ca.MX.sym(
+                self.function.name_in(i), self.function.size1_in(i), self.function.size2_in(i)
+            )
+            for i in range(len(STEP_IN))
+        ]
         P = ca.SX.sym("P", s[1].shape[0], s[1].shape[0])
         root = ca.Function("root", [P], [ca.densify(cholesky_semidefinite(P))])
         out = list(self.function(s[0], root(s[1]), *s[2:]))[: len(STEP_OUT)]
@@ -180,6 +202,10 @@ class FilterResult:
         )
 
 
+#: Makes a filter's step for a model: ``ekf_step``, ``ukf_step``, or a function of one's own.
+StepMaker = Callable[[FilterModel], FilterStep]
+
+
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
     """Call ``f`` n times, as one function.
 
@@ -202,8 +228,10 @@ def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.F
         now = out[:carried]
         results.append(out)
     first = f.n_out() - kept
-    out = [*results[-1][:first], *(ca.horzcat(*(r[i] for r in results))
-                                   for i in range(first, f.n_out()))]  # fmt: skip
+    out = [
+        *results[-1][:first],
+        *(ca.horzcat(*(r[i] for r in results)) for i in range(first, f.n_out())),
+    ]
     return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
 
 
@@ -229,9 +257,12 @@ def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> c
     before each sample and C, S; matrices as columns.
     """
     nx, nu, np_, _, ny = step.model.sizes
-    s = [ca.MX.sym(n, *shape) for n, shape in zip(
-        STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
-    )]  # fmt: skip
+    s = [
+        ca.MX.sym(n, *shape)
+        for n, shape in zip(
+            STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
+        )
+    ]
     m, P, u, p, y, R, dt = s
     o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
     kept = [o["m_f"], ca.vec(o["P_f"]), o["nu"], ca.diag(o["S"]), o["stats"]]
@@ -306,8 +337,12 @@ def run(
         r = slice(b * BLOCK, b * BLOCK + n)
         out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
         for target, source in (
-            (mean, out[2]), (var, out[3][:: nx + 1]), (nu, out[4]), (S, out[5]), (stats, out[6])
-        ):  # fmt: skip
+            (mean, out[2]),
+            (var, out[3][:: nx + 1]),
+            (nu, out[4]),
+            (S, out[5]),
+            (stats, out[6]),
+        ):
             target[:, r] = source[:, :n]
         _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
         if kept is not None:
@@ -320,14 +355,12 @@ def run(
     root = None if not passes.now.gives_roots else out[-1][:, n - 1].reshape(nx, nx).T.copy()
     np.maximum(var, 0.0, out=var)  # rounding, judged above
     nu[missing], S[missing] = np.nan, np.nan
-    again = None
+    final = Belief(model.x, mean[:, -1].copy(), last, root)
+    told = stats[1], stats[3], float(stats[2].sum()), final
+    more: dict[str, Any] = {} if kept is None else kept.fields()
     if full and step.wide is not None:
-        again = partial(_rooted, step, prior, data, backend)
-    return FilterResult(
-        model.x, model.y, data.t, mean, var, nu, S, stats[1], stats[3], float(stats[2].sum()),
-        Belief(model.x, mean[:, -1].copy(), last, root),
-        **({} if kept is None else kept.fields()), again=again,
-    )  # fmt: skip
+        more["again"] = partial(_rooted, step, prior, data, backend)
+    return FilterResult(model.x, model.y, data.t, mean, var, nu, S, *told, **more)
 
 
 def _rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
@@ -442,9 +475,13 @@ class _Kept:
     def fields(self) -> dict[str, Any]:
         """The fields of a result that hold them."""
         return {
-            "cov": self.cov, "mean_pred": self.mean_pred, "cov_pred": self.cov_pred,
-            "cross": self.cross, "innovation_cov": self.S, "roots": self.roots,
-        }  # fmt: skip
+            "cov": self.cov,
+            "mean_pred": self.mean_pred,
+            "cov_pred": self.cov_pred,
+            "cross": self.cross,
+            "innovation_cov": self.S,
+            "roots": self.roots,
+        }
 
     def put(self, r: slice, columns: list[np.ndarray], *, root: bool) -> None:
         """Take P_f, m, P, C, S of some instants; matrices are columns in column-major order."""

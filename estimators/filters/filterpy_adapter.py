@@ -29,7 +29,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import DataError, EstimationError, SignalError
 from apu_casadi.core.sharing import Rebuilt, building
 from estimators.filters.belief import Belief
@@ -97,7 +98,7 @@ class _Evaluated(Rebuilt):
                 f"{self.model.name}: inputs of shape ({len(self.model.u)},) or by name expected "
                 f"({', '.join(self.model.u.names)}), got shape {u.shape}"
             )
-        return u
+        return np.asarray(u)
 
     def _checked(self, out: tuple[np.ndarray, ...], what: str) -> tuple[np.ndarray, ...]:
         check = float(out[-1][0])
@@ -137,7 +138,7 @@ class _Evaluated(Rebuilt):
                 "whole or not at all (z = None): leave the others out by measure(), or use "
                 "estimators.filters.ekf or estimators.filters.ukf, where NaN is the normal case"
             )
-        return z
+        return np.asarray(z)
 
     def noise(self, sigma: Mapping[str, float]) -> np.ndarray:
         """R from standard deviations by name."""

@@ -26,7 +26,8 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from apu_casadi.core.backend import Caller, backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signals
@@ -201,7 +202,7 @@ class ImmResult:
     @property
     def probability(self) -> np.ndarray:
         """Probabilities of the modes after each sample, (M, K)."""
-        return np.exp(self.log_probability)
+        return np.asarray(np.exp(self.log_probability))
 
     @property
     def best(self) -> np.ndarray:
@@ -269,10 +270,8 @@ def _block(
     x = [m.x for m in models]
     n = [len(s) for s in x]
     _, nu, np_, _, ny = models[0].sizes
-    shapes = {
-        "logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2, "u": nu,
-        "y": ny, "R": ny, "dt": 1, "p": np_,
-    }  # fmt: skip
+    shapes = {"logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2}
+    shapes |= {"u": nu, "y": ny, "R": ny, "dt": 1, "p": np_}
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
     mixer = root_mixer if roots else plain_mixer
     logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
@@ -290,11 +289,7 @@ def _block(
     ll = ca.vertcat(*(o[7][2] for o in outs))
     check = ca.vertcat(*(o[7][0] for o in outs))
     new, total, mean, var = _weigher(x, common)(logs, ll, m_f, P_f)
-    carried = [
-        new,
-        ca.vertcat(*(o[0] for o in outs)),
-        ca.vertcat(*(ca.vec(o[1]) for o in outs)),
-    ]
+    carried = [new, ca.vertcat(*(o[0] for o in outs)), ca.vertcat(*(ca.vec(o[1]) for o in outs))]
     S = ca.vertcat(*(ca.diag(o[6]) for o in outs))
     kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check), S]
     name = "imm_roots" if roots else "imm"
@@ -402,95 +397,109 @@ def interacting_multiple_models(
     """
     steps = _steps(models)
     names = tuple(steps)
-    M = len(names)
+    priors = [prior if isinstance(prior, Belief) else prior[n] for n in names]
+    _check(steps, priors)
     first = next(iter(steps.values())).model
-    for name, step in steps.items():
+    data.check(first)
+    common = Signals([s for s in first.x if all(s.name in b.x.names for b in priors)])
+    logT = _log_transitions(len(names), data, transition, rates, names)
+    n = [len(b.x) for b in priors]
+    K = data.size
+    pad = -K % BLOCK
+    y, R, u, dt = padded(data, pad)
+    # a padded sample changes no mode
+    logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
+    logs = _log_prior(names, prior_probability)
+    passes = _Passes([*steps.values()], priors, logs, common, backend)
+    kept: list[list[np.ndarray]] = [[], [], [], [], []]
+    for start in range(0, K + pad, BLOCK):
+        s = slice(start, start + BLOCK)
+        out = passes.block(logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p, K - start)
+        for target, i in zip(kept, (0, 3, 5, 6, 7), strict=True):
+            target.append(out[i].copy())
+        _believable(names, n, data, out[1], out[2], out[7], start)
+        last = out[4][:, -1].copy()  # what is padded may be carried on
+    logp, m_f, mean, var, stats = (np.concatenate(k, axis=1) for k in kept)
+    means = np.split(m_f, np.cumsum(n)[:-1])
+    final = []
+    for b, m, cov in zip(priors, means, _square(last, n), strict=True):
+        final.append(Belief(b.x, m[:, -1].copy(), (cov + cov.T) / 2))
+    loglik = float(stats[0].sum())
+    return ImmResult(names, common, data.t, logp, mean, var, tuple(means), loglik, tuple(final))
+
+
+def _square(columns: np.ndarray, n: list[int]) -> list[np.ndarray]:
+    """Matrices of n x n, stacked as one column in column-major order."""
+    ends = np.cumsum([k * k for k in n])[:-1]
+    return [c.reshape(k, k).T for c, k in zip(np.split(columns, ends), n, strict=True)]
+
+
+def _check(steps: Mapping[str, FilterStep], priors: Sequence[Belief]) -> None:
+    """Refuse modes that differ in what they share, and priors of other states."""
+    base, first = next(iter(steps.items()))
+    for (name, step), b in zip(steps.items(), priors, strict=True):
         for kind in ("u", "p", "y"):
-            mine, want = getattr(step.model, kind).names, getattr(first, kind).names
+            mine, want = getattr(step.model, kind).names, getattr(first.model, kind).names
             if mine != want:
                 raise SignalError(
-                    f"modes {names[0]!r} and {name!r} differ in {kind}: {', '.join(want)} and "
+                    f"modes {base!r} and {name!r} differ in {kind}: {', '.join(want)} and "
                     f"{', '.join(mine)}"
                 )
-    data.check(first)
-    priors = [prior if isinstance(prior, Belief) else prior[n] for n in names]
-    for name, b, step in zip(names, priors, steps.values(), strict=True):
         if b.x.names != step.model.x.names:
             raise SignalError(
                 f"mode {name!r}: prior of {', '.join(b.x.names)}; its model has "
                 f"{', '.join(step.model.x.names)}"
             )
-    common = Signals([s for s in first.x if all(s.name in b.x for b in priors)])
-    logT = _log_transitions(M, data, transition, rates, names)
-    n = [len(b.x) for b in priors]
-    K = data.size
-    blocks = -(-K // BLOCK)
-    pad = blocks * BLOCK - K
-    y, R, u, dt = padded(data, pad)
-    # a padded sample changes no mode
-    logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
 
-    # the buffers are this run's own, as in estimators.filters.filtering
-    one, *others = steps.values()
 
-    def caller(roots: bool) -> Caller:
-        block = _block(one, tuple(others), common, roots, backend, backend_in_use())
-        return Caller(block, copy=False)
+class _Passes:
+    """Blocks one after the other, in square-root form from where a covariance loses digits.
 
-    # what a filter without square-root form lacks, mixing cannot give back
-    able = all(step.root or step.wide is not None for step in steps.values())
-    rooted = able and any(narrow(b.cov) for b in priors)
-    call = caller(rooted)
-    logs = _log_prior(names, prior_probability)
-    m = np.concatenate([b.mean for b in priors])
-    roots = [root_of(b.cov) if b.root is None else b.root for b in priors]
-    P = np.concatenate([(L if rooted else b.cov).ravel(order="F")
-                        for b, L in zip(priors, roots, strict=True)])  # fmt: skip
-    kept: list[list[np.ndarray]] = [[], [], [], [], []]
-    for start in range(0, blocks * BLOCK, BLOCK):
-        s = slice(start, start + BLOCK)
-        data_of = logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p
-        out = call(logs, m, P, *data_of)
-        if (
-            able
-            and not rooted
-            and _needs_roots(
-                n,
-                out[2].ravel(),
-                out[7][:, : K - start],
-                out[11][:, : K - start],
-                R[:, s][:, : K - start],
-            )
-        ):
-            at = np.cumsum([0, *(k * k for k in n)])
-            P = np.concatenate([root_of(P[i:j].reshape(k, k)).ravel(order="F")
-                                for i, j, k in zip(at[:-1], at[1:], n, strict=True)])  # fmt: skip
-            rooted, call = True, caller(True)
-            out = call(logs, m, P, *data_of)
-        each = [o[:, : K - start] for o in out[3:]]
-        for target, i in zip(kept, (0, 3, 5, 6, 7), strict=True):
-            target.append(each[i].copy())
-        _believable(names, n, data, each[1], each[2], each[7], start)
-        logs, m, P = (o.ravel().copy() for o in out[:3])
-        last = each[4][:, -1].copy()  # not P: what is padded may be carried on
-    logp, m_f, mean, var, stats = (np.concatenate(k, axis=1) for k in kept)
-    edges = np.cumsum([0, *n])
-    squares = np.cumsum([0, *(k * k for k in n)])
-    final = []
-    for j, belief in enumerate(priors):
-        cov = last[squares[j] : squares[j + 1]].reshape(n[j], n[j])
-        final.append(Belief(belief.x, m_f[edges[j] : edges[j + 1], -1].copy(), (cov + cov.T) / 2))
-    return ImmResult(
-        names,
-        common,
-        data.t,
-        logp,
-        mean,
-        var,
-        tuple(m_f[edges[j] : edges[j + 1]] for j in range(M)),
-        float(stats[0].sum()),
-        tuple(final),
-    )
+    Args:
+        steps, priors: of the modes.
+        logs: logarithms of the modes' probabilities at the first sample.
+        common, backend: as of :func:`_block`.
+    """
+
+    def __init__(
+        self,
+        steps: list[FilterStep],
+        priors: list[Belief],
+        logs: np.ndarray,
+        common: Signals,
+        backend: str | None,
+    ) -> None:
+        self.steps, self.common, self.backend = steps, common, backend
+        self.n = [len(b.x) for b in priors]
+        # what a filter without square-root form lacks, mixing cannot give back
+        self.able = all(step.root or step.wide is not None for step in steps)
+        self.rooted = self.able and any(narrow(b.cov) for b in priors)
+        self.logs, self.m = logs, np.concatenate([b.mean for b in priors])
+        roots = [root_of(b.cov) if b.root is None else b.root for b in priors]
+        carried = roots if self.rooted else [b.cov for b in priors]
+        self.P = np.concatenate([c.ravel(order="F") for c in carried])
+        self._call = self._caller()
+
+    def _caller(self) -> Caller:
+        # the buffers are this run's own, as in estimators.filters.filtering
+        first, *others = self.steps
+        how = self.rooted, self.backend, backend_in_use()
+        return Caller(_block(first, tuple(others), self.common, *how), copy=False)
+
+    def block(self, *given: Any) -> list[np.ndarray]:
+        """Return what is kept of one block, its last argument the samples in it; go on."""
+        *data, K = given
+        out = self._call(self.logs, self.m, self.P, *data)
+        if self.able and not self.rooted:
+            R, P1 = data[3][:, :K], out[2].ravel()
+            if _needs_roots(self.n, P1, out[7][:, :K], out[11][:, :K], R):
+                roots = [root_of(P) for P in _square(self.P, self.n)]
+                self.P = np.concatenate([L.ravel(order="F") for L in roots])
+                self.rooted = True
+                self._call = self._caller()
+                out = self._call(self.logs, self.m, self.P, *data)
+        self.logs, self.m, self.P = (o.ravel().copy() for o in out[:3])
+        return [o[:, :K] for o in out[3:]]
 
 
 def _believable(

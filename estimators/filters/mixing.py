@@ -42,7 +42,7 @@ def plain_mixer(x: Sequence[Signals]) -> ca.Function:
                 carried.append((ms[i], Ps[i]))
                 continue
             m, P = ca.SX(ms[j]), ca.SX(Ps[j])
-            here = [b for b, s in enumerate(x[j].names) if s in x[i]]
+            here = [b for b, s in enumerate(x[j].names) if s in x[i].names]
             there = [x[i].index(x[j].names[b]) for b in here]
             rest = [b for b in range(n[j]) if b not in here]
             m[here] = ms[i][there]
@@ -81,7 +81,7 @@ def root_mixer(x: Sequence[Signals]) -> ca.Function:
         carried = []
         for i in range(M):
             m, L = ca.SX(ms[j]), ca.SX(n[j], n[i])
-            here = [b for b, s in enumerate(x[j].names) if s in x[i]]
+            here = [b for b, s in enumerate(x[j].names) if s in x[i].names]
             there = [x[i].index(x[j].names[b]) for b in here]
             rest = [b for b in range(n[j]) if b not in here]
             m[here] = ms[i][there]

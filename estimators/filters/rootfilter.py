@@ -22,7 +22,7 @@ from typing import Any
 import casadi as ca
 
 from apu_casadi.core.sharing import kept, once
-from estimators.filters.algebra import append_column, graded_lower, root_update
+from estimators.filters.algebra import graded_lower, root_update, without_gain
 from estimators.filters.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterStep
 from estimators.filters.stepparts import kind_of, projected, step_symbols
 from estimators.models.filtermodel import FilterModel
@@ -42,15 +42,7 @@ def _update(nx: int, nw: int, ny: int, fixed: tuple[int, ...]) -> ca.Function:
     # what is not measured: no innovation, no sensitivity, unit noise
     D = ca.diag(ca.if_else(there, 1, 0)) @ (H @ La)
     done = root_update(La, ca.sparsify(ca.diag(per) @ D), per * nu)
-    gain, L1 = done.gain, done.L
-    if fixed:
-        # each row of the optimal gain takes gain gain' off the variance; without gain it stays
-        kept = ca.SX(*gain.shape)
-        for i in fixed:
-            kept[i, :] = gain[i, :]
-            gain[i, :] = 0
-        for j in range(ny):
-            L1 = append_column(L1, ca.sparsify(kept[:, j]))
+    gain, L1 = without_gain(done.gain, done.L, fixed)
     S = D @ D.T + ca.diag(ca.if_else(there, R, 1))
     nis, measured = ca.dot(done.e, done.e), ca.sum1(there)
     logdet = done.logdet + ca.sum1(ca.log(ca.if_else(there, R, 1)))

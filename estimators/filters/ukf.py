@@ -39,7 +39,7 @@ import casadi as ca
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.core.sharing import kept
-from estimators.filters.algebra import append_column, forward, graded_lower, qr_lower, root_update
+from estimators.filters.algebra import forward, graded_lower, qr_lower, root_update, without_gain
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterResult, FilterStep, run
 from estimators.filters.stepparts import projected, step_symbols
@@ -269,15 +269,7 @@ def _updated(
     noise = ca.diag(ca.sqrt(ca.if_else(there, R, 1)))
     W = qr_lower(ca.horzcat(noise, Q)) if Q.nnz() else noise
     done = root_update(L, ca.sparsify(forward(W, D)), forward(W, nu))
-    gain, L1 = done.gain, done.L
-    if fixed:
-        # each row of the optimal gain takes gain gain' off the variance; without gain it stays
-        kept = ca.SX(*gain.shape)
-        for i in fixed:
-            kept[i, :] = gain[i, :]
-            gain[i, :] = 0
-        for j in range(ny):
-            L1 = append_column(L1, ca.sparsify(kept[:, j]))
+    gain, L1 = without_gain(done.gain, done.L, fixed)
     S = D @ D.T + W @ W.T
     nis = ca.dot(done.e, done.e)
     measured = ca.sum1(there)

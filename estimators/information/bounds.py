@@ -28,7 +28,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Caller, compiled
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, SignalError
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
@@ -37,13 +38,7 @@ from estimators.filters.ekf import extended_kalman_filter
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
-__all__ = [
-    "error_model",
-    "expected_bound",
-    "linearisations",
-    "posterior_bound",
-    "snapshot_bound",
-]
+__all__ = ["error_model", "expected_bound", "linearisations", "posterior_bound", "snapshot_bound"]
 
 COMPILE_FROM = 1000  # samples from which compiling the Jacobians pays
 #: Largest change, over the nominal values, that counts as none in a transition's Jacobian.
@@ -140,12 +135,7 @@ def error_model(model: FilterModel) -> FilterModel:
 
 
 def posterior_bound(
-    model: FilterModel,
-    prior: Belief,
-    data: Recording,
-    truth: Any,
-    *,
-    backend: str | None = None,
+    model: FilterModel, prior: Belief, data: Recording, truth: Any, *, backend: str | None = None
 ) -> np.ndarray:
     """Return the bound on the covariance of x(k) given the samples 0..k, shape (K, nx, nx).
 
@@ -234,10 +224,7 @@ def linearisations(
 
 
 def expected_bound(
-    model: FilterModel,
-    prior: Belief,
-    data: Sequence[Recording],
-    truth: Sequence[Any],
+    model: FilterModel, prior: Belief, data: Sequence[Recording], truth: Sequence[Any]
 ) -> np.ndarray:
     """Return the bound with its information terms averaged over trajectories, (K, nx, nx).
 

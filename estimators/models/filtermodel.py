@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +42,7 @@ __all__ = [
     "biases",
     "discretise",
     "gains",
+    "lagging",
     "measure",
     "measured_inputs",
     "noisy_inputs",
@@ -49,6 +50,7 @@ __all__ = [
 
 #: Largest residual of eliminated unknowns with which a result of f or g is used.
 CHECK_TOL = 1e-9
+_ERROR = "error of the measured {} over its standard deviation"
 METHODS = ("midpoint", "rk4", "implicit midpoint")
 _TRANSITION = ["x", "u", "p", "w", "dt"], ["x1", "check"]
 _OUTPUT = ["x", "u", "p", "w"], ["y", "check"]
@@ -146,6 +148,48 @@ class FilterModel(Parametric):
             if i in fixed and self.walk[i]:
                 raise SignalError(f"{self.name}: {s.name} is considered, its walk must be 0")
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        signals: Sequence[Signals],
+        symbols: Sequence[Any],
+        transition: Sequence[Any],
+        output: Sequence[Any],
+        like: FilterModel | None = None,
+        more: Mapping[str, Unknown] | None = None,
+        consider: tuple[str, ...] = (),
+        cse: bool = False,
+    ) -> FilterModel:
+        """Make a model from expressions in its symbols.
+
+        Args:
+            name: of the model.
+            signals: x, u, p, w, y.
+            symbols: (x, u, p, w, dt).
+            transition: next state and check.
+            output: outputs and check.
+            like: the model whose walk, bounds and considered states the first states have; without,
+                none of them.
+            more: the same of the last states, by name.
+            consider: further considered states.
+            cse: look for common parts of the expressions.
+        """
+        more = more or {}
+        n = len(signals[0]) - len(more)
+        free = np.zeros(n), np.full(n, -np.inf), np.full(n, np.inf)
+        first = free if like is None else (like.walk, like.lower, like.upper)
+        last = zip(*((k.walk, k.lower, k.upper) for k in more.values()), strict=True)
+        held = () if like is None else like.consider
+        all_of = [np.append(a, b) for a, b in zip(first, last, strict=True)] if more else first
+        how = [{"cse": True}] if cse else []
+        f = ca.Function(f"{name}_f", [*symbols], [*transition], *_TRANSITION, *how)
+        g = ca.Function(f"{name}_g", [*symbols[:4]], [*output], *_OUTPUT, *how)
+        held = (*held, *consider, *(n for n, k in more.items() if k.consider))
+        x, u, p, w, y = signals
+        walk, lower, upper = all_of
+        return cls(name, x, u, p, w, y, f, g, walk, lower, upper, held)
+
     @property
     def sizes(self) -> tuple[int, int, int, int, int]:
         """(nx, nu, np, nw, ny)."""
@@ -190,36 +234,9 @@ class FilterModel(Parametric):
         )
 
 
-def _model(
-    name: str,
-    signals: tuple[Signals, Signals, Signals, Signals, Signals],
-    symbols: Sequence[Any],
-    transition: Sequence[Any],
-    output: Sequence[Any],
-    walk: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    consider: tuple[str, ...] = (),
-) -> FilterModel:
-    """Make the two functions from expressions in ``symbols`` = (x, u, p, w, dt)."""
-    return FilterModel(
-        name,
-        *signals,
-        transition=ca.Function(f"{name}_f", [*symbols], [*transition], *_TRANSITION),
-        output=ca.Function(f"{name}_g", [*symbols[:4]], [*output], *_OUTPUT),
-        walk=walk,
-        lower=lower,
-        upper=upper,
-        consider=consider,
-    )
-
-
 @remade
 def discretise(
-    ss: StateSpace,
-    *,
-    method: str = "midpoint",
-    walk: Mapping[str, float] | None = None,
+    ss: StateSpace, *, method: str = "midpoint", walk: Mapping[str, float] | None = None
 ) -> FilterModel:
     """Make a filter's model from a continuous one, inputs held over each step.
 
@@ -258,17 +275,11 @@ def discretise(
         x1 = linearly_implicit_midpoint(x, k1, ca.jacobian(k1, x), dt)
     alg = ss.residual(x, ss.z_of(x, u, p), u, p)[1]
     at_output = ca.norm_1(alg) if len(ss.z) else ca.MX(0)
-    model = _model(
-        ss.name,
-        (ss.x, ss.u, ss.theta, Signals(), ss.y),
-        (x, u, p, w, dt),
-        (x1, check),
-        (ss.g(x, u, p), at_output),
-        np.zeros(nx),
-        np.full(nx, -np.inf),
-        np.full(nx, np.inf),
+    signals = ss.x, ss.u, ss.theta, Signals(), ss.y
+    output = ss.g(x, u, p), at_output
+    return FilterModel.of(ss.name, signals, (x, u, p, w, dt), (x1, check), output).with_walk(
+        walk or {}
     )
-    return model.with_walk(walk or {})
 
 
 @remade
@@ -310,7 +321,7 @@ def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
             raise ParameterError(
                 f"noisy_inputs: sigma of {name} must be finite and >= 0, got {value!r}"
             )
-        if f"w_{name}" in model.w:
+        if f"w_{name}" in model.w.names:
             raise SignalError(f"{model.name}: input {name} is noisy already")
     x, u, p, _, dt = model.symbols()
     n = len(model.w)
@@ -319,36 +330,26 @@ def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
     for j, (i, s) in enumerate(zip(cols, sigma.values(), strict=True)):
         spread[i, j] = s
     true = u - ca.mtimes(spread, w[n:])
-    noises = model.w + Signals(
-        [Signal(f"w_{n}", "1", f"error of the measured {n} over its standard deviation")
-         for n in sigma]
-    )  # fmt: skip
-    return _model(
+    noises = model.w + Signals([Signal(f"w_{n}", "1", _ERROR.format(n)) for n in sigma])
+    return FilterModel.of(
         model.name,
         (model.x, model.u, model.p, noises, model.y),
         (x, u, p, w, dt),
         model.transition(x, true, p, w[:n], dt),
         model.output(x, true, p, w[:n]),
-        model.walk,
-        model.lower,
-        model.upper,
-        model.consider,
+        like=model,
     )
 
 
 def _sensor_errors(model: FilterModel, names: Sequence[str], kind: str) -> FilterModel:
     rows = model.y.indices(names)
     n = len(model.p)
+    what = {"gain": "relative gain error", "bias": "bias"}[kind]
     extra = Signals(
         [
-            Signal(
-                f"{kind}_{name}",
-                "1" if kind == "gain" else model.y[name].unit,
-                f"{'relative gain error' if kind == 'gain' else 'bias'} of the sensor of {name}",
-                default=0.0,
-                nominal=0.01 if kind == "gain" else 0.01 * model.y[name].nominal,
-            )
-            for name in names
+            Signal(f"{kind}_{y.name}", unit, f"{what} of the sensor of {y.name}", 0.0, 0.01 * size)
+            for y in (model.y[i] for i in rows)
+            for unit, size in [("1", 1.0) if kind == "gain" else (y.unit, y.nominal)]
         ]
     )
     x, u, _, w, dt = model.symbols()
@@ -359,16 +360,13 @@ def _sensor_errors(model: FilterModel, names: Sequence[str], kind: str) -> Filte
         spread[i, j] = 1
     error = ca.mtimes(spread, p[n:])
     y = y * (1 + error) if kind == "gain" else y + error
-    return _model(
+    return FilterModel.of(
         model.name,
         (model.x, model.u, model.p + extra, model.w, model.y),
         (x, u, p, w, dt),
         model.transition(x, u, p[:n], w, dt),
         (y, check),
-        model.walk,
-        model.lower,
-        model.upper,
-        model.consider,
+        like=model,
     )
 
 
@@ -407,23 +405,15 @@ def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
     place = {i: x[nx + j] for j, i in enumerate(moved)} | {i: p[j] for j, i in enumerate(kept)}
     all_p = ca.vertcat(*(place[i] for i in range(len(model.p)))) if place else ca.MX(0, 1)
     x1, check = model.transition(x[:nx], u, all_p, w, dt)
-    new = list(unknowns.values())
-    return _model(
+    x_of, p_of = ([model.p[i] for i in rows] for rows in (moved, kept))
+    return FilterModel.of(
         model.name,
-        (
-            model.x + Signals([model.p[i] for i in moved]),
-            model.u,
-            Signals([model.p[i] for i in kept]),
-            model.w,
-            model.y,
-        ),
+        (model.x + Signals(x_of), model.u, Signals(p_of), model.w, model.y),
         (x, u, p, w, dt),
         (ca.vertcat(x1, x[nx:]), check),
         model.output(x[:nx], u, all_p, w),
-        np.concatenate([model.walk, [k.walk for k in new]]),
-        np.concatenate([model.lower, [k.lower for k in new]]),
-        np.concatenate([model.upper, [k.upper for k in new]]),
-        (*model.consider, *(name for name, k in unknowns.items() if k.consider)),
+        like=model,
+        more=unknowns,
     )
 
 
@@ -439,7 +429,7 @@ def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """
     cols = model.u.indices(names)
     for name in names:
-        if f"w_{name}" in model.w:
+        if f"w_{name}" in model.w.names:
             raise SignalError(f"{model.name}: input {name} is noisy already")
     nu, nw = len(model.u), len(model.w)
     x, _, p, _, dt = model.symbols()
@@ -449,22 +439,52 @@ def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
         spread[i, j] = 1
     true = u[:nu] - ca.mtimes(spread, u[nu:] * w[nw:])
     sigmas = [
-        Signal(f"sigma_{n}", model.u[n].unit, f"standard deviation of the measured {n}", None,
-               model.u[n].nominal)
-        for n in names
-    ]  # fmt: skip
-    noises = [
-        Signal(f"w_{n}", "1", f"error of the measured {n} over its standard deviation")
-        for n in names
+        Signal(f"sigma_{n}", s.unit, f"standard deviation of the measured {n}", None, s.nominal)
+        for n, s in ((n, model.u[n]) for n in names)
     ]
-    return _model(
+    noises = [Signal(f"w_{n}", "1", _ERROR.format(n)) for n in names]
+    return FilterModel.of(
         model.name,
         (model.x, model.u + Signals(sigmas), model.p, model.w + Signals(noises), model.y),
         (x, u, p, w, dt),
         model.transition(x, true, p, w[:nw], dt),
         model.output(x, true, p, w[:nw]),
-        model.walk,
-        model.lower,
-        model.upper,
-        model.consider,
+        like=model,
+    )
+
+
+@remade
+def lagging(
+    model: FilterModel, outputs: Sequence[tuple[Signal, Callable[..., Any], Sequence[str], float]]
+) -> FilterModel:
+    """Return the model with readings as its outputs, of which some lag.
+
+    Args:
+        outputs: for each the signal, the expression of some outputs that it is, their names, and
+            the time constant of a first-order lag, s; 0 without.  A lag's state has the name of its
+            signal and is appended; its discretisation is exact for outputs that are held over the
+            step, as inputs are.
+
+    Raises:
+        SignalError: unknown output.
+    """
+    lags = [(i, tau) for i, (_, _, _, tau) in enumerate(outputs) if tau]
+    nx = len(model.x)
+    _, u, p, w, dt = model.symbols()
+    x = ca.MX.sym("x", nx + len(lags))
+    y, check = model.output(x[:nx], u, p, w)
+    read = [value(*(y[model.y.index(n)] for n in names)) for _, value, names, _ in outputs]
+    x1, checked = model.transition(x[:nx], u, p, w, dt)
+    for j, (i, tau) in enumerate(lags):
+        x1 = ca.vertcat(x1, read[i] + ca.exp(-dt / tau) * (x[nx + j] - read[i]))
+        read[i] = x[nx + j]
+    states = [dataclasses.replace(outputs[i][0], default=None) for i, _ in lags]
+    return FilterModel.of(
+        model.name,
+        (model.x + Signals(states), model.u, model.p, model.w, Signals([s for s, *_ in outputs])),
+        (x, u, p, w, dt),
+        (x1, checked + check if lags else checked),
+        (ca.vertcat(*read), check),
+        like=model,
+        more={s.name: Unknown() for s in states},
     )

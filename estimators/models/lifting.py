@@ -27,8 +27,6 @@ from estimators.models.filtermodel import FilterModel, discretise
 
 __all__ = ["Lifted", "lift", "plain"]
 
-TRANSITION = ["x", "u", "p", "w", "dt"], ["x1", "check"]
-OUTPUT = ["x", "u", "p", "w"], ["y", "check"]
 _STAGE = ["x", "s", "u", "p", "w", "dt", "k"], ["y", "x1", "c", "check"]
 
 
@@ -120,33 +118,61 @@ def lift(
             in a steady model.
     """
     build = build or (lambda m: m)
-    nx, nz, nt = len(ss.x), len(ss.z), len(ss.theta)
     smooth, cells = _split(_equations(ss, equations))
-    n_k = cells.size1_out(0)
     model = build(discretise(ss, walk=walk))
     if steady and (model.x.names != ss.x.names or model.walk.any()):
         raise ParameterError(
             f"{ss.name}: a steady model has no process noise and no parameters as states; samples "
             "do not follow from each other"
         )
-    # unknowns at the sample (a) and amid the step (m)
-    s = [Signal(f"{q.name}_a", q.unit, q.doc, None, q.nominal) for q in ss.z]
-    held = [Signal(f"alg_{q.name}_a", "1", f"equation of {q.name}") for q in ss.z]
-    if steady:
-        held += [Signal(f"rate_{q.name}", q.unit, f"rate of {q.name}") for q in ss.x]
-    else:
-        amid = (*ss.x, *ss.z)
-        s += [Signal(f"{q.name}_m", q.unit, q.doc, None, q.nominal) for q in amid]
-        held += [Signal(f"alg_{q.name}_m", "1", f"equation of {q.name}") for q in amid]
-    n_s = len(s)
-    k = [Signal(f"k{i}", "1", "coefficient") for i in range(n_k if steady else 2 * n_k)]
+    form = _Form(ss, build, smooth, cells, steady, walk or {})
+    big = form.changed([*form.s, *form.k], form.held, form.constraints, form.output)
+    jumps = form.changed(form.s, form.k, form.coefficients, form.nothing)
+    x, u, p, w, dt = model.symbols()
+    given = [x, ca.MX.sym("s", len(form.s)), u, p, w, dt]
+    at_k = ca.MX.sym("k", len(form.k))
+    known = {q.name: given[1][i] for i, q in enumerate(form.s)}
+    known |= {q.name: at_k[i] for i, q in enumerate(form.k)}
+    y, x1, c = _sorted(model, big, form.held, given, known)
+    stage = ca.Function(f"{ss.name}_stage", [*given, at_k], [y, x1, c, ca.MX(0)], *_STAGE)
+    _, _, now = _sorted(model, jumps, form.k, given, known)
+    frozen = ca.Function(f"{ss.name}_frozen", given, [now])
+    start = _start(ss, model, steady)
+    return Lifted(model, Signals(form.s), _scalar(stage), frozen, start, steady)
 
-    def point(x: Any, p: Any) -> tuple[Any, ...]:
-        """State and unknowns at the sample, and amid the step."""
-        q = p[nt : nt + n_s]
-        return x[:nx], q[:nz], *((None, None) if steady else (q[nz : nz + nx], q[nz + nx :]))
+
+class _Form:
+    """The lifted form of a model's equations: unknowns ``s``, constraints ``held``, cells ``k``.
+
+    Unknowns are those at the sample (a) and, unless ``steady``, amid the step (m).
+    """
+
+    def __init__(
+        self,
+        ss: StateSpace,
+        build: Callable[[FilterModel], FilterModel],
+        smooth: ca.Function,
+        cells: ca.Function,
+        steady: bool,
+        walk: Mapping[str, float],
+    ) -> None:
+        self.ss, self.build, self.smooth, self.cells = ss, build, smooth, cells
+        self.steady, self.walk = steady, walk
+        s = [Signal(f"{q.name}_a", q.unit, q.doc, None, q.nominal) for q in ss.z]
+        held = [Signal(f"alg_{q.name}_a", "1", f"equation of {q.name}") for q in ss.z]
+        if steady:
+            held += [Signal(f"rate_{q.name}", q.unit, f"rate of {q.name}") for q in ss.x]
+        else:
+            amid = (*ss.x, *ss.z)
+            s += [Signal(f"{q.name}_m", q.unit, q.doc, None, q.nominal) for q in amid]
+            held += [Signal(f"alg_{q.name}_m", "1", f"equation of {q.name}") for q in amid]
+        self.n_k = cells.size1_out(0)
+        n = self.n_k if steady else 2 * self.n_k
+        self.s, self.held = s, held
+        self.k = [Signal(f"k{i}", "1", "coefficient") for i in range(n)]
 
     def changed(
+        self,
         parameters: Sequence[Signal],
         kept: Sequence[Signal],
         rows: Callable[[Any, Any, Any, Any], tuple[Any, list[Any]]],
@@ -157,50 +183,53 @@ def lift(
         Constraints travel as the next values of states that nothing reads, unknowns and
         coefficients as parameters: so ``build`` does to them what it does to the model.
         """
-        x, w = ca.MX.sym("x", nx + len(kept)), ca.MX.sym("w", 0)
-        u, p, dt = ca.MX.sym("u", len(ss.u)), ca.MX.sym("p", nt + len(parameters)), ca.MX.sym("dt")
+        ss = self.ss
+        x, u = ca.MX.sym("x", len(ss.x) + len(kept)), ca.MX.sym("u", len(ss.u))
+        p, w = ca.MX.sym("p", len(ss.theta) + len(parameters)), ca.MX.sym("w", 0)
+        dt = ca.MX.sym("dt")
         x1, more = rows(x, u, p, dt)
-        n = nx + len(kept)
-        f = ca.Function("f", [x, u, p, w, dt], [ca.vertcat(x1, *more), ca.MX(0)], *TRANSITION)
-        g = ca.Function("g", [x, u, p, w], [output(x, u, p), ca.MX(0)], *OUTPUT)
-        return build(
-            FilterModel(
-                ss.name, ss.x + Signals(kept), ss.u, ss.theta + Signals(parameters), Signals(),
-                ss.y, f, g, np.zeros(n), np.full(n, -np.inf), np.full(n, np.inf),
-            ).with_walk(walk or {})
-        )  # fmt: skip
+        signals = ss.x + Signals(kept), ss.u, ss.theta + Signals(parameters), Signals(), ss.y
+        step, seen = (ca.vertcat(x1, *more), ca.MX(0)), (output(x, u, p), ca.MX(0))
+        model = FilterModel.of(ss.name, signals, (x, u, p, w, dt), step, seen)
+        return self.build(model.with_walk(self.walk))
 
-    def equations_at(x: Any, u: Any, p: Any) -> tuple[Any, Any, Any]:
-        at, z, _, _ = point(x, p)
-        out: tuple[Any, Any, Any] = smooth(at, z, u, p[:nt], p[nt + n_s : nt + n_s + n_k])
+    def _point(self, x: Any, p: Any) -> tuple[Any, ...]:
+        """State and unknowns at the sample, and amid the step."""
+        nx, nz, nt = (len(v) for v in (self.ss.x, self.ss.z, self.ss.theta))
+        q = p[nt : nt + len(self.s)]
+        return x[:nx], q[:nz], *((None, None) if self.steady else (q[nz : nz + nx], q[nz + nx :]))
+
+    def _equations(self, x: Any, u: Any, p: Any) -> tuple[Any, Any, Any]:
+        at, z, _, _ = self._point(x, p)
+        nt, n = len(self.ss.theta), len(self.ss.theta) + len(self.s)
+        out: tuple[Any, Any, Any] = self.smooth(at, z, u, p[:nt], p[n : n + self.n_k])
         return out
 
-    def constraints(x: Any, u: Any, p: Any, dt: Any) -> tuple[Any, list[Any]]:
-        at, _, x_m, z_m = point(x, p)
-        ode, alg, _ = equations_at(x, u, p)
-        if steady:
+    def output(self, x: Any, u: Any, p: Any) -> Any:
+        """Outputs at the sample."""
+        return self._equations(x, u, p)[2]
+
+    def nothing(self, x: Any, u: Any, p: Any) -> Any:
+        """No outputs."""
+        return ca.MX.zeros(len(self.ss.y))
+
+    def constraints(self, x: Any, u: Any, p: Any, dt: Any) -> tuple[Any, list[Any]]:
+        """Next state, and what must be zero."""
+        ss, nt = self.ss, len(self.ss.theta)
+        at, _, x_m, z_m = self._point(x, p)
+        ode, alg, _ = self._equations(x, u, p)
+        if self.steady:
             return at, [alg, ode / ss.x.nominals]
-        rate, alg_m, _ = smooth(x_m, z_m, u, p[:nt], p[nt + n_s + n_k :])
+        k_m = p[nt + len(self.s) + self.n_k :]
+        rate, alg_m, _ = self.smooth(x_m, z_m, u, p[:nt], k_m)
         return at + dt * rate, [alg, (x_m - at - dt / 2 * ode) / ss.x.nominals, alg_m]
 
-    def coefficients(x: Any, u: Any, p: Any, _: Any) -> tuple[Any, list[Any]]:
-        at, z, x_m, z_m = point(x, p)
-        here = [cells(at, z, u, p[:nt])]
-        return at, here if steady else [*here, cells(x_m, z_m, u, p[:nt])]
-
-    big = changed([*s, *k], held, constraints, lambda x, u, p: equations_at(x, u, p)[2])
-    jumps = changed(s, k, coefficients, lambda x, u, p: ca.MX.zeros(len(ss.y)))
-    x, u, p, w, dt = model.symbols()
-    given = [x, ca.MX.sym("s", n_s), u, p, w, dt]
-    at_k = ca.MX.sym("k", len(k))
-    known = {q.name: given[1][i] for i, q in enumerate(s)}
-    known |= {q.name: at_k[i] for i, q in enumerate(k)}
-    y, x1, c = _sorted(model, big, held, given, known)
-    stage = ca.Function(f"{ss.name}_stage", [*given, at_k], [y, x1, c, ca.MX(0)], *_STAGE)
-    _, _, now = _sorted(model, jumps, k, given, known)
-    frozen = ca.Function(f"{ss.name}_frozen", given, [now])
-    start = _start(ss, model, steady)
-    return Lifted(model, Signals(s), _scalar(stage), frozen, start, steady)
+    def coefficients(self, x: Any, u: Any, p: Any, _: Any) -> tuple[Any, list[Any]]:
+        """State, and the cells of the tables."""
+        theta = p[: len(self.ss.theta)]
+        at, z, x_m, z_m = self._point(x, p)
+        here = [self.cells(at, z, u, theta)]
+        return at, here if self.steady else [*here, self.cells(x_m, z_m, u, theta)]
 
 
 def _scalar(fun: ca.Function) -> ca.Function:
@@ -282,7 +311,7 @@ def _sorted(
 ) -> tuple[Any, Any, Any]:
     """Outputs, next state and held rows of a changed model, called with a stage's arguments."""
     x, _, u, p, w, dt = given
-    X = ca.vertcat(*(x[model.x.index(n)] if n in model.x else 0 for n in big.x.names))
+    X = ca.vertcat(*(x[model.x.index(n)] if n in model.x.names else 0 for n in big.x.names))
     P = ca.vertcat(
         ca.MX(0, 1), *(known[n] if n in known else p[model.p.index(n)] for n in big.p.names)
     )
@@ -294,7 +323,8 @@ def _sorted(
 
 def _start(ss: StateSpace, model: FilterModel, steady: bool) -> ca.Function:
     x, u, p, _, _ = model.symbols()
-    theta = [x[model.x.index(n)] if n in model.x else p[model.p.index(n)] for n in ss.theta.names]
+    own = model.x.names
+    theta = [x[model.x.index(n)] if n in own else p[model.p.index(n)] for n in ss.theta.names]
     at = x[: len(ss.x)]
     z = ss.z_of(at, u[model.u.indices(ss.u.names)], ca.vertcat(ca.MX(0, 1), *theta))
     return ca.Function(f"{ss.name}_start", [x, u, p], [z if steady else ca.vertcat(z, at, z)])

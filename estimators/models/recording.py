@@ -52,8 +52,9 @@ def plain_numbers(data: Any, what: str, *, gaps: bool = False) -> np.ndarray:
         how = "t / np.timedelta64(1, 's')" if kind == "m" else "(t - t[0]) / np.timedelta64(1, 's')"
         raise DataError(f"{what}: {str(wrong)!r} is a time of NumPy, not a number: give {how}")
     if kind not in "fiu" and a.size:
-        raise DataError(f"{what}: numbers expected, got {wrong!r:.60} of type "
-                        f"{type(wrong).__name__}")  # fmt: skip
+        raise DataError(
+            f"{what}: numbers expected, got {wrong!r:.60} of type {type(wrong).__name__}"
+        )
     out = a.astype(float)
     if mask is not None and mask.any():
         if not gaps:
@@ -235,11 +236,12 @@ def record(
         SignalError: a missing input or parameter, or one that is not finite.
     """
     for what, names, known in (
-        ("output", outputs, model.y), ("sigma of output", sigma, model.y),
+        ("output", outputs, model.y),
+        ("sigma of output", sigma, model.y),
         ("input", inputs or {}, model.u),
-    ):  # fmt: skip
+    ):
         for name in names:
-            if name not in known:
+            if name not in known.names:
                 raise DataError(f"unknown {what} {name!r} {nearest(name, known.names)}")
     if not outputs:
         raise DataError("no output is measured")

@@ -18,30 +18,29 @@ import os
 import sys
 from pathlib import Path
 
+from scenarios.commands import given
 from scenarios.shell import jsontext, usage
 
 NAME = "bench"
 HELP = "measure times and their accuracy (takes minutes)"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--only", metavar="A,B", help="parts to measure, comma separated")
-    parser.add_argument("--list", action="store_true", help="list the parts and stop")
-    parser.add_argument("--peers", action="store_true", help="also measure dpsim and pyCycle")
-    parser.add_argument(
-        "--pycycle-python", metavar="PYTHON", help="a Python that has pyCycle, for --peers"
-    )
-    parser.add_argument("--runs", type=int, help="joint runs of the campaign (default 1000)")
-    parser.add_argument("--json", action="store_true", help="print JSON only")
-    parser.add_argument("--page", metavar="FILE", help="also write the page, BENCHMARKS.md")
-    parser.add_argument("--quiet", action="store_true", help="do not say what is being measured")
+OPTIONS = """
+--only A,B              | parts to measure, comma separated
+--list                  | list the parts and stop
+--peers                 | also measure dpsim and pyCycle
+--pycycle-python PYTHON | a Python that has pyCycle, for --peers
+--runs int              | joint runs of the campaign (default 1000)
+--json                  | print JSON only
+--page FILE             | also write the page, BENCHMARKS.md
+--quiet                 | do not say what is being measured
+"""
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print, write."""
     from scenarios import registry
     from scenarios.bench import benchmarks
+    from scenarios.bench.linearity import write_plot
+    from scenarios.bench.measuring import Size
     from scenarios.shell import markdown
 
     if args.list:
@@ -50,13 +49,13 @@ def run(args: argparse.Namespace) -> int:
     usage.count("--runs", args.runs)
     if args.pycycle_python:
         os.environ["APU_PYCYCLE_PYTHON"] = args.pycycle_python
-    size = benchmarks.Size()
+    size = Size()
     if args.runs is not None:
         size = dataclasses.replace(size, runs=args.runs)
     names = None
     if args.only is not None:
-        names = [n.strip() for n in args.only.split(",") if n.strip()]
-        names += [n for n in benchmarks.PEERS if args.peers and n not in names]
+        names = given.names(args.only)
+        names += [n for n in benchmarks.parts(peers=True) if args.peers and n not in names]
     if args.page:
         registry.prepare(Path(args.page).parent)
     show = not args.quiet and not args.json and sys.stderr.isatty()
@@ -70,12 +69,12 @@ def run(args: argparse.Namespace) -> int:
         page, image = Path(args.page), None
         if report.curves:
             image = "docs/images/bench_linear.png"
-            made.append(benchmarks.write_plot(report.curves, size, page.parent / image))
+            made.append(write_plot(report.curves, size, page.parent / image))
         made.append(markdown.write_text(page, benchmarks.page(report, image)))
     if args.json:
         jsontext.show(report.to_dict())
     else:
         print(benchmarks.table(report))
         if made:
-            print("\nwritten:", *(f"  {path}" for path in made), sep="\n")
+            given.written(made)
     return 0 if all(r.accurate for rows in report.rows.values() for r in rows) else 1

@@ -17,9 +17,10 @@ war), health (f_eta_c, ...), fixed (two for each point) or measured:
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from scenarios.commands import given
 from scenarios.shell import jsontext, progress
 
 if TYPE_CHECKING:
@@ -28,11 +29,18 @@ if TYPE_CHECKING:
 
 NAME = "calibrate"
 HELP = "fit map numbers to table or test-bench points"
+OPTIONS = f"""
+file FILE ?        | CSV of points (see above)
+--free A,B         | numbers to fit (default: the six of the code)
+--write-points CSV | write the points, as a template
+{given.UNIT}
+--json             | print JSON
+"""
 
-FREE = (
-    "compressor_map.a_W", "compressor_map.n_Re", "compressor_map.k_SM", "compressor_map.a_SM",
-    "turbine_map.a_W", "turbine_map.c_PR",
-)  # fmt: skip
+FREE = tuple(
+    [f"compressor_map.{n}" for n in ["a_W", "n_Re", "k_SM", "a_SM"]]
+    + [f"turbine_map.{n}" for n in ["a_W", "c_PR"]]
+)
 """The numbers that the defaults set."""
 
 CLOSURE = 1e-4
@@ -40,22 +48,10 @@ CLOSURE = 1e-4
 rows of Table 4.  The digits printed are finer."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare arguments and options."""
-    parser.add_argument("file", metavar="FILE", nargs="?", help="CSV of points (see above)")
-    parser.add_argument(
-        "--free",
-        metavar="A,B",
-        help="numbers to fit (default: the six of the code)",
-    )
-    parser.add_argument("--write-points", metavar="CSV", help="write the points, as a template")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
 def published_points() -> list[CalibrationPoint]:
     """Return the points that the defaults were fitted to, from Tables 4 and 5."""
     from apu_casadi.gaspath.calibration import CalibrationPoint
-    from apu_casadi.gaspath.gasgenerator import GasGeneratorParameters
+    from apu_casadi.gaspath.designdata import GasGeneratorParameters
     from scenarios.validation.comparison import reference
 
     p = GasGeneratorParameters()
@@ -88,14 +84,13 @@ def published_points() -> list[CalibrationPoint]:
     ]
 
 
-def uncalibrated() -> GasGenerator:
-    """Return the default engine with the maps' shapes as published."""
+def uncalibrated(gg: GasGenerator) -> GasGenerator:
+    """Return an engine with the maps' shapes as published."""
     import dataclasses
 
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
 
-    gg, plain = GasGenerator(), MapCalibration()
+    plain = MapCalibration()
     return dataclasses.replace(
         gg,
         compressor_map=dataclasses.replace(gg.compressor_map, calibration=plain),
@@ -106,20 +101,21 @@ def uncalibrated() -> GasGenerator:
 def run(args: argparse.Namespace) -> int:
     """Fit, and print the result."""
     from apu_casadi.gaspath.calibration import calibrate, read_points, write_points
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
 
     points = read_points(args.file) if args.file else published_points()
     if args.file:
         _plausible(args.file, points)
     if args.write_points:
         write_points(points, args.write_points)
-    free = [n.strip() for n in args.free.split(",") if n.strip()] if args.free else list(FREE)
+    free = given.names(args.free) if args.free else list(FREE)
     progress.tell(f"fitting {len(free)} numbers to {len(points)} points", quiet=args.json)
-    result = calibrate(GasGenerator() if args.file else uncalibrated(), points, free)
+    gg = given.engine(args)
+    result = calibrate(gg if args.file else uncalibrated(gg), points, free)
+    now = in_use(gg, result.names)
     if args.json:
-        jsontext.show(report(result))
+        jsontext.show(report(result, now))
     else:
-        print(text(result))
+        print(text(result, now))
     return 0
 
 
@@ -145,9 +141,8 @@ def _plausible(path: str, points: Sequence[CalibrationPoint]) -> None:
                 )
 
 
-def report(result: CalibrationResult) -> dict[str, Any]:
-    """Return the result as plain numbers, with the values now in the code beside them."""
-    now = _in_code(result)
+def report(result: CalibrationResult, now: Mapping[str, float]) -> dict[str, Any]:
+    """Return the result as plain numbers, with the values of the engine before beside them."""
     return {
         "numbers": [
             {"name": n, "value": result.values[n], "std": result.std[n], "in_code": now[n]}
@@ -164,17 +159,15 @@ def report(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _in_code(result: CalibrationResult) -> dict[str, float]:
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-
-    gg = GasGenerator()
-    parts = (n.partition(".") for n in result.names)
+def in_use(gg: GasGenerator, names: Sequence[str]) -> dict[str, float]:
+    """Return the calibrated numbers that an engine has, by name."""
+    parts = (n.partition(".") for n in names)
     return {f"{s}.{f}": getattr(getattr(gg, s).calibration, f) for s, _, f in parts}
 
 
-def text(result: CalibrationResult) -> str:
-    """Return the result as text."""
-    now, std = _in_code(result), result.std
+def text(result: CalibrationResult, now: Mapping[str, float]) -> str:
+    """Return the result as text, with the values of the engine before beside them."""
+    std = result.std
     width = max(len(n) for n in result.names)
     lines = [f"{'number':<{width}}  {'value':>12}  {'std. dev.':>10}  {'in the code':>12}"]
     lines += [

@@ -12,38 +12,33 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from scenarios.commands import given
 from scenarios.shell import guard, jsontext, usage
+from scenarios.shell.progress import bar
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 NAME = "campaign"
 HELP = "run many joint scenarios with random faults"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--runs", type=int, default=1000, help="number of runs (default 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default 0)")
-    parser.add_argument(
-        "--base", default="joint", metavar="SCENARIO", help="scenario that is varied (joint)"
-    )
-    parser.add_argument("--workers", type=int, help="processes (default: all cores)")
-    parser.add_argument(
-        "--out", default="results/campaign", metavar="DIR", help="folder (results/campaign)"
-    )
-    parser.add_argument("--fresh", action="store_true", help="do not take up what DIR already has")
-    parser.add_argument(
-        "--waveforms", action="store_true", help="keep the full dataset of each run (large)"
-    )
-    parser.add_argument(
-        "--no-wait", action="store_true", help="refuse when another campaign works in DIR"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+OPTIONS = f"""
+--runs int =1000       | number of runs (default 1000)
+--seed int =0          | of the random numbers (default 0)
+--base SCENARIO =joint | scenario that is varied (joint)
+{given.UNIT}
+--workers int          | processes (default: all cores)
+--out DIR =results/campaign | folder (results/campaign)
+--fresh                | do not take up what DIR already has
+--waveforms            | keep the full dataset of each run (large)
+--no-wait              | refuse when another campaign works in DIR
+--json                 | print JSON
+--quiet                | no progress bar
+"""
 
 
 def resume(args: argparse.Namespace) -> str:
@@ -53,15 +48,12 @@ def resume(args: argparse.Namespace) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Run the campaign; status 0 even if runs were refused, which the result tells."""
-    from pathlib import Path
-
-    from apu_casadi.gaspath.conditions import day_words
-    from scenarios import campaigns, registry
-    from scenarios.shell import notices
+    from scenarios import campaigns
 
     usage.count("--runs", args.runs)
     usage.count("--workers", args.workers, most=1024)
-    runs = campaigns.random_faults(args.runs, args.seed, base=registry.get(args.base))
+    base = given.scenario(args, args.base)
+    runs = campaigns.random_faults(args.runs, args.seed, base=base)
     t = time.perf_counter()
     kept = 0
 
@@ -73,69 +65,50 @@ def run(args: argparse.Namespace) -> int:
     def say(sentence: str) -> None:
         print(f"apu: {sentence}", file=sys.stderr, flush=True)
 
+    how: dict[str, Any] = {"workers": args.workers, "out": args.out, "progress": progress}
+    how |= {"summary_only": not args.waveforms, "resume": not args.fresh, "wait": not args.no_wait}
+    show = not args.quiet and sys.stderr.isatty()
     try:
-        with _bar(args.runs, show=not args.quiet and sys.stderr.isatty()) as move:
-            ds = campaigns.run_campaign(
-                runs, workers=args.workers, out=args.out, summary_only=not args.waveforms,
-                progress=progress, resume=not args.fresh, wait=not args.no_wait, say=say,
-            )  # fmt: skip
+        with bar(NAME, args.runs, show=show, unit="run") as move:
+            ds = campaigns.run_campaign(runs, say=say, **how)
     except KeyboardInterrupt:
         again = "the same command without --fresh" if args.fresh else "the same command"
         guard.note(f"{kept} of {args.runs} runs are kept in {args.out}; {again} goes on with them")
         raise
     t = time.perf_counter() - t
-    n = campaigns.counts(ds)
-    reasons = {
-        str(name): str(why)
-        for name, why, s in zip(*(ds[k].values for k in ("run", "reason", "status")), strict=True)
-        if s
-    }
-    warned = {
-        str(name): str(words)
-        for name, words in zip(ds["run"].values, ds["warnings"].values, strict=True)
-        if words != "-"
-    }
-    base = registry.get(args.base)
-    made = {
-        "base": base.name, "ambient": dataclasses.asdict(base.ambient),
-        "solver": ds.attrs["solver"], "exchange": base.exchange,
-        "apu_casadi_version": ds.attrs["apu_casadi_version"],
-    }  # fmt: skip
-    path = Path(args.out) / campaigns.DATASET
+    report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": campaigns.counts(ds)}
+    report |= {"base": base.name, "ambient": dataclasses.asdict(base.ambient)}
+    report |= {"solver": ds.attrs["solver"], "exchange": base.exchange}
+    report |= {"apu_casadi_version": ds.attrs["apu_casadi_version"], "reasons": _told(ds, "reason")}
+    report |= {"warnings": _told(ds, "warnings"), "file": str(Path(args.out) / campaigns.DATASET)}
     if args.json:
-        report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": n}
-        report |= {**made, "reasons": reasons, "warnings": warned, "file": str(path)}
         jsontext.show(report)
-        return 0
-    print(f"{args.runs} runs in {t:.1f} s: " + ", ".join(f"{v} {k}" for k, v in n.items() if v))
-    for name, why in list(reasons.items())[:10]:
-        print(f"  {name}: {why}")
-    if len(reasons) > 10:
-        print(f"  ... and {len(reasons) - 10} more, in the file")
-    for name, words in list(warned.items())[:10]:
-        notices.tell([f"{name}: {words}"])
-    if warned:
-        print(f"{len(warned)} runs come with warnings, in the file")
-    print(
-        f"base {base.name}, seed {args.seed}, {day_words(made['ambient'])}, solver "
-        f"{made['solver']}, exchange {base.exchange}, apu-casadi {made['apu_casadi_version']}"
-    )
-    print(f"written: {path}")
+    else:
+        _print(report)
     return 0
 
 
-@contextmanager
-def _bar(total: int, *, show: bool) -> Iterator[Callable[[int, int], None]]:
-    """Yield a callback that moves a progress bar on stderr, or does nothing."""
-    if not show:
-        yield lambda done, total: None
-        return
-    from tqdm import tqdm
+def _told(ds: xr.Dataset, name: str) -> dict[str, str]:
+    """Return the texts of a variable by run, without those that have nothing to tell."""
+    texts = zip(ds["run"].values, ds[name].values, strict=True)
+    return {str(run): str(text) for run, text in texts if text != "-"}
 
-    columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
-    with tqdm(total=total, desc=NAME, unit="run", ncols=columns, file=sys.stderr) as bar:
 
-        def progress(done: int, _: int) -> None:
-            bar.update(done - bar.n)
+def _print(r: dict[str, Any]) -> None:
+    from apu_casadi.gaspath.conditions import day_words
+    from scenarios.shell import notices
 
-        yield progress
+    counted = ", ".join(f"{v} {k}" for k, v in r["counts"].items() if v)
+    print(f"{r['runs']} runs in {r['seconds']:.1f} s: {counted}")
+    for name, why in list(r["reasons"].items())[:10]:
+        print(f"  {name}: {why}")
+    if len(r["reasons"]) > 10:
+        print(f"  ... and {len(r['reasons']) - 10} more, in the file")
+    notices.tell(f"{name}: {words}" for name, words in list(r["warnings"].items())[:10])
+    if r["warnings"]:
+        print(f"{len(r['warnings'])} runs come with warnings, in the file")
+    print(
+        f"base {r['base']}, seed {r['seed']}, {day_words(r['ambient'])}, solver {r['solver']}, "
+        f"exchange {r['exchange']}, apu-casadi {r['apu_casadi_version']}"
+    )
+    print(f"written: {r['file']}")

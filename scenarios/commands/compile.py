@@ -8,11 +8,18 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from typing import Any
 
+from scenarios.commands import given
 from scenarios.shell import jsontext
 
 NAME = "compile"
 HELP = "compile the hot functions to C libraries ahead of time"
+OPTIONS = """
+--clear    | delete the libraries and stop
+--only A,B | groups to compile, comma separated
+--json     | print JSON
+"""
 
 HOT: tuple[tuple[str, str], ...] = (
     ("gas_generator", "scenarios.commands.compile:gas_generator_functions"),
@@ -20,13 +27,6 @@ HOT: tuple[tuple[str, str], ...] = (
     ("joint", "scenarios.commands.compile:joint_functions"),
 )
 """(name, "module:callable"); the callable compiles its functions and returns their names."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--clear", action="store_true", help="delete the libraries and stop")
-    parser.add_argument("--only", metavar="A,B", help="groups to compile, comma separated")
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def resume(args: argparse.Namespace) -> str:
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"{n} libraries deleted")
         return 0
     groups = dict(HOT)
-    only = [n.strip() for n in args.only.split(",")] if args.only else list(groups)
+    only = given.names(args.only) if args.only else list(groups)
     for name in only:
         if name not in groups:
             raise BackendError(f"--only: unknown group {name!r} {nearest(name, groups)}")
@@ -78,12 +78,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def gas_generator_functions() -> list[str]:
-    """Compile state update, output and their combination of the default engine."""
+    """Compile state update, output and their combination for engines of the default structure."""
     from apu_casadi.core.backend import compiled
     from apu_casadi.gaspath.gasgenerator import GasGenerator
 
-    gg = GasGenerator()
-    return [str(compiled(f).name()) for f in (gg.f, gg.g, gg.step)]
+    family = GasGenerator().family
+    return [str(compiled(f).name()) for f in (family.f, family.g, family.step)]
 
 
 def joint_functions() -> list[str]:
@@ -99,8 +99,6 @@ def joint_functions() -> list[str]:
     for waveform_dt in (50e-6, None):
         for fault in (Ttsc(0.05, 20.0), Ttsc(0.05, 1.0, 1.0)):
             events = [FaultChange(0.3, fault)]
-            simulate_joint(
-                apu, duration=0.4, load=load, events=events, solver="propagator",
-                waveform_dt=waveform_dt,
-            )  # fmt: skip
+            how: dict[str, Any] = {"solver": "propagator", "waveform_dt": waveform_dt}
+            simulate_joint(apu, duration=0.4, load=load, events=events, **how)
     return loaded_functions()

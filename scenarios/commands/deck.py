@@ -15,57 +15,50 @@ import time
 from pathlib import Path
 from typing import Any
 
+from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
-from scenarios.commands.given import program
+from scenarios.commands import given
 from scenarios.shell import jsontext, progress, usage
 
 NAME = "deck"
 HELP = "write a performance deck over altitude, Mach, ISA deviation and power"
+OPTIONS = f"""
+--altitude AXIS =0:12000:7 | m
+--mach AXIS =0:0.8:5       | flight Mach number
+--disa AXIS ={DEFAULT_DAY["dT_isa"]:g} | ISA deviation, K (default %(default)s)
+--power AXIS =0:500e3:11   | shaft power, W
+--outputs A,B              | outputs to keep (default: all)
+{given.UNIT}
+--out FILE =deck.nc        | netCDF file
+--threads int              | default: all cores
+--json                     | print JSON
+"""
 LARGEST = 5_000_000  # points; outputs alone are then 1.8 GB
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--altitude", default="0:12000:7", metavar="AXIS", help="m")
-    parser.add_argument("--mach", default="0:0.8:5", metavar="AXIS", help="flight Mach number")
-    parser.add_argument(
-        "--disa", default=f"{DEFAULT_DAY['dT_isa']:g}", metavar="AXIS",
-        help="ISA deviation, K (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--power", default="0:500e3:11", metavar="AXIS", help="shaft power, W")
-    parser.add_argument("--outputs", metavar="A,B", help="outputs to keep (default: all)")
-    parser.add_argument("--out", default="deck.nc", metavar="FILE", help="netCDF file")
-    parser.add_argument("--threads", type=int, help="default: all cores")
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Solve the grid and write it."""
     from apu_casadi.core import files, results
     from apu_casadi.core.errors import ScenarioError
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.gaspath.steady.steadypoint import MEANING, Status
     from apu_casadi.gaspath.steady.trimbatch import performance_deck
 
     usage.count("--threads", args.threads, most=1024)
-    axes: dict[str, Any] = {
-        "altitude": _axis("--altitude", args.altitude), "Mach": _axis("--mach", args.mach),
-        "dT_isa": _axis("--disa", args.disa), "PW": _axis("--power", args.power),
-    }  # fmt: skip
+    options = {"altitude": "altitude", "Mach": "mach", "dT_isa": "disa", "PW": "power"}
+    axes: dict[str, Any] = {n: _axis(f"--{o}", getattr(args, o)) for n, o in options.items()}
     points = math.prod(len(v) for v in axes.values())
     if points > LARGEST:
         raise ScenarioError(
             f"{points} points asked for, {LARGEST} at most; take coarser axes, or several decks"
         )
     files.folder(Path(args.out).parent)
-    keep = None if args.outputs is None else [n.strip() for n in args.outputs.split(",")]
+    keep = None if args.outputs is None else given.names(args.outputs)
     progress.tell(f"solving {points} points", quiet=args.json)
+    gg = given.engine(args)
     t = time.perf_counter()
-    deck = performance_deck(
-        GasGenerator(), **axes, outputs=keep, n_threads=args.threads
-    )  # fmt: skip
+    deck = performance_deck(gg, **axes, outputs=keep, n_threads=args.threads)
     t = time.perf_counter() - t
-    deck.attrs["apu_casadi_version"] = program().split()[1]
+    deck.attrs["apu_casadi_version"] = installed()
     results.save(deck, args.out)
     status = deck["status"].values
     counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}
@@ -77,12 +70,12 @@ def run(args: argparse.Namespace) -> int:
     for name, n in counts.items():
         print(f"  {name:<24}{n:8d}")
     a = deck.attrs
-    health = all(a[n] == 1.0 for n in GasGenerator.THETA.names)
+    health = all(a[n] == 1.0 for n in gg.THETA.names)
     print(
         f"speed {a['N'] * 30 / math.pi:.1f} r/min, {'healthy' if health else 'faulty'} engine, "
         f"war = {a['war']:g}, ISA deviation "
         + ", ".join(f"{v:g}" for v in axes["dT_isa"])
-        + f" K; {program()}"
+        + f" K; {given.program()}"
     )
     print(f"written: {args.out}")
     return 0

@@ -11,12 +11,10 @@ from scenarios.shell import jsontext, progress
 
 NAME = "errata"
 HELP = "what the paper leaves open, what was chosen, and what it changes"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--write", metavar="FILE", help="write the page, docs/ERRATA.md")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+OPTIONS = """
+--write FILE | write the page, docs/ERRATA.md
+--json       | print JSON
+"""
 
 
 def run(args: argparse.Namespace) -> int:

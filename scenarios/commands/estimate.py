@@ -9,67 +9,63 @@ apu estimate sensors               what is measured, how well, and where that is
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from scenarios.commands import given
 from scenarios.shell import jsontext, usage
+from scenarios.shell.progress import bar, moving
+from scenarios.studies.estimation import names
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: joint run, studies, their page"
 KEPT = "docs/estimation"
-NAMES = (
-    "correctness", "electrical", "detection", "gaspath", "shaft-power", "isolation", "fitting",
-    "joint", "speed",
-)  # fmt: skip
-"""The studies; here as well, so that the help needs nothing heavy.  A test compares."""
+
+
+_OUT = f"--out DIR ={KEPT} | where results are kept (default %(default)s)"
+_JOINT = f"""
+--scenario NAME|FILE =joint | what is true: of the library, .toml or .py (default %(default)s)
+{given.UNIT}
+--seed int N =1             | of all errors (default 1)
+--out DIR                   | folder (default results/estimate_NAME)
+--figures =on               | draw truth, estimate and band (default)
+--json                      | print the summary as JSON only
+--quiet                     | no progress bar, no list of files
+"""
+_STUDY = f"""
+study NAME    | all, or one of {", ".join(names())}
+--seeds int N | fresh seeds (default: the study's own)
+{_OUT}
+--again       | also run what is kept
+--json        | print the claims as JSON
+--quiet       | no progress bar
+"""
+_PAGE = f"""
+{_OUT.replace("--out", "--from >source")}
+--write FILE =ESTIMATION.md | the page, figures in docs/images beside it (default %(default)s)
+--readme FILE | also put the short table between its marks
+"""
+_SENSORS = f"""
+{given.PARTS}
+--json | print JSON
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the four actions."""
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-
-    def action(name: str, call: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+    for name, call, table in (
+        ("joint", _joint, _JOINT),
+        ("study", _study, _STUDY),
+        ("page", _page, _PAGE),
+        ("sensors", _sensors, _SENSORS),
+    ):
         p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
         p.set_defaults(action=call)
-        return p
-
-    p = action("joint", _joint)
-    p.add_argument(
-        "--scenario", default="joint", metavar="NAME|FILE",
-        help="what is true: of the library, .toml or .py (default %(default)s)",
-    )  # fmt: skip
-    p.add_argument("--seed", type=int, default=1, metavar="N", help="of all errors (default 1)")
-    p.add_argument("--out", metavar="DIR", help="folder (default results/estimate_NAME)")
-    p.add_argument("--figures", action=argparse.BooleanOptionalAction, default=True,
-                   help="draw truth, estimate and band (default)")  # fmt: skip
-    p.add_argument("--json", action="store_true", help="print the summary as JSON only")
-    p.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
-
-    p = action("study", _study)
-    p.add_argument("study", metavar="NAME", help=f"all, or one of {', '.join(NAMES)}")
-    p.add_argument("--seeds", type=int, metavar="N", help="fresh seeds (default: the study's own)")
-    p.add_argument("--out", metavar="DIR", default=KEPT, help="where results are kept "
-                   "(default %(default)s)")  # fmt: skip
-    p.add_argument("--again", action="store_true", help="also run what is kept")
-    p.add_argument("--json", action="store_true", help="print the claims as JSON")
-    p.add_argument("--quiet", action="store_true", help="no progress bar")
-
-    p = action("page", _page)
-    p.add_argument("--from", dest="source", metavar="DIR", default=KEPT,
-                   help="where results are kept (default %(default)s)")  # fmt: skip
-    p.add_argument(
-        "--write", metavar="FILE", default="ESTIMATION.md",
-        help="the page, figures in docs/images beside it (default %(default)s)",
-    )  # fmt: skip
-
-    p.add_argument("--readme", metavar="FILE", help="also put the short table between its marks")
-
-    p = action("sensors", _sensors)
-    p.add_argument("--json", action="store_true", help="print JSON")
+        usage.declare(p, table)
 
 
 def resume(args: argparse.Namespace) -> str:
@@ -92,15 +88,14 @@ def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi.core import results
     from apu_casadi.core.errors import ScenarioError
+    from apu_casadi.core.files import write_text
     from scenarios import registry
     from scenarios.shell import notices
-    from scenarios.shell.markdown import write_text
-    from scenarios.shell.progress import bar
     from scenarios.studies import jointrun
 
     if args.seed < 0:
         raise ScenarioError(f"--seed must be >= 0, got {args.seed}")
-    s = registry.get(args.scenario)
+    s = given.scenario(args, args.scenario)
     folder = registry.prepare(args.out or f"results/estimate_{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(f"{s.name}, truth", s.duration, show=show) as progress:
@@ -123,7 +118,7 @@ def _joint(args: argparse.Namespace) -> int:
     print(jointrun.table(report), "", *jointrun.words(report), sep="\n")
     print(f"\n{jointrun.made_words(report)}")
     if not args.quiet:
-        print("\nwritten:", *(f"  {p}" for p in made), sep="\n")
+        given.written(made)
     return 0
 
 
@@ -134,33 +129,31 @@ def _study(args: argparse.Namespace) -> int:
     """Run a study over fresh random seeds; parts that are kept are not run again."""
     from apu_casadi.core.errors import ParameterError, nearest
     from scenarios import registry
-    from scenarios.pages.reports import REPORTS
     from scenarios.studies import catalogue
     from scenarios.studies.kept import understood
 
     known = [*catalogue.STUDIES, "all"]
     if args.study not in known:
         raise ParameterError(f"unknown study {args.study!r} {nearest(args.study, known)}")
-    names = list(catalogue.STUDIES) if args.study == "all" else [args.study]
+    chosen = list(catalogue.STUDIES) if args.study == "all" else [args.study]
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
     usage.count("--seeds", args.seeds, least=2)
     folder = registry.prepare(args.out)
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
-    for name in names:
-        n = args.seeds or catalogue.get(name).seeds
-        todo = list(catalogue.get(name).parts) if args.again else catalogue.pending(
-            catalogue.get(name), folder, n
-        )  # fmt: skip
+    for name in chosen:
+        study = catalogue.get(name)
+        n = args.seeds or study.seeds
+        todo = list(study.parts) if args.again else catalogue.pending(study, folder, n)
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
             record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
         with understood(name):
-            found[name] = REPORTS[name].claims(catalogue.results(record))
+            found[name] = study.report.claims(catalogue.results(record))
         if not args.json:
-            remark = catalogue.other_code(catalogue.get(name), record)
+            remark = catalogue.other_code(study, record)
             if remark:
                 print(f"  {remark}", flush=True)
             for c in found[name]:
@@ -179,21 +172,15 @@ def _study(args: argparse.Namespace) -> int:
 @contextmanager
 def _study_bar(name: str, *, show: bool) -> Iterator[Callable[[str, float, float], None] | None]:
     """Yield a callback that moves a bar of expected seconds, or None."""
-    if not show:
-        yield None
-        return
-    from tqdm import tqdm
-
-    columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
     form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
-    with tqdm(total=1.0, desc=name, bar_format=form, ncols=columns, file=sys.stderr) as bar:
+    with moving(name, 1.0, show=show, bar_format=form) as bar:
 
         def progress(part: str, done: float, total: float) -> None:
             bar.set_description_str(f"{name}, {part}", refresh=False)
             bar.total = max(total, 1e-9)
             bar.update(max(done - bar.n, 0.0))
 
-        yield progress
+        yield progress if show else None
 
 
 # ------------------------------------------------------------------------------ page, sensors
@@ -203,8 +190,8 @@ def _page(args: argparse.Namespace) -> int:
     """Write the page and its figures from the kept studies."""
     from apu_casadi.core import files
     from apu_casadi.core.errors import DataError
+    from apu_casadi.core.files import write_text
     from scenarios.pages import estimation_page
-    from scenarios.shell.markdown import write_text
     from scenarios.studies import catalogue
 
     try:
@@ -230,6 +217,7 @@ def _page(args: argparse.Namespace) -> int:
 
 def _sensors(args: argparse.Namespace) -> int:
     """Print the 1-sigma tables with their sources."""
+    given.parts(args)
     from estimators.apu.sensors import ELECTRICAL, GAS_PATH
 
     sets = {"gas path, every 20 ms": GAS_PATH, "electrical, at 10 kHz": ELECTRICAL}

@@ -20,107 +20,57 @@ option that decides.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
-from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, day_words
-from scenarios.commands.given import ambient_arguments, ambient_given, program
-from scenarios.shell import jsontext
+from apu_casadi.core.version import installed
+from apu_casadi.gaspath.conditions import AMBIENT, CONDITIONS, DEFAULT_DAY, day_words
+from apu_casadi.gaspath.health import HEALTH
+from scenarios.commands import given
+from scenarios.shell import jsontext, progress
 
 if TYPE_CHECKING:
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.fitting import EngineData, EngineFit
     from estimators.apu.recordings.recorded import Reading, Table
     from estimators.apu.sensors import SensorSet
-    from estimators.batch.fit import Profile
+    from estimators.batch.fitresult import Profile
 
 NAME = "fit"
 HELP = "fit health factors to recorded data (CSV, Parquet, netCDF)"
+OPTIONS = f"""
+files FILE +           | recorded data (see above)
+--estimate A,B ={",".join(HEALTH)} | health factors, gain_SENSOR, bias_SENSOR (default: the
+                       | four health factors)
+{given.UNIT}
+--own A,B =            | gains or biases that each file has for itself
+--column NAME=COLUMN[:UNIT] ... | column of another name, or its unit
+--time COLUMN          | time column (default: time, t, Timestamp and the like)
+--encoding NAME        | of text files, such as utf-16
+--decimal {{point,comma}} | decimal point or comma
+--missing A,B =        | numbers that stand for a gap, as in the file: --missing=-999,9999
+--exclude-implausible  | leave out readings that cannot be, instead of refusing the file
+--range NAME=LOW:HIGH ... | another plausible range, in SI: T5=250:1300
+--time-format FORMAT   | of dates, such as %%d.%%m.%%Y %%H:%%M:%%S
+--time-zone ZONE       | of dates without one: UTC, Europe/Berlin
+--steady               | each row is a steady point
+--sigma NAME=VALUE ... | standard deviation of a sensor: 0.5%% of the reading, or a number with
+                       | unit: 3K
+--readings int N =1    | each value is a mean of N readings
+--prior NAME=MEAN:SIGMA ... | what is known of a parameter beforehand
+--consider NAME=SIGMA ... | uncertain but not estimated; widens the intervals: gain_T5=0.005
+--fix NAME=VALUE ...   | a known health factor
+{given.ambient_options("a column, what the run file says, else ")}
+--profile              | intervals from the profile likelihood too
+--figure FILE          | draw measured against fitted (.png)
+--json                 | print JSON
+--quiet                | no word on progress
+"""
 RIDGE = 0.95  # correlation from which a pair is said to be confounded
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare arguments and options."""
-    parser.add_argument("files", metavar="FILE", nargs="+", help="recorded data (see above)")
-    parser.add_argument(
-        "--estimate", metavar="A,B", default="f_eta_c,f_W_c,f_eta_t,f_W_t",
-        help="health factors, gain_SENSOR, bias_SENSOR (default: the four health factors)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--own", metavar="A,B", default="", help="gains or biases that each file has for itself"
-    )
-    parser.add_argument(
-        "--column", metavar="NAME=COLUMN[:UNIT]", action="append", default=[],
-        help="column of another name, or its unit",
-    )  # fmt: skip
-    parser.add_argument(
-        "--time", metavar="COLUMN", help="time column (default: time, t, Timestamp and the like)"
-    )
-    _add_reading(parser)
-    parser.add_argument("--steady", action="store_true", help="each row is a steady point")
-    parser.add_argument(
-        "--sigma", metavar="NAME=VALUE", action="append", default=[],
-        help="standard deviation of a sensor: 0.5%% of the reading, or a number with unit: 3K",
-    )  # fmt: skip
-    parser.add_argument(
-        "--readings", metavar="N", type=int, default=1, help="each value is a mean of N readings"
-    )
-    parser.add_argument(
-        "--prior", metavar="NAME=MEAN:SIGMA", action="append", default=[],
-        help="what is known of a parameter beforehand",
-    )  # fmt: skip
-    parser.add_argument(
-        "--consider", metavar="NAME=SIGMA", action="append", default=[],
-        help="uncertain but not estimated; widens the intervals: gain_T5=0.005",
-    )  # fmt: skip
-    parser.add_argument(
-        "--fix", metavar="NAME=VALUE", action="append", default=[], help="a known health factor"
-    )
-    ambient_arguments(parser, otherwise="a column, what the run file says, else ")
-    parser.add_argument(
-        "--profile", action="store_true", help="intervals from the profile likelihood too"
-    )
-    parser.add_argument("--figure", metavar="FILE", help="draw measured against fitted (.png)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--quiet", action="store_true", help="no word on progress")
-
-
-def _add_reading(parser: argparse.ArgumentParser) -> None:
-    """Declare how files are read that leave a question."""
-    parser.add_argument("--encoding", metavar="NAME", help="of text files, such as utf-16")
-    parser.add_argument("--decimal", choices=("point", "comma"), help="decimal point or comma")
-    parser.add_argument(
-        "--missing", metavar="A,B", default="",
-        help="numbers that stand for a gap, as in the file: --missing=-999,9999",
-    )  # fmt: skip
-    parser.add_argument(
-        "--exclude-implausible", action="store_true",
-        help="leave out readings that cannot be, instead of refusing the file",
-    )  # fmt: skip
-    parser.add_argument(
-        "--range", metavar="NAME=LOW:HIGH", action="append", default=[],
-        help="another plausible range, in SI: T5=250:1300",
-    )  # fmt: skip
-    parser.add_argument(
-        "--time-format", metavar="FORMAT", help="of dates, such as %%d.%%m.%%Y %%H:%%M:%%S"
-    )
-    parser.add_argument(
-        "--time-zone", metavar="ZONE", help="of dates without one: UTC, Europe/Berlin"
-    )
-
-
-def _reading(args: argparse.Namespace) -> Reading:
-    from estimators.apu.recordings.plausible import parse_limits
-    from estimators.apu.recordings.recorded import Reading
-
-    missing = [_number(n, "--missing", args.missing) for n in _names(args.missing)]
-    return Reading(
-        args.encoding, args.decimal, tuple(missing), args.exclude_implausible,
-        parse_limits(args.range), args.time_format, args.time_zone,
-    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -128,58 +78,39 @@ def run(args: argparse.Namespace) -> int:
     from estimators.apu import fitting
     from estimators.apu.recordings.recorded import parse_mapping, read_table
     from estimators.apu.recordings.runfiles import recorded_ambient
-    from estimators.batch.fit import profile
 
+    gg = given.engine(args)
     mapping = parse_mapping(args.column)
-    _known_targets(mapping)
+    _known_targets(mapping, gg)
     reading = _reading(args)
     notes: list[str] = []
     tables = [read_table(f, mapping, reading=reading, notes=notes) for f in args.files]
-    sensors = _sensors(args.sigma)
+    sensors = _sensors(args.sigma, gg)
     times = [None if args.steady else t.time(args.time) for t in tables]
     if len({t is None for t in times}) > 1:
         raise DataError("some files have a time column and some not; --steady takes rows as points")
     steady = times[0] is None
     said = [recorded_ambient(f) for f in args.files]
-    data = [
-        _data(table, t, sensors, args, day)
-        for table, t, day in zip(tables, times, said, strict=True)
-    ]
-    ignored = _ignored(tables, sensors, args.time)
-    estimate = _names(args.estimate)
+    each = zip(tables, times, said, strict=True)
+    data = [_data(table, t, sensors, gg, args, day) for table, t, day in each]
+    ignored = _ignored(tables, sensors, gg, args.time)
     if args.readings < 1:
         raise ParameterError(f"--readings must be >= 1, got {args.readings}")
     rows = sum(d.t.size for d in data)
-    talk = not args.quiet and not args.json and sys.stderr.isatty()
-    if talk and rows > 200:
-        print(f"fitting {rows} samples ...", file=sys.stderr, flush=True)
-    fit = fitting.fit_engine(
-        data,
-        estimate,
-        steady=steady,
-        sensors=sensors,
-        averaged=args.readings,
-        own=_names(args.own),
-        fixed=_numbers(args.fix, "--fix"),
-        prior=_pairs(args.prior),
-        consider=_numbers(args.consider, "--consider"),
-    )
-    profiles = []
-    if args.profile:
-        for name in fit.result.names:
-            if talk:
-                print(f"profile of {name} ...", file=sys.stderr, flush=True)
-            if name not in fit.result.at_bound:
-                profiles.append(profile(fit.result, name))
+    if rows > 200:
+        _tell(args, f"fitting {rows} samples")
+    how: dict[str, Any] = {"steady": steady, "sensors": sensors, "averaged": args.readings}
+    how |= {"own": given.names(args.own), "fixed": given.numbers(args.fix, "--fix")}
+    how |= {"prior": _priors(args.prior), "consider": given.numbers(args.consider, "--consider")}
+    fit = fitting.fit_engine(data, given.names(args.estimate), gg=gg, **how)
+    profiles = _profiles(fit, args) if args.profile else []
     figures = _draw(fit, args.figure, steady, [d.ambient for d in data]) if args.figure else []
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["read_as"] = [*notes, *_unheeded(tables, times, args)]
-    found["recorded_ambient"] = {
-        t.source: taken for t, day in zip(tables, said, strict=True)
-        if (taken := _recorded(t, day, args))
-    }  # fmt: skip
-    found["apu_casadi_version"] = program().split()[1]
+    days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
+    found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
+    found["apu_casadi_version"] = installed()
     if args.json:
         jsontext.show(found)
         return 0
@@ -189,107 +120,108 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _tell(args: argparse.Namespace, what: str) -> None:
+    progress.tell(what, quiet=args.quiet or args.json)
+
+
+def _profiles(fit: EngineFit, args: argparse.Namespace) -> list[Profile]:
+    from estimators.batch.fit import profile
+
+    profiles = []
+    for name in fit.result.names:
+        _tell(args, f"profile of {name}")
+        if name not in fit.result.at_bound:
+            profiles.append(profile(fit.result, name))
+    return profiles
+
+
 # ------------------------------------------------------------------------------ options
 
 
-def _names(text: str) -> list[str]:
-    return [n.strip() for n in text.split(",") if n.strip()]
+def _reading(args: argparse.Namespace) -> Reading:
+    """Return how files are read that leave a question."""
+    from estimators.apu.recordings.plausible import parse_limits
+    from estimators.apu.recordings.recorded import Reading
+
+    missing = [given.number(n, "--missing", args.missing) for n in given.names(args.missing)]
+    limits = parse_limits(args.range)
+    how = args.exclude_implausible, limits, args.time_format, args.time_zone
+    return Reading(args.encoding, args.decimal, tuple(missing), *how)
 
 
-def _number(text: str, option: str, item: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ParameterError(f"{option} {item!r}: {text!r} is no number")
-    return value
-
-
-def _split(item: str, option: str, form: str) -> tuple[str, str]:
-    name, sep, value = item.partition("=")
-    if not (sep and name.strip() and value.strip()):
-        raise ParameterError(f"{option} {item!r}: {form} is expected")
-    return name.strip(), value.strip()
-
-
-def _numbers(items: Sequence[str], option: str) -> dict[str, float]:
-    out = {}
-    for item in items:
-        name, value = _split(item, option, "NAME=VALUE")
-        out[name] = _number(value, option, item)
-    return out
-
-
-def _pairs(items: Sequence[str]) -> dict[str, tuple[float, float]]:
-    out = {}
-    for item in items:
-        name, value = _split(item, "--prior", "NAME=MEAN:SIGMA")
-        mean, sep, sigma = value.partition(":")
+def _priors(items: Sequence[str]) -> dict[str, tuple[float, float]]:
+    out, form = {}, "NAME=MEAN:SIGMA"
+    for p in given.pairs(items, "--prior", form):
+        mean, sep, sigma = p.value.partition(":")
         if not sep:
-            raise ParameterError(f"--prior {item!r}: NAME=MEAN:SIGMA is expected")
-        out[name] = _number(mean, "--prior", item), _number(sigma, "--prior", item)
+            raise ParameterError(f"--prior {p.item!r}: {form} is expected")
+        mean_sigma = (given.number(part, "--prior", p.item) for part in (mean, sigma))
+        out[p.name] = (next(mean_sigma), next(mean_sigma))
     return out
 
 
-def _sensors(items: Sequence[str]) -> SensorSet:
+def _sensors(items: Sequence[str], gg: GasGenerator) -> SensorSet:
     """The table of sensors, changed and extended by ``--sigma``."""
-    import dataclasses
+    from estimators.apu.sensors import KNOWN, Sensor, SensorSet, gas_path_table
 
-    import numpy as np
-
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.recordings.recorded import UNITS, convert
-    from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
-
-    known = {s.name: s for s in GAS_PATH.sensors}
-    for item in items:
-        name, value = _split(item, "--sigma", "NAME=VALUE")
-        if name not in GasGenerator.Y:
+    known = {s.name: s for s in gas_path_table().sensors}
+    for p in given.pairs(items, "--sigma"):
+        if p.name not in gg.Y and p.name not in KNOWN:
             raise ParameterError(
-                f"--sigma {item!r}: unknown output {nearest(name, GasGenerator.Y.names)}"
+                f"--sigma {p.item!r}: unknown output {nearest(p.name, gg.Y.names)}"
             )
-        unit = GasGenerator.Y[name].unit
-        # the longest ending that is a unit: 3K, 1.5 kPa, 0.5%, 3 K
-        ending = next(
-            (u for u in sorted(UNITS, key=len, reverse=True)
-             if value.endswith(u) and not u[0].isdigit() and u != "-"), "",
-        )  # fmt: skip
-        number = _number(value.removesuffix(ending).strip(), "--sigma", item)
-        relative = ending == "%" and unit != "1"
-        if ending and not relative:
-            number = float(
-                convert(np.array(number), ending, unit, f"--sigma {item}", difference=True)
-            )
-        elif relative:
-            number /= 100
-        elif unit != "1":
-            raise ParameterError(
-                f"--sigma {item!r}: a unit is needed, % of the reading or one of {unit}"
-            )
-        if not number > 0:
-            raise ParameterError(f"--sigma {item!r}: a standard deviation must be > 0")
-        if name in known:
-            known[name] = dataclasses.replace(
-                known[name], noise=number, relative=relative, source="changed by the user"
-            )
-        else:
-            known[name] = Sensor(name, number, relative, 0.0, unit, "given by the user")
+        unit = KNOWN[p.name].unit if p.name in KNOWN else gg.Y[p.name].unit
+        noise, relative = _deviation(p, unit)
+        new = Sensor(p.name, noise, relative, 0.0, unit, "given by the user")
+        if p.name in known:
+            new = dataclasses.replace(known[p.name], source="changed by the user")
+        elif p.name in KNOWN:
+            new = dataclasses.replace(KNOWN[p.name], gain=0.0, source=new.source)
+        known[p.name] = dataclasses.replace(new, noise=noise, relative=relative)
     return SensorSet(tuple(known.values()))
 
 
-def _known_targets(mapping: Mapping[str, Any]) -> None:
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import AMBIENT
+def _deviation(p: given.Pair, unit: str) -> tuple[float, bool]:
+    """Return a standard deviation in SI, and whether it is relative to the reading."""
+    import numpy as np
 
-    valid = [*GasGenerator.Y.names, *AMBIENT, "time"]
+    from estimators.apu.recordings.units import UNITS, convert
+
+    # the longest ending that is a unit: 3K, 1.5 kPa, 0.5%, 3 K
+    endings = [u for u in UNITS if p.value.endswith(u) and not u[0].isdigit() and u != "-"]
+    ending = max(endings, key=len, default="")
+    number = given.number(p.value.removesuffix(ending).strip(), "--sigma", p.item)
+    relative = ending == "%" and unit != "1"
+    if relative:
+        number /= 100
+    elif ending:
+        value = convert(np.array(number), ending, unit, f"--sigma {p.item}", difference=True)
+        number = float(value)
+    elif unit != "1":
+        raise ParameterError(
+            f"--sigma {p.item!r}: a unit is needed, % of the reading or one of {unit}"
+        )
+    if not number > 0:
+        raise ParameterError(f"--sigma {p.item!r}: a standard deviation must be > 0")
+    return number, relative
+
+
+def _known_targets(mapping: Mapping[str, Any], gg: GasGenerator) -> None:
+    from estimators.apu.sensors import KNOWN
+
+    valid = list(dict.fromkeys([*gg.Y.names, *KNOWN, *AMBIENT, "time"]))
     for name in mapping:
         if name not in valid:
             raise DataError(f"--column {name}=...: unknown quantity {nearest(name, valid)}")
 
 
 def _data(
-    table: Table, t: Any, sensors: SensorSet, args: argparse.Namespace, said: Mapping[str, float]
+    table: Table,
+    t: Any,
+    sensors: SensorSet,
+    gg: GasGenerator,
+    args: argparse.Namespace,
+    said: Mapping[str, float],
 ) -> EngineData:
     """Take from a table what the sensors measure, and the ambient conditions.
 
@@ -297,11 +229,9 @@ def _data(
     """
     import numpy as np
 
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import AMBIENT, INPUTS, EngineData
+    from estimators.apu.fitting import INPUTS, EngineData
 
-    Y, U = GasGenerator.Y, GasGenerator.U
-    readings = {s: table.get(s, Y[s].unit) for s in sensors.names if s in table}
+    readings = {s.name: table.get(s.name, s.unit) for s in sensors.sensors if s.name in table}
     measured = [n for n in readings if n not in INPUTS]
     if not measured:
         raise DataError(
@@ -309,12 +239,11 @@ def _data(
             f"({', '.join(n for n in sensors.names if n not in INPUTS)}); name them with --column"
         )
     ambient: dict[str, Any] = {}
-    given = ambient_given(args)
-    for name in AMBIENT:
-        if (option := given[name]) is not None:
+    for name, option in given.ambient_given(args).items():
+        if option is not None:
             ambient[name] = option
         elif name in table:
-            ambient[name] = table.get(name, U[name].unit, difference=name == "dT_isa")
+            ambient[name] = table.get(name, gg.U[name].unit, difference=name == "dT_isa")
         elif name in said:
             ambient[name] = said[name]
         if name in ambient:
@@ -353,8 +282,8 @@ def _recorded(
     table: Table, said: Mapping[str, float], args: argparse.Namespace
 ) -> dict[str, float]:
     """Ambient conditions that were taken from what a run file says of itself."""
-    given = ambient_given(args)
-    return {n: v for n, v in said.items() if given[n] is None and n not in table}
+    left = given.ambient_assumed(args)
+    return {n: v for n, v in said.items() if n in left and n not in table}
 
 
 def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Namespace) -> list[str]:
@@ -371,10 +300,10 @@ def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Name
     ]
 
 
-def _ignored(tables: Sequence[Table], sensors: SensorSet, time: str | None) -> list[str]:
+def _ignored(
+    tables: Sequence[Table], sensors: SensorSet, gg: GasGenerator, time: str | None
+) -> list[str]:
     """Columns that the fit does not use, with a guess of what they may be."""
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import AMBIENT
     from estimators.apu.recordings.timestamps import is_time_name
 
     used = {*sensors.names, *AMBIENT, time}
@@ -383,7 +312,7 @@ def _ignored(tables: Sequence[Table], sensors: SensorSet, time: str | None) -> l
         for name in table.columns:
             if name in used or name in table.mapped or is_time_name(name):
                 continue
-            hint = "no sigma known: give --sigma" if name in GasGenerator.Y else ""
+            hint = "no sigma known: give --sigma" if name in gg.Y else ""
             if not hint:
                 guess = nearest(name, [*sensors.names, *AMBIENT])
                 hint = guess[1:-1] if guess.startswith("(did") else ""
@@ -502,8 +431,8 @@ def text(found: Mapping[str, Any]) -> str:
         lines.append(line)
     lines += ["", "correlations"]
     for i, r in enumerate(rows):
-        cells = (f"{c:+6.2f}" if c is not None else "     -"
-                 for c in found["correlation"][i][: i + 1])  # fmt: skip
+        row = found["correlation"][i][: i + 1]
+        cells = (f"{c:+6.2f}" if c is not None else "     -" for c in row)
         lines.append(f"{r['name']:<{width}}  {' '.join(cells)}")
     lines.append("")
     for ridge in found["ridges"]:
@@ -567,15 +496,14 @@ def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, A
         raise ParameterError(f"--figure {path!r}: .png, .pdf or .svg is expected")
     units = {s.name: s.unit for s in GasGenerator.Y}
     r, made = fit.result, []
-    note = "; ".join(f"{n} = {v:.4f} ± {1.96 * s:.4f}" for n, v, s in
-                     zip(r.names, r.estimate, r.sigma, strict=True))  # fmt: skip
+    each = zip(r.names, r.estimate, r.sigma, strict=True)
+    note = "; ".join(f"{n} = {v:.4f} ± {1.96 * s:.4f}" for n, v, s in each)
+    how: dict[str, Any] = {"steady": steady}
     for k, name in enumerate(fit.names):
         target = first if len(fit.names) == 1 else first.with_stem(f"{first.stem}_{k + 1}")
-        t = fit.recordings[k].t
-        fig = plot_fit(
-            t + 1 if steady else t, fit.series(k), units, steady=steady,
-            heading=f"{name}: measured and fitted",
-            note=f"95 %: {note}. Ambient: {_day(days[k])}; {program()}.",
-        )  # fmt: skip
+        t = fit.recordings[k].t + (1 if steady else 0)
+        how["heading"] = f"{name}: measured and fitted"
+        how["note"] = f"95 %: {note}. Ambient: {_day(days[k])}; {given.program()}."
+        fig = plot_fit(t, fit.series(k), units, **how)
         made.append(files.save_figure(fig, target))
     return made

@@ -1,44 +1,73 @@
-"""The options of ambient conditions, alike in every command, and the line that tells them.
+"""What several commands are given in the same words: the day, the unit, names, numbers, pairs.
 
-Their defaults are those of :mod:`apu_casadi.gaspath.conditions`; what a command assumed, it prints.
+What a command assumed, it prints; the defaults of the day are those of
+:mod:`apu_casadi.gaspath.conditions`.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
-from typing import Any
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
 
-OPTIONS = {"altitude": "altitude", "Mach": "mach", "dT_isa": "disa", "war": "humidity"}
-"""The option of each condition, without its dashes."""
-_METAVAR = {"altitude": "M", "Mach": "MA", "dT_isa": "K", "war": "RATIO"}
+if TYPE_CHECKING:
+    from argparse import Namespace
+
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.machine.loads.load import Load
+    from apu_casadi.unit.apu import Apu
+    from scenarios.schema import Scenario
+
+_FLAGS = {"altitude": "--altitude M", "Mach": "--mach MA", "dT_isa": "--disa K"}
+_FLAGS |= {"war": "--humidity --war RATIO"}
+
+PARTS = """
+--with FILE ... >extensions | a Python file of your own that registers loads, faults, sensors, ...
+"""
+UNIT = f"""{PARTS.rstrip()}
+--engine FILE | another engine: its design data and maps (default: the paper's)
+"""
 
 
-def ambient_arguments(parser: argparse.ArgumentParser, *, otherwise: str = "") -> None:
-    """Declare ``--altitude``, ``--mach``, ``--disa`` and ``--humidity`` (also ``--war``), numbers.
+class Pair(NamedTuple):
+    """What stands on both sides of ``NAME=VALUE``, and the whole as it was given."""
+
+    name: str
+    value: str
+    item: str
+
+
+def ambient_options(otherwise: str = "") -> str:
+    """Return the options of ambient conditions, numbers, for :func:`scenarios.shell.usage.declare`.
 
     Args:
         otherwise: what stands in for an option before the default day does, for the help.
     """
+    lines = []
     for name, c in CONDITIONS.items():
-        flags = [f"--{OPTIONS[name]}"] + (["--war"] if name == "war" else [])
         unit = "" if c.unit == "1" else f", {c.unit}"
-        parser.add_argument(
-            *flags, metavar=_METAVAR[name], type=float, dest=name,
-            help=f"{c.doc}{unit} (default: {otherwise}{c.default:g})",
-        )  # fmt: skip
+        help_ = f"{c.doc}{unit} (default: {otherwise}{c.default:g})"
+        lines.append(f"{_FLAGS[name]} float >{name} | {help_}\n")
+    return "".join(lines)
 
 
-def ambient_given(args: argparse.Namespace) -> dict[str, float | None]:
+def ambient_given(args: Namespace) -> dict[str, float | None]:
     """Return the conditions as given, None where an option was left out."""
     return {name: getattr(args, name) for name in CONDITIONS}
 
 
-def ambient_of(args: argparse.Namespace) -> dict[str, float]:
+def ambient_of(args: Namespace) -> dict[str, float]:
     """Return all conditions: as given, else of the default day."""
     return {n: DEFAULT_DAY[n] if v is None else float(v) for n, v in ambient_given(args).items()}
+
+
+def ambient_assumed(args: Namespace) -> list[str]:
+    """Return the names of the conditions that nobody gave."""
+    return [n for n, v in ambient_given(args).items() if v is None]
 
 
 def ambient_line(given: Mapping[str, Any]) -> str:
@@ -48,8 +77,102 @@ def ambient_line(given: Mapping[str, Any]) -> str:
     return f"ambient: {day_words(known)}" + (f" (assumed: {left})" if left else "")
 
 
+def parts(args: Namespace) -> None:
+    """Load the files of ``--with``, whose parts can be named from then on."""
+    from scenarios import extensions
+
+    extensions.load(args.extensions)
+
+
+def engine(args: Namespace) -> GasGenerator:
+    """Return the gas generator that a command is about: of ``--engine``, else the paper's."""
+    from scenarios import registry
+
+    parts(args)
+    return registry.engine_of(args.engine)
+
+
+def unit(args: Namespace) -> Apu:
+    """Return the whole unit with the engine of ``--engine``, else the paper's."""
+    from scenarios import registry
+
+    parts(args)
+    return registry.unit_of(engine=args.engine)
+
+
+def load(args: Namespace) -> Load:
+    """Return the load of each generator that ``--load`` describes by the keys of a scenario."""
+    from scenarios.reading import read_load
+
+    parts(args)
+    return read_load(args.load, "--load")
+
+
+def load_words(load: Load) -> str:
+    """Return a load in words."""
+    from apu_casadi.unit.runrecord import load_words as words
+
+    return words(load)
+
+
+def scenario(args: Namespace, name: str) -> Scenario:
+    """Return a scenario with the parts of ``--with`` and the engine of ``--engine``."""
+    from scenarios import registry
+
+    parts(args)
+    s = registry.get(name)
+    if args.extensions:
+        s = s.change(extensions=(*s.extensions, *args.extensions))
+    return s if args.engine is None else s.change(engine=args.engine)
+
+
 def program() -> str:
     """Return name and version of the program, for results."""
-    from apu_casadi import __version__
+    return f"apu-casadi {installed()}"
 
-    return f"apu-casadi {__version__}"
+
+def names(text: str) -> list[str]:
+    """Return the names of ``A,B``."""
+    return [n.strip() for n in text.split(",") if n.strip()]
+
+
+def written(paths: Iterable[object]) -> None:
+    """Print the files that were made."""
+    print("\nwritten:", *(f"  {path}" for path in paths), sep="\n")
+
+
+def number(text: str, option: str, item: str) -> float:
+    """Return a finite number of an option's text.
+
+    Raises:
+        ParameterError: it is none; names option and item.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ParameterError(f"{option} {item!r}: {text!r} is no number")
+    return value
+
+
+def pairs(items: Iterable[str], option: str, form: str = "NAME=VALUE") -> Iterator[Pair]:
+    """Yield name, value and text of each ``NAME=VALUE``, also of several with commas between.
+
+    Raises:
+        ParameterError: another form than ``form``, or a name given twice.
+    """
+    seen = set()
+    for item in (part for text in items for part in text.split(",")):
+        name, sep, value = (part.strip() for part in item.partition("="))
+        if not (sep and name and value):
+            raise ParameterError(f"{option} {item!r}: {form} is expected")
+        if name in seen:
+            raise ParameterError(f"{option}: {name} given twice")
+        seen.add(name)
+        yield Pair(name, value, item)
+
+
+def numbers(items: Iterable[str], option: str) -> dict[str, float]:
+    """Return the numbers of ``NAME=VALUE`` by name; errors as :func:`pairs` and :func:`number`."""
+    return {p.name: number(p.value, option, p.item) for p in pairs(items, option)}

@@ -11,104 +11,106 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import day_words
-from scenarios.commands.given import (
-    ambient_arguments,
-    ambient_given,
-    ambient_line,
-    ambient_of,
-    program,
-)
+from scenarios.commands import given
 from scenarios.shell import jsontext
 
 if TYPE_CHECKING:
+    from apu_casadi.machine.loads.load import Load
+    from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.events import Ambient
     from apu_casadi.unit.linearisation import LinearModel
 
 NAME = "linearise"
 HELP = "print and draw the eigenvalues at a steady point"
-MODELS = ("gas", "generator", "joint")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--model", choices=MODELS, default="joint", help="default %(default)s")
-    parser.add_argument("--power", metavar="KW", type=float, default=225.0,
-                        help="load of each generator at 230 V (default %(default)s)")  # fmt: skip
-    parser.add_argument("--power-factor", metavar="PF", type=float, default=1.0, help="default 1")
-    parser.add_argument("--constant-power", action="store_true", help="a load that holds its power")
-    ambient_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON, with all matrices")
-    parser.add_argument(
-        "--out", metavar="DIR", default="results/linearise", help="default %(default)s"
-    )
-    parser.add_argument("--no-figures", action="store_true", help="draw no figure")
+OPTIONS = f"""
+--model {{gas,generator,joint}} =joint | default %(default)s
+--power float KW =225.0 | load of each generator at 230 V (default %(default)s)
+--power-factor float PF =1.0 | default 1
+--constant-power     | a load that holds its power
+--load TABLE part    | another load, by the keys of a scenario:
+                     | 'kind = "series", R_ohm = 1, L_mH = 1'
+{given.ambient_options()}
+{given.UNIT}
+--json               | print JSON, with all matrices
+--out DIR =results/linearise | default %(default)s
+--no-figures         | draw no figure
+"""
 
 
 def run(args: argparse.Namespace) -> int:
     """Trim, linearise, print and draw."""
-    model = linear_model(args)
+    from apu_casadi.unit.events import Ambient
+
+    unit, load = given.unit(args), _load(args)
+    model = linear_model(args.model, unit, load, Ambient(**given.ambient_of(args)))
     path = None
     if not args.no_figures:
         from apu_casadi.core import files
         from scenarios import registry
         from scenarios.figures.eigenplot import plot_eigenvalues
 
-        label = f"{_load(args)} each, {day_words(ambient_of(args))}"
+        label = f"{_words(args, load)} each, {day_words(given.ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
-        note = f"Load {label}; healthy; {program()}."
+        note = f"Load {label}; healthy; {given.program()}."
         files.save_figure(plot_eigenvalues({label: model}, note), path)
     if args.json:
-        given = {
-            "ambient": ambient_of(args),
-            "assumed": [n for n, v in ambient_given(args).items() if v is None],
-            "load": {
-                "power": 1e3 * args.power, "power_factor": args.power_factor,
-                "constant_power": args.constant_power,
-            },
-            "apu_casadi_version": program().split()[1],
-        }  # fmt: skip
-        jsontext.show(report(model) | given)
+        told = {
+            "ambient": given.ambient_of(args),
+            "assumed": given.ambient_assumed(args),
+            "load": args.load or _asked(args),
+            "apu_casadi_version": installed(),
+        }
+        jsontext.show(report(model) | told)
         return 0
     print(table(model))
     if args.model != "generator":
-        print(f"\n{ambient_line(ambient_given(args))}")
-    print(f"load of each generator: {_load(args)}; healthy; {program()}")
+        print(f"\n{given.ambient_line(given.ambient_given(args))}")
+    print(f"load of each generator: {_words(args, load)}; healthy; {given.program()}")
     if path is not None:
         print(f"\n{path}")
     return 0
 
 
-def _load(args: argparse.Namespace) -> str:
+def _asked(args: argparse.Namespace) -> dict[str, Any]:
+    keys = {"power_factor": args.power_factor, "constant_power": args.constant_power}
+    return {"power": 1e3 * args.power, **keys}
+
+
+def _load(args: argparse.Namespace) -> Load:
+    from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+    from apu_casadi.machine.loads.series import SeriesLoad
+
+    if args.load is not None:
+        return given.load(args)
+    if args.constant_power:
+        return ConstantPowerLoad(1e3 * args.power)
+    return SeriesLoad.from_power(1e3 * args.power, args.power_factor)
+
+
+def _words(args: argparse.Namespace, load: Load) -> str:
+    if args.load is not None:
+        return given.load_words(load)
     kind = "constant power" if args.constant_power else f"power factor {args.power_factor:g}"
     return f"{args.power:g} kW at 230 V, {kind}"
 
 
-def linear_model(args: argparse.Namespace) -> LinearModel:
-    """Return the linear model that the options describe."""
-    from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
-    from apu_casadi.machine.loads.load import Load
-    from apu_casadi.machine.loads.series import SeriesLoad
-    from apu_casadi.unit.apu import Apu
-    from apu_casadi.unit.events import Ambient
-    from apu_casadi.unit.linearisation import (
-        linearise_gas_generator,
-        linearise_generator,
-        linearise_joint,
-    )
+def linear_model(model: str, apu: Apu, load: Load, ambient: Ambient) -> LinearModel:
+    """Return the linear model ``gas``, ``generator`` or ``joint`` at a steady point.
 
-    apu = Apu()
-    load: Load
-    if args.constant_power:
-        load = ConstantPowerLoad(1e3 * args.power)
-    else:
-        load = SeriesLoad.from_power(1e3 * args.power, args.power_factor)
-    if args.model == "generator":
-        w_r = apu.w_r(apu.N_ref)
-        return linearise_generator(apu.generator, apu.generator.steady_state(load, w_r=w_r))
-    point = apu.steady_state(load, ambient=Ambient(**ambient_of(args)))
-    if args.model == "gas":
-        return linearise_gas_generator(apu.gas_generator, point.gas)
-    return linearise_joint(apu, point)
+    Raises:
+        OperatingPointError: there is no such point.
+    """
+    from apu_casadi.unit import linearisation
+
+    if model == "generator":
+        at = apu.generator.steady_state(load, w_r=apu.w_r(apu.N_ref))
+        return linearisation.linearise_generator(apu.generator, at)
+    point = apu.steady_state(load, ambient=ambient)
+    if model == "gas":
+        return linearisation.linearise_gas_generator(apu.gas_generator, point.gas)
+    return linearisation.linearise_joint(apu, point)
 
 
 def report(model: LinearModel) -> dict[str, Any]:

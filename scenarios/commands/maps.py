@@ -7,24 +7,22 @@ from __future__ import annotations
 
 import argparse
 
+from scenarios.commands import given
+
 NAME = "maps"
 HELP = "draw the component maps with operating lines and a run"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--trajectory", metavar="FILE.nc", help="a run, as 'apu run' writes it")
-    parser.add_argument(
-        "--out", metavar="DIR", default="results/maps", help="folder (default %(default)s)"
-    )
-    parser.add_argument("--no-lines", action="store_true", help="draw no operating lines")
+OPTIONS = f"""
+--trajectory FILE.nc    | a run, as 'apu run' writes it
+{given.UNIT}
+--out DIR =results/maps | folder (default %(default)s)
+--no-lines              | draw no operating lines
+"""
 
 
 def run(args: argparse.Namespace) -> int:
     """Draw both maps and print the paths."""
     from apu_casadi.core import files, results
     from apu_casadi.core.errors import DataError
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from scenarios import registry
     from scenarios.figures.mapplots import default_lines, plot_compressor_map, plot_turbine_map
     from scenarios.shell import progress
@@ -32,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     ds = None if args.trajectory is None else results.load(args.trajectory)
     folder = registry.prepare(args.out)
     progress.tell("drawing both maps")
-    gg = GasGenerator()
+    gg = given.engine(args)
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
         path = folder / f"{name}.png"

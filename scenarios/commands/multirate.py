@@ -11,25 +11,18 @@ import sys
 from pathlib import Path
 
 from apu_casadi.core.errors import ScenarioError
+from scenarios.commands import given
 from scenarios.shell import jsontext
 
 NAME = "multirate"
 HELP = "measure the error of the multi-rate exchange (takes minutes)"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--out", metavar="DIR", help="folder for figure and numbers (default results/multirate)"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON only")
-    parser.add_argument(
-        "--steps", metavar="MS,MS", help="exchange steps in ms, divisors of 80 (default: six)"
-    )
-    parser.add_argument(
-        "--page", metavar="FILE", help="also write the page, with its figure in images/ beside it"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+OPTIONS = """
+--out DIR     | folder for figure and numbers (default results/multirate)
+--json        | print JSON only
+--steps MS,MS | exchange steps in ms, divisors of 80 (default: six)
+--page FILE   | also write the page, with its figure in images/ beside it
+--quiet       | no progress bar
+"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         print(text)
         return 0
     print(study.table(rows))
-    print("\nwritten:", *(f"  {path}" for path in made), sep="\n")
+    given.written(made)
     return 0
 
 

@@ -11,37 +11,27 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from scenarios.commands import given
 from scenarios.shell import jsontext
 from scenarios.shell.progress import bar
 
 NAME = "run"
 HELP = "run a scenario of the library or of a file"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare arguments and options."""
-    parser.add_argument("scenario", metavar="SCENARIO", help="a name, a .toml or a .py file")
-    parser.add_argument("--out", metavar="DIR", help="folder for the files (default results/NAME)")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON only")
-    parser.add_argument("--no-figures", action="store_true", help="draw no figures")
-    parser.add_argument(
-        "--no-waveforms", action="store_true", help="keep no waveforms: a small file, rms figures"
-    )
-    parser.add_argument(
-        "--phasors",
-        action="store_true",
-        help="keep the fundamental phasors of voltages and currents of every exchange step",
-    )
-    parser.add_argument(
-        "--solver", default="cvodes", metavar="NAME",
-        help="cvodes (default), idas, or propagator: exact and fast where the load is linear",
-    )  # fmt: skip
-    parser.add_argument(
-        "--exchange", metavar="NAME",
-        help="of speed and fuel between the parts: paper, predicted (errs less at the same price), "
-        "or corrected; default: the scenario's",
-    )  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="no progress bar, no list of files")
+OPTIONS = f"""
+scenario SCENARIO      | a name, a .toml or a .py file
+{given.UNIT}
+--out DIR              | folder for the files (default results/NAME)
+--json                 | print the summary as JSON only
+--no-figures           | draw no figures
+--no-waveforms         | keep no waveforms: a small file, rms figures
+--phasors              | keep the fundamental phasors of voltages and currents of every exchange
+                       | step
+--solver NAME =auto    | auto (default): exact and fast where the load is linear, elsewhere CVODES;
+                       | cvodes, idas, or propagator, another name of auto
+--exchange NAME        | of speed and fuel between the parts: paper, predicted (errs less at the
+                       | same price), or corrected; default: the scenario's
+--quiet                | no progress bar, no list of files
+"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from scenarios import registry
     from scenarios.shell import notices
 
-    s = registry.get(args.scenario)
+    s = given.scenario(args, args.scenario)
     if args.no_waveforms:
         s = s.change(waveform_dt=None)
     if args.exchange is not None:
@@ -68,9 +58,7 @@ def run(args: argparse.Namespace) -> int:
     print(table(report["phases"]))
     print("", *made_with(report), sep="\n")
     if not args.quiet:
-        print("\nwritten:")
-        for path in made:
-            print(f"  {path}")
+        given.written(made)
     return 0
 
 

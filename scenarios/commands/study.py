@@ -11,16 +11,13 @@ from scenarios.shell import jsontext, progress
 
 NAME = "study"
 HELP = "run a numerical study (trim)"
-STUDIES = ("trim",)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("study", choices=STUDIES, help="which study")
-    parser.add_argument("--points", type=int, default=10_000, help="random points (default 10000)")
-    parser.add_argument("--seed", type=int, default=1, help="of the random points (default 1)")
-    parser.add_argument("--threads", type=int, help="default: all cores")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+OPTIONS = """
+study {trim}        | which study
+--points int =10000 | random points (default 10000)
+--seed int =1       | of the random points (default 1)
+--threads int       | default: all cores
+--json              | print JSON
+"""
 
 
 def run(args: argparse.Namespace) -> int:

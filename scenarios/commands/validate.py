@@ -10,25 +10,24 @@ import argparse
 import math
 import os
 import sys
+from typing import TYPE_CHECKING
 
+from scenarios.commands import given
 from scenarios.shell import jsontext
+
+if TYPE_CHECKING:
+    from scenarios.validation.comparison import Row
 
 NAME = "validate"
 HELP = "recompute published tables and numerical checks"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("--only", metavar="A,B", help="sections to run, comma separated")
-    parser.add_argument("--list", action="store_true", help="list the sections and stop")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument(
-        "--pycycle-python", metavar="PYTHON", help="a Python that has pyCycle, for section pycycle"
-    )
-    parser.add_argument("--write", metavar="FILE", help="also write the page, VALIDATION.md")
-    parser.add_argument(
-        "--figures", metavar="DIR", help="draw Figures 15 to 25 of the paper there, and stop"
-    )
+OPTIONS = """
+--only A,B              | sections to run, comma separated
+--list                  | list the sections and stop
+--json                  | print JSON
+--pycycle-python PYTHON | a Python that has pyCycle, for section pycycle
+--write FILE            | also write the page, VALIDATION.md
+--figures DIR           | draw Figures 15 to 25 of the paper there, and stop
+"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
         print(*paper_figures.write_figures(args.figures), sep="\n")
         return 0
-    names = [n.strip() for n in args.only.split(",") if n.strip()] if args.only else list(known)
+    names = given.names(args.only) if args.only else list(known)
     report = {}
     skipped = {}
     failed = 0
@@ -84,39 +83,21 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failed or (args.only and skipped) else 0
 
 
-def table(rows: list) -> str:
-    """Return the rows as a text table."""
-    head = (
-        "quantity",
-        "unit",
-        "reference",
-        "ours",
-        "error",
-        "tolerance",
-        "kind",
-        "",
-        "why this tolerance",
-    )
-    body = [
-        (
-            r.quantity,
-            r.unit,
-            f"{r.reference:.7g}",
-            f"{r.ours:.7g}",
-            f"{r.error:+.1e}",
-            "-" if math.isinf(r.tolerance) else f"{r.tolerance:.0e}",
-            r.kind,
-            "ok" if r.passed else "SHORT",
-            r.reason,
-        )
-        for r in rows
-    ]
-    widths = [max(len(row[k]) for row in (head, *body)) for k in range(len(head))]
-    right = {2, 3, 4, 5}
+_HEAD = "quantity|unit|reference|ours|error|tolerance|kind||why this tolerance"
+HEAD = _HEAD.split("|")
+
+
+def table(rows: list[Row]) -> str:
+    """Return the rows as a text table; numbers stand to the right."""
+    body = [HEAD, *(_cells(r) for r in rows)]
+    widths = [max(len(row[k]) for row in body) for k in range(len(HEAD))]
+    right = [">" if 2 <= k <= 5 else "<" for k in range(len(HEAD))]
     return "\n".join(
-        "  " + "  ".join(
-            c.rjust(w) if k in right else c.ljust(w)
-            for k, (c, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in (head, *body)
-    )  # fmt: skip
+        ("  " + "  ".join(map("{:{}{}}".format, row, right, widths))).rstrip() for row in body
+    )
+
+
+def _cells(r: Row) -> list[str]:
+    tolerance = "-" if math.isinf(r.tolerance) else f"{r.tolerance:.0e}"
+    numbers = [f"{r.reference:.7g}", f"{r.ours:.7g}", f"{r.error:+.1e}", tolerance]
+    return [r.quantity, r.unit, *numbers, r.kind, "ok" if r.passed else "SHORT", r.reason]

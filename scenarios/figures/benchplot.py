@@ -54,10 +54,8 @@ def plot_costs(panels: Sequence[tuple[str, str, str, np.ndarray, np.ndarray]], n
             ax.set_xlabel(xlabel)
             ax.set_ylabel(ylabel)
             title(ax, head)
-            ax.text(
-                0.04, 0.93, f"{offset:.2g} s + {slope:.2g} s per unit\noff the line by "
-                f"{100 * off:.0f} % at most", transform=ax.transAxes, va="top", fontsize=8.2,
-                color=INK,
-            )  # fmt: skip
+            line = f"{offset:.2g} s + {slope:.2g} s per unit"
+            text = f"{line}\noff the line by {100 * off:.0f} % at most"
+            ax.text(0.04, 0.93, text, transform=ax.transAxes, va="top", fontsize=8.2, color=INK)
         caption(fig, note)
     return fig

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+from scenarios.figures.figstyle import (
+    INK,
+    LINE_INK,
+    MARKS,
+    MUTED,
+    PATCH,
+    caption,
+    drawing,
+    new_figure,
+    remark,
+    title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -16,7 +27,6 @@ if TYPE_CHECKING:
     from apu_casadi.unit.linearisation import LinearModel
 
 _LINEAR = 0.3  # 1/s; between plus and minus this the axes are linear
-_MARKS = ("o", "s", "^", "D")
 
 
 def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figure:
@@ -34,8 +44,8 @@ def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figur
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter
 
-    if not 1 <= len(models) <= len(_MARKS):
-        raise SignalError(f"one to {len(_MARKS)} models can be drawn, got {len(models)}")
+    if not 1 <= len(models) <= len(MARKS):
+        raise SignalError(f"one to {len(MARKS)} models can be drawn, got {len(models)}")
     modes = {label: m.eigenvalues() for label, m in models.items()}
     values = np.array([e.value for es in modes.values() for e in es])
     with drawing():
@@ -58,15 +68,15 @@ def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figur
                 ax.plot(-decay, sign * w, color=MUTED, lw=0.7, ls=(0, (3, 3)), zorder=1)
             k = int(np.argmin(np.abs(w - 2.0 * np.sqrt(high))))
             if decay[k] < 0.6 * left:
-                ax.annotate(f"ζ = {zeta:g}", (-decay[k], -w[k]), fontsize=7.4, color=MUTED,
-                            ha="center", va="center", zorder=3,
-                            bbox={"fc": "white", "ec": "none", "pad": 1.0})  # fmt: skip
+                look = {"color": MUTED, "ha": "center", "va": "center", "zorder": 3, "bbox": PATCH}
+                remark(ax, f"ζ = {zeta:g}", (-decay[k], -w[k]), (0, 0), fontsize=7.4, **look)
         for k, (label, es) in enumerate(modes.items()):
             v = np.array([e.value for e in es])
             both = np.concatenate([v, v[v.imag > 0].conj()])
-            ax.plot(both.real, both.imag, ls="none", marker=_MARKS[k], ms=7 if k == 0 else 6,
-                    mfc="none" if k else LINE_INK[0], mec=LINE_INK[k % len(LINE_INK)], mew=1.5,
-                    label=label, zorder=5 + k)  # fmt: skip
+            ink = LINE_INK[k % len(LINE_INK)]
+            look = {"ms": 6, "mfc": "none"} if k else {"ms": 7, "mfc": ink}
+            mark = {"marker": MARKS[k], "ls": "none", "mec": ink, "mew": 1.5}
+            ax.plot(both.real, both.imag, label=label, zorder=5 + k, **look, **mark)
         _name_modes(ax, next(iter(modes.values())))
         ticks = [s * 10.0**e for e in range(0, 7) for s in (1, -1)]
 
@@ -101,12 +111,9 @@ def _name_modes(ax: Any, modes: Any) -> None:
     for e in modes:
         first = next(iter(e.participation), "")
         if e.value.imag > 0:
-            ax.annotate(first, (e.value.real, e.value.imag), xytext=(8, 4),
-                        textcoords="offset points", fontsize=8.0, color=INK, zorder=8)  # fmt: skip
+            remark(ax, first, (e.value.real, e.value.imag), (8, 4), fontsize=8.0, zorder=8)
             continue
-        ax.annotate(
-            first, (e.value.real, 0), xytext=(0, heights[real % len(heights)]),
-            textcoords="offset points", fontsize=8.0, color=INK, ha="center", zorder=8,
-            arrowprops={"arrowstyle": "-", "color": MUTED, "lw": 0.6, "shrinkB": 3},
-        )  # fmt: skip
+        line = {"arrowstyle": "-", "color": MUTED, "lw": 0.6, "shrinkB": 3}
+        look = {"fontsize": 8.0, "ha": "center", "zorder": 8, "arrowprops": line}
+        remark(ax, first, (e.value.real, 0), (0, heights[real % len(heights)]), **look)
         real += 1

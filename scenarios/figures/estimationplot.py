@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+from scenarios.figures.figstyle import (
+    INK,
+    LINE_INK,
+    MUTED,
+    PATCH,
+    caption,
+    drawing,
+    new_figure,
+    remark,
+    title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,28 +68,24 @@ def plot_gain_of_a_sensor(
             ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
             ax.minorticks_off()
             ax.set_xlabel("prior of each factor, 1 sigma, %")
-        right.plot(100 * prior, 100 * prior, color=MUTED, lw=1.2, ls="--",
-                   label="before any reading")  # fmt: skip
+        percent = 100 * prior
+        right.plot(percent, percent, color=MUTED, lw=1.2, ls="--", label="before any reading")
         for (label, c), ink in zip(curves.items(), LINE_INK, strict=False):
-            left.plot(100 * prior, 100 * np.asarray(c["reduction"]), color=ink, lw=1.8, label=label)
-            right.plot(100 * prior, 100 * np.asarray(c["null_after"]), color=ink, lw=1.8,
-                       label=label)  # fmt: skip
+            for ax, key in ((left, "reduction"), (right, "null_after")):
+                ax.plot(percent, 100 * np.asarray(c[key]), color=ink, lw=1.8, label=label)
             if label in aims:
                 at, goal = aims[label]
                 left.plot(100 * at, 100 * goal, marker="^", ms=9, mfc="white", mec=ink, mew=1.8)
-                left.annotate(
-                    f"aim {100 * goal:.0f} %", (100 * at, 100 * goal), (-9, -3), ha="right",
-                    textcoords="offset points", fontsize=8.2, color=INK,
-                    bbox={"fc": "white", "ec": "none", "pad": 0.8},
-                )  # fmt: skip
+                place, text = (100 * at, 100 * goal), f"aim {100 * goal:.0f} %"
+                remark(left, text, place, (-9, -3), ha="right", bbox=PATCH)
         worst = max((c["null_before"] for c in curves.values()), key=lambda v: float(np.max(v)))
-        right.plot(100 * prior, 100 * np.asarray(worst), color=INK, lw=0, marker="o", ms=3.5,
-                   label=f"without {sensor}")  # fmt: skip
+        without = f"without {sensor}"
+        right.plot(percent, 100 * np.asarray(worst), "o", color=INK, ms=3.5, label=without)
         left.set_ylim(0, 100)
         right.set_yscale("log")
         seen = [np.min(c["null_after"]) for c in curves.values()]
-        levels = [t for t in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
-                  if 50 * min(seen) <= t <= 101 * prior[-1]]  # fmt: skip
+        low, high = 50 * min(seen), 101 * prior[-1]
+        levels = [t for t in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20) if low <= t <= high]
         right.set_yticks(levels, [f"{t:g}" for t in levels])
         right.minorticks_off()
         left.set_ylabel("reduction of the rms error, %")

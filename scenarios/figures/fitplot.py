@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+from scenarios.figures.figstyle import (
+    INK,
+    LINE_INK,
+    MUTED,
+    caption,
+    drawing,
+    margins,
+    new_figure,
+    title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SHOWN = {
-    "rad/s": ("r/min", 30 / np.pi), "Pa": ("kPa", 1e-3), "W": ("kW", 1e-3), "kg/s": ("g/s", 1e3),
-}  # fmt: skip
+_SHOWN = {"rad/s": ("r/min", 30 / np.pi), "Pa": ("kPa", 1e-3), "W": ("kW", 1e-3)}
+_SHOWN["kg/s"] = ("g/s", 1e3)
 Series = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -47,35 +55,36 @@ def plot_fit(
             f"series of {np.size(t)} values expected; wrong: {', '.join(wrong) or 'none given'}"
         )
     n = len(series)
+    dots: dict[str, Any] = {"ms": 2.6, "mfc": MUTED, "mew": 0.0, "alpha": 0.6}
+    line: dict[str, Any] = {"lw": 1.4}
+    small = {"ms": 2.2, "alpha": 0.6}
+    if steady:
+        dots = {"ms": 5, "mfc": "none", "mew": 1.0, "alpha": 1.0}
+        line, small = {"lw": 0, "marker": "x", "ms": 5, "mew": 1.5}, {"ms": 4, "alpha": 0.9}
     with drawing():
         height = 1.25 * n + 1.3
         fig = new_figure(height)
-        grid = fig.add_gridspec(
-            n, 2, width_ratios=(1.9, 1), left=0.085, right=0.985, bottom=0.85 / height,
-            top=1 - 0.55 / height, hspace=0.28, wspace=0.16,
-        )  # fmt: skip
+        place = {"left": 0.085, "right": 0.985, "hspace": 0.28, "wspace": 0.16}
+        place |= margins(fig, top=0.55, bottom=0.85)
+        grid = fig.add_gridspec(n, 2, width_ratios=(1.9, 1), **place)
         fig.text(0.012, 1 - 0.22 / height, heading, fontsize=11, fontweight="bold", va="center")
         for i, (name, (measured, fitted, error)) in enumerate(series.items()):
             unit, scale = _SHOWN.get(units[name], (units[name], 1.0))
             ax = fig.add_subplot(grid[i, 0])
-            ax.plot(t, scale * measured, ls="none", marker="o", ms=5 if steady else 2.6,
-                    mfc="none" if steady else MUTED, mec=MUTED, mew=1.0 if steady else 0.0,
-                    alpha=1.0 if steady else 0.6, label="measured")  # fmt: skip
-            ax.plot(t, scale * fitted, color=LINE_INK[0], lw=0 if steady else 1.4,
-                    marker="x" if steady else None, ms=5, mew=1.5, label="fitted")  # fmt: skip
+            ax.plot(t, scale * measured, "o", mec=MUTED, label="measured", **dots)
+            ax.plot(t, scale * fitted, color=LINE_INK[0], label="fitted", **line)
             ax.set_ylabel(f"{name} [{unit}]")
             ax.margins(x=0.02, y=0.15)
             side = fig.add_subplot(grid[i, 1], sharex=ax)
             side.axhspan(-1.96, 1.96, color="#e8f0f7", lw=0, zorder=0)
             side.axhline(0, color=INK, lw=0.8)
-            side.plot(t, error, ls="none", marker="o", ms=4 if steady else 2.2, color=LINE_INK[1],
-                      alpha=0.9 if steady else 0.6, mew=0)  # fmt: skip
+            side.plot(t, error, "o", color=LINE_INK[1], mew=0, **small)
             largest = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
             reach = max(3.2, 1.15 * largest)
             side.set_ylim(-reach, reach)
             if not np.isfinite(error).any():
-                side.text(0.5, 0.5, "not measured", transform=side.transAxes, ha="center",
-                          va="center", color=MUTED, fontsize=8.5)  # fmt: skip
+                middle = {"transform": side.transAxes, "ha": "center", "va": "center"}
+                side.text(0.5, 0.5, "not measured", color=MUTED, fontsize=8.5, **middle)
             for a in (ax, side):
                 a.tick_params(labelbottom=i == n - 1)
             if i == 0:

@@ -29,8 +29,9 @@ def _matrix(ax: Axes, head: str, scores: Mapping[str, Any], labelled: bool) -> N
     for i in range(n):
         for j in range(n):
             if share[i, j] >= 0.005:
-                ax.text(j, i, f"{100 * share[i, j]:.0f}", ha="center", va="center", fontsize=6.8,
-                        color="white" if share[i, j] > 0.6 else INK)  # fmt: skip
+                ink = "white" if share[i, j] > 0.6 else INK
+                place = {"ha": "center", "va": "center", "fontsize": 6.8}
+                ax.text(j, i, f"{100 * share[i, j]:.0f}", color=ink, **place)
     ax.set_xticks(range(n), scores["classes"], rotation=60, ha="right", rotation_mode="anchor")
     ax.set_yticks(range(n), scores["classes"] if labelled else [""] * n)
     ax.tick_params(labelsize=7.2, length=0)

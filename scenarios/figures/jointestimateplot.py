@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+from scenarios.figures.figstyle import (
+    DASHED,
+    INK,
+    LINE_INK,
+    MUTED,
+    OF_AXES,
+    caption,
+    drawing,
+    new_figure,
+    remark,
+    title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,17 +42,17 @@ Z95 = 1.96
 
 
 def _curve(
-    ax: Axes, t: np.ndarray, data: Mapping[str, np.ndarray], name: str, scale: float, offset: float,
-    ink: str,
-) -> np.ndarray:  # fmt: skip
+    ax: Axes, t: np.ndarray, data: Mapping[str, np.ndarray], name: str, scale: float, ink: str
+) -> np.ndarray:
     """Draw band, estimate and truth; return estimate and truth, for the axis."""
+    offset = 1.0 if name.startswith("f_") else 0.0
     mean, sigma, true = (
         np.asarray(data[n], float) for n in (name, f"{name}_sigma", f"{name}_true")
     )
     value, true, band = scale * (mean - offset), scale * (true - offset), scale * Z95 * sigma
     ax.fill_between(t, value - band, value + band, color=ink, alpha=0.2, lw=0, zorder=1)
     ax.plot(t, value, color=ink, lw=1.2, zorder=2)
-    ax.plot(t, true, color=INK, lw=1.1, ls=(0, (4, 2)), zorder=3)
+    ax.plot(t, true, color=INK, lw=1.1, ls=DASHED, zorder=3)
     # a band that is wide for an instant, after a fault, need not fit into the picture
     usual = np.nanquantile(band, 0.98)
     slim = band <= usual
@@ -87,16 +98,14 @@ def plot_joint_estimate(
         for k, (name, words, unit, scale) in enumerate(_PANELS):
             ax = fig.add_subplot(grid[k // 2, k % 2], sharex=axes[0] if axes else None)
             axes.append(ax)
-            offset = 1.0 if name.startswith("f_") else 0.0
-            seen = _curve(ax, t, data, name, scale, offset, LINE_INK[0])
+            seen = _curve(ax, t, data, name, scale, LINE_INK[0])
             _fit(ax, seen)
             ax.set_ylabel(unit)
             title(ax, f"{words}, {name}")
         ax = fig.add_subplot(grid[3, :], sharex=axes[0])
         axes.append(ax)
         every = [
-            _curve(ax, t, data, n, 1e3, 0.0, ink)
-            for n, ink in zip(SEVERITIES, LINE_INK, strict=False)
+            _curve(ax, t, data, n, 1e3, ink) for n, ink in zip(SEVERITIES, LINE_INK, strict=False)
         ]
         for n, ink in zip(SEVERITIES, LINE_INK, strict=False):
             ax.plot([], [], color=ink, lw=3, label=n)
@@ -109,16 +118,13 @@ def plot_joint_estimate(
             for _, start in phases[1:]:
                 ax.axvline(start, color=MUTED, lw=0.9, ls=":", zorder=0.9)
             for when in alarms:
-                ax.plot(when, 0.0, marker="^", ms=6, color=LINE_INK[3], clip_on=False, zorder=5,
-                        transform=ax.get_xaxis_transform())  # fmt: skip
+                place = {"clip_on": False, "zorder": 5, "transform": ax.get_xaxis_transform()}
+                ax.plot(when, 0.0, marker="^", ms=6, color=LINE_INK[3], **place)
         for ax in axes[:4]:
             ax.tick_params(labelbottom=False)
         axes[-1].set_xlabel("time [s]")
         for name, start in phases:
-            axes[-1].annotate(
-                name, (start, 1.0), (3, -3), xycoords=("data", "axes fraction"), va="top",
-                textcoords="offset points", fontsize=8.2, color=MUTED,
-            )  # fmt: skip
+            remark(axes[-1], name, (start, 1.0), (3, -3), xycoords=OF_AXES, va="top", color=MUTED)
         text = "Dashed: truth. Line and shade: estimate and its 95 % band. Dotted: phases."
         if len(alarms):
             text += " Triangles: a change of health was reported."

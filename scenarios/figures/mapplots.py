@@ -22,7 +22,18 @@ from apu_casadi.core.results import phases
 from apu_casadi.gaspath.maps.scaledmaps import map_function
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+from scenarios.figures.figstyle import (
+    DASHED,
+    INK,
+    LINE_INK,
+    MUTED,
+    caption,
+    drawing,
+    new_figure,
+    remark,
+    title,
+)
+from scenarios.figures.runwords import scenario_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,6 +49,8 @@ _SHADE = ("#f4f8fb", "#e6f0f7", "#d3e4f0", "#bcd6e8", "#a3c6de")
 _PHASES = ("#111827", "#0f766e", "#7a3e9d", "#c2185b", "#6b7f00", "#0891b2")
 _OUTSIDE = 0.5  # table spans beyond the table in which the surge line is looked for
 Lines = Mapping[str, Sequence[OperatingPoint]]
+Curve = tuple[np.ndarray, np.ndarray]
+_SHAFT = "Operating lines: governed speed, no shaft power (lower end) to design T4."
 
 
 def operating_line(
@@ -206,8 +219,8 @@ def _draw(
     design: tuple[float, float],
     lines: Lines | None,
     trajectory: xr.Dataset | None,
-    surge: tuple[np.ndarray, np.ndarray] | None,
-    published: tuple[np.ndarray, np.ndarray] | None,
+    surge: Curve | None,
+    published: Curve | None,
     labels: tuple[str, str],
     what: str,
     symbol: str,
@@ -218,10 +231,8 @@ def _draw(
     drawn = [place(_columns(points)) for points in lines.values()]
     with drawing():
         fig = new_figure(6.4)
-        grid = fig.add_gridspec(
-            1, 2, width_ratios=[1.35, 1.0], left=0.062, right=0.985, wspace=0.17, top=0.93,
-            bottom=0.255,
-        )  # fmt: skip
+        place_ = {"left": 0.062, "right": 0.985, "wspace": 0.17, "top": 0.93, "bottom": 0.255}
+        grid = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0], **place_)
         whole, near = (fig.add_subplot(grid[k]) for k in range(2))
         x_all = np.concatenate([np.atleast_1d(design[0]), *(np.ravel(x) for x, _ in drawn)])
         y_all = np.concatenate([np.atleast_1d(design[1]), *(np.ravel(y) for _, y in drawn)])
@@ -237,50 +248,38 @@ def _draw(
                 ax.set_ylim(*box[1])
             _map(ax, m, axes_of, symbol, zoomed=zoomed)
             if surge is not None and published is not None:
-                ax.plot(*surge, color=SURGE_INK, lw=2.2, label="surge line", zorder=4)
-                ax.plot(*published, color=SURGE_INK, lw=1.1, ls=(0, (4, 2)), zorder=4,
-                        label="surge line as published, scaled")  # fmt: skip
+                _surge(ax, surge, published)
             for k, (label, (x, y)) in enumerate(zip(lines, drawn, strict=True)):
-                ax.plot(
-                    x, y, color=LINE_INK[k % len(LINE_INK)], lw=2.0, marker="o", ms=3.2, zorder=5,
-                    label=f"operating line, {label}",
-                )  # fmt: skip
+                look = {"color": LINE_INK[k % len(LINE_INK)], "lw": 2.0, "ms": 3.2, "zorder": 5}
+                ax.plot(x, y, marker="o", label=f"operating line, {label}", **look)
             if run is not None and trajectory is not None:
                 _draw_run(ax, *run, trajectory)
-            ax.plot(*design, marker="*", ms=13, mfc="white", mec=INK, mew=1.2, ls="none", zorder=8,
-                    label="design point")  # fmt: skip
+            star = {"ms": 13, "mfc": "white", "mec": INK, "mew": 1.2, "zorder": 8}
+            ax.plot(*design, "*", label="design point", **star)
             ax.set_xlabel(labels[0] if not zoomed else labels[0].split(",")[0])
         whole.set_ylabel(labels[1])
         title(whole, f"{what}: {m.table.name}, scaled and calibrated")
         title(near, "Enlarged")
         (x0, x1), (y0, y1) = box
-        whole.plot(
-            [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=MUTED, lw=0.9, ls="--", zorder=6
-        )
-        fig.legend(
-            *whole.get_legend_handles_labels(),
-            loc="lower left",
-            bbox_to_anchor=(0.05, 0.075),
-            ncols=4,
-            fontsize=7.8,
-            frameon=False,
-            columnspacing=1.6,
-            handlelength=2.2,
-        )
-        speeds = (
-            f"Grey: lines of relative corrected speed ${symbol}$; shading: isentropic efficiency"
-        )
-        words = [
-            f"{what} at Reynolds number index 1. {speeds} inside the table.",
-            "Operating lines: governed speed, no shaft power (lower end) to design T4.",
-        ]
+        frame = [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0]
+        whole.plot(*frame, color=MUTED, lw=0.9, ls="--", zorder=6)
+        space = {"ncols": 4, "columnspacing": 1.6, "handlelength": 2.2}
+        where = {"loc": "lower left", "bbox_to_anchor": (0.05, 0.075), "frameon": False}
+        fig.legend(*whole.get_legend_handles_labels(), fontsize=7.8, **where, **space)
+        words = [f"{what} at Reynolds number index 1. Grey: lines of relative corrected speed"]
+        words.append(f"${symbol}$; shading: isentropic efficiency inside the table. {_SHAFT}")
         if surge is not None:
             words.append("Surge line: zero stability margin.")
         if run is not None:
-            name = _name(trajectory)
-            words.append(f"Trajectory{name}: circle start, square end.")
+            words.append(f"Trajectory{_name(trajectory)}: circle start, square end.")
         caption(fig, " ".join(words))
         return fig
+
+
+def _surge(ax: Axes, surge: Curve, published: Curve) -> None:
+    ax.plot(*surge, color=SURGE_INK, lw=2.2, label="surge line", zorder=4)
+    look = {"color": SURGE_INK, "lw": 1.1, "ls": DASHED, "zorder": 4}
+    ax.plot(*published, label="surge line as published, scaled", **look)
 
 
 def _columns(points: Sequence[OperatingPoint]) -> dict[str, np.ndarray]:
@@ -339,11 +338,9 @@ def _map(
         if seen.any():
             k = int(np.flatnonzero(seen)[np.argmax(ly[seen])])
             text = f"${symbol}$ = {v:.3g}" if zoomed else f"{v:.3g}"
-            ax.annotate(
-                text, (lx[k], ly[k]), xytext=(3, -2 if zoomed else 3), textcoords="offset points",
-                fontsize=7.4, color=INK, ha="left", va="top" if zoomed else "bottom", zorder=7,
-                clip_on=True,
-            )  # fmt: skip
+            shift, va = ((3, -2), "top") if zoomed else ((3, 3), "bottom")
+            look = {"fontsize": 7.4, "ha": "left", "va": va, "zorder": 7, "clip_on": True}
+            remark(ax, text, (lx[k], ly[k]), shift, **look)
 
 
 def _edges(m: ScaledMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -378,17 +375,13 @@ def _draw_run(ax: Axes, x: np.ndarray, y: np.ndarray, ds: xr.Dataset) -> None:
     for k, p in enumerate(phases(ds)):
         inside = (t >= p["start"] - 1e-9) & (t <= p["end"] + 1e-9)
         ink = _PHASES[k % len(_PHASES)]
-        ax.plot(x[inside], y[inside], color="white", lw=3.4, zorder=5.5, solid_capstyle="round")
-        ax.plot(x[inside], y[inside], color=ink, lw=1.7, zorder=6, label=f"run: {p['name']}",
-                solid_capstyle="round")  # fmt: skip
+        path, look = (x[inside], y[inside]), {"solid_capstyle": "round"}
+        ax.plot(*path, color="white", lw=3.4, zorder=5.5, **look)
+        ax.plot(*path, color=ink, lw=1.7, zorder=6, label=f"run: {p['name']}", **look)
     for i, mark in ((0, "o"), (-1, "s")):
         ax.plot(x[i], y[i], marker=mark, ms=6, mfc="white", mec=INK, mew=1.3, ls="none", zorder=9)
 
 
 def _name(ds: xr.Dataset | None) -> str:
-    import json
-
-    try:
-        return f" of scenario “{json.loads(ds.attrs['scenario'])['name']}”"  # type: ignore[union-attr]
-    except (KeyError, TypeError, ValueError, AttributeError):
-        return ""
+    name = "" if ds is None else scenario_of(ds).get("name", "")
+    return f" of scenario “{name}”" if name else ""

@@ -8,8 +8,25 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from scenarios.figures.figstyle import caption
+
 if TYPE_CHECKING:
     import xarray as xr
+    from matplotlib.figure import Figure
+
+SEVERITY = ("mu", "k_rf", "kappa")
+"""Of a stator fault, as a run records it."""
+FIGURES = {
+    "fig20_phases": "Phases of the run: load, gas-path health and stator fault",
+    "fig21_speed_power": "Shaft speed and shaft power of the gas generator",
+    "fig22_compressor_outlet": "Compressor outlet total temperature and total pressure",
+    "fig23_T4_surge_margin": "Combustor outlet total temperature and compressor surge margin",
+    "fig24_currents": "Three-phase currents of the starter/generator",
+    "fig25_voltages": "Three-phase voltages of the starter/generator",
+}
+"""File names (without ``.png``) and titles, in the paper's order."""
 
 
 def _rows(ds: xr.Dataset, name: str) -> list[dict[str, Any]]:
@@ -46,3 +63,35 @@ def made_with(ds: xr.Dataset) -> str:
     except (KeyError, TypeError, ValueError):
         pass
     return "; ".join(words) + "." if words else ""
+
+
+def scenario_of(ds: xr.Dataset) -> dict[str, Any]:
+    """Return the scenario of a run as a table; empty where it is not recorded."""
+    try:
+        found = json.loads(ds.attrs["scenario"])
+    except (KeyError, TypeError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _severity_note(ds: xr.Dataset) -> str:
+    """Tell the severity of the last stator fault: always mu, k_rf and kappa together."""
+    if not all(n in ds for n in SEVERITY):
+        return ""
+    mu = ds["mu"].values
+    hit = np.flatnonzero(mu > 0)
+    if hit.size == 0:
+        return ""
+    k = hit[-1]
+    m, r, c = (float(ds[n].values[k]) for n in SEVERITY)
+    kappa = f"κ = µ = {c:g}" if abs(c - m) < 1e-12 else f"κ = {c:g}"
+    where = fault_phase(ds, float(ds["time"].values[k]))
+    return f"TTSC{where}: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
+
+
+def caption_of(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
+    """Write number, title, scenario, severity and what the run was made with under a figure."""
+    name = scenario_of(ds).get("name", "")
+    words = [f"Figure {key[3:5]}. {FIGURES[key]}.", f"Scenario “{name}”." if name else ""]
+    words += [_severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
+    caption(fig, " ".join(w for w in words if w))

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import INK, LINE_INK, MUTED, caption, drawing, new_figure, title
+from scenarios.figures.figstyle import (
+    INK,
+    LINE_INK,
+    MARKS,
+    MUTED,
+    OF_AXES,
+    caption,
+    drawing,
+    new_figure,
+    remark,
+    title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,7 +29,6 @@ __all__ = ["plot_consistency", "plot_coverage", "plot_null", "plot_rate"]
 
 _BAND = "#e8f0f7"
 _PATCH = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
-_MARKS = ("o", "s", "^", "D")
 
 
 def _same_length(head: str, t: Any, curves: Mapping[str, Any]) -> np.ndarray:
@@ -61,20 +71,18 @@ def plot_consistency(
         fig = new_figure(5.2)
         grid = fig.subplots(2, len(panels), squeeze=False, sharex="col")
         heads = [textwrap.fill(head, 88 // len(panels)) for head, *_ in panels]
-        fig.subplots_adjust(
-            left=0.065, right=0.985, top=0.88 if any("\n" in h for h in heads) else 0.925,
-            bottom=0.185, wspace=0.2, hspace=0.12,
-        )  # fmt: skip
+        roof = 0.88 if any("\n" in h for h in heads) else 0.925
+        space = {"bottom": 0.185, "wspace": 0.2, "hspace": 0.12}
+        fig.subplots_adjust(left=0.065, right=0.985, top=roof, **space)
         for k, (head, t, ratios, limit, checks) in enumerate(panels):
             at = _same_length(head, t, {**ratios, **{n: v for n, (v, _) in checks.items()}})
             top, low = grid[:, k]
             top.axhline(1, color=INK, lw=0.8)
             if limit is not None:
                 top.axhline(limit, color=MUTED, lw=1.2, ls="--")
-                top.annotate(f"goal {limit:g}", (at[-1], limit), (0, 2), fontsize=8,
-                             color=MUTED, bbox=_PATCH, textcoords="offset points",
-                             ha="right")  # fmt: skip
-            for (name, v), ink, mark in zip(ratios.items(), LINE_INK, _MARKS, strict=False):
+                look = {"color": MUTED, "bbox": _PATCH, "ha": "right"}
+                remark(top, f"goal {limit:g}", (at[-1], limit), (0, 2), fontsize=8, **look)
+            for (name, v), ink, mark in zip(ratios.items(), LINE_INK, MARKS, strict=False):
                 top.plot(at, v, mark, ls="-", color=ink, lw=1.2, ms=2.6, label=name)
             reach = max(float(np.max(v)) for v in ratios.values())
             if reach > 5:
@@ -82,7 +90,7 @@ def plot_consistency(
             else:
                 top.set_ylim(0, 1.25 * max(reach, limit or 1.0))
             title(top, heads[k])
-            for (name, (v, band)), ink, mark in zip(checks.items(), LINE_INK, _MARKS, strict=False):
+            for (name, (v, band)), ink, mark in zip(checks.items(), LINE_INK, MARKS, strict=False):
                 low.axhspan(*band, color=ink, alpha=0.07, lw=0)
                 for edge in band:
                     low.axhline(edge, color=ink, lw=0.7, ls=":")
@@ -123,7 +131,7 @@ def plot_null(
         fig.subplots_adjust(left=0.065, right=0.985, top=0.89, bottom=0.255, wspace=0.08)
         for ax, (head, t, curves) in zip(axes, panels, strict=True):
             at = _same_length(head, t, curves)
-            for (name, v), ink, mark in zip(curves.items(), LINE_INK, _MARKS, strict=False):
+            for (name, v), ink, mark in zip(curves.items(), LINE_INK, MARKS, strict=False):
                 ax.plot(at, v, mark, ls="-", color=ink, lw=1.3, ms=3, label=name)
             ax.set_xlabel("time [s]")
             ax.set_ylim(bottom=0)
@@ -164,15 +172,12 @@ def plot_coverage(
         width = len(names[0]) + 1
         for k, (head, group) in enumerate(groups.items()):
             for j, (name, (share, low, high)) in enumerate(group.items()):
-                ax.errorbar(
-                    k * width + j, 100 * share, [[100 * (share - low)], [100 * (high - share)]],
-                    fmt=_MARKS[j % 4], color=LINE_INK[j % 4], ms=5, capsize=3, lw=1.2,
-                    label=name if k == 0 else None,
-                )  # fmt: skip
-            ax.annotate(
-                head, (k * width + (width - 2) / 2, 0), (0, -14), ha="center", va="top",
-                xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=9,
-            )  # fmt: skip
+                ends = [[100 * (share - low)], [100 * (high - share)]]
+                look = {"fmt": MARKS[j % 4], "color": LINE_INK[j % 4], "ms": 5, "capsize": 3}
+                label = name if k == 0 else None
+                ax.errorbar(k * width + j, 100 * share, ends, lw=1.2, label=label, **look)
+            place = {"ha": "center", "va": "top", "xycoords": OF_AXES}
+            remark(ax, head, (k * width + (width - 2) / 2, 0), (0, -14), fontsize=9, **place)
         ax.set_xticks([])
         ax.set_xlim(-0.8, width * len(groups) - 1.2)
         ax.set_ylabel(f"{100 * level:.0f} % intervals that\nhold the truth [%]")
@@ -208,20 +213,17 @@ def plot_rate(
         fig = new_figure(3.7)
         ax = fig.subplots()
         fig.subplots_adjust(left=0.075, right=0.985, top=0.89, bottom=0.255)
-        ax.plot(z, e / hours, color=LINE_INK[0], lw=1.6,
-                label="Rice's formula, one constant fitted")  # fmt: skip
+        fitted = "Rice's formula, one constant fitted"
+        ax.plot(z, e / hours, color=LINE_INK[0], lw=1.6, label=fitted)
         seen = c > 0
         error = np.sqrt(c[seen])
-        ax.errorbar(
-            z[seen], c[seen] / hours, [np.minimum(error, 0.999 * c[seen]) / hours, error / hours],
-            fmt="o", color=LINE_INK[1], ms=4.5, capsize=3, lw=1.2, label="counted",
-        )  # fmt: skip
+        ends = [np.minimum(error, 0.999 * c[seen]) / hours, error / hours]
+        look = {"fmt": "o", "color": LINE_INK[1], "ms": 4.5, "capsize": 3, "lw": 1.2}
+        ax.errorbar(z[seen], c[seen] / hours, ends, label="counted", **look)
         ax.axhline(goal, color=MUTED, lw=1.2, ls="--")
-        ax.annotate(f"goal: {goal:g} an hour", (z[0], goal), (2, 3), fontsize=8.2, color=MUTED,
-                    textcoords="offset points")  # fmt: skip
+        remark(ax, f"goal: {goal:g} an hour", (z[0], goal), (2, 3), color=MUTED)
         ax.axvline(threshold, color=INK, lw=1.0)
-        ax.annotate("alarm", (threshold, 0.97), (4, 0), fontsize=8.5, color=INK, va="top",
-                    xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
+        remark(ax, "alarm", (threshold, 0.97), (4, 0), fontsize=8.5, va="top", xycoords=OF_AXES)
         ax.set_yscale("log")
         ax.set_xlabel("level of the largest h over its standard deviation")
         ax.set_ylabel("rises past it, per hour")

@@ -12,75 +12,24 @@ from typing import Any
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.files import write_text
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
-from scenarios.pages.reports import JOINT, REPORTS, Claim, Pictures
-from scenarios.shell.markdown import markdown_table, write_text
+from scenarios.shell.template import Template
 from scenarios.studies import catalogue
 from scenarios.studies.kept import understood
+from scenarios.studies.registration import JOINT, Claim, Pictures
 
-__all__ = [
-    "claims",
-    "load",
-    "page",
-    "preliminary",
-    "put_summary",
-    "sensor_table",
-    "summary",
-    "write",
-]
+__all__ = ["claims", "load", "page", "preliminary", "put_summary", "summary", "write"]
 
 IMAGES = "docs/images"
 DPI = 120
-GOALS = {
-    1: "correctness", 2: "efficiency", 3: "consistency", 4: "shaft power", 5: "detection",
-    6: "isolation", 7: "fitting", 8: "speed",
-}  # fmt: skip
+MARKS = ("<!-- estimation: begin -->", "<!-- estimation: end -->")
+"""What the summary in the README stands between."""
 
-_TOP = """# Estimation
-
-Made by `apu estimate page --write ESTIMATION.md` from the numbers in `docs/estimation`; do not
-edit. How well health factors, short circuits and their confidence are estimated, against goals that
-were set before: each on fresh random seeds, with filters, noise levels and thresholds fixed in code
-and tuned on other seeds. What falls short is printed with its reason.
-"""
-
-_SENSORS = """## Sensors
-
-Standard deviations (1 sigma) that all studies use; `apu estimate sensors` prints them. Noise is
-white; a gain error is a constant relative error that is drawn anew for each run. Another table is
-made with `SensorSet.change`.
-"""
-
-_HOW = """## How to reproduce
-
-    pip install .
-    apu estimate joint                    # one joint run: summary, data, figure
-    apu estimate sensors                  # the tables above
-    apu estimate study NAME               # one study, into docs/estimation/NAME.json
-    apu estimate study all                # all that is not kept with the same seeds and constants
-    apu estimate study all --seeds 20     # quickly, into results/estimation if --out says so
-    apu estimate page --write ESTIMATION.md
-
-A study is written part by part and can be interrupted; what is done is not run again unless
-`--again` is given. Seconds on one core with the default number of seeds:
-"""
-
-_LIMITS = """## Limits of validity
-
-- All data are simulated. The mismatched truths differ from the filters' models as stated (other
-  integrators, steps, inertia, gas data, maps, kappa, gain errors, unbalance); a real machine also
-  differs in ways that nobody wrote down: saturation, slot harmonics, heat soak, sensor lags.
-- Sensor noise is white and Gaussian, gain errors are constant. The 1-sigma tables are from the
-  literature where it has them, assumed elsewhere; every conclusion moves with them.
-- Electrical severities are h = mu/(k_rf + 1 - mu) with full coupling (kappa = mu). mu and k_rf are
-  reported as a ridge; where kappa > mu they can be separated, but only by a filter that is told
-  kappa.
-- Bounds are posterior Cramer-Rao bounds, averaged over some of the trajectories for the gas path.
-- Health factors walk slowly and jump by a few per cent; the jump test has its false alarms by
-  construction of its threshold, not by a fit to the data shown.
-- A unit without history is only known by the priors of wear and gain errors; no method isolates
-  faults that lie inside them.
-"""
+TEXT = Template.of("estimation.md")
+_ROWS = [row.split(" | ") for row in TEXT.raw("goals").splitlines()]
+GOALS = {k: name for k, (name, _) in enumerate(_ROWS, 1)}
+ASKED = {k: asked for k, (_, asked) in enumerate(_ROWS, 1)}
 
 
 def load(folder: str | Path) -> dict[str, dict[str, Any]]:
@@ -98,7 +47,7 @@ def load(folder: str | Path) -> dict[str, dict[str, Any]]:
         raise DataError(f"{os.fspath(folder)}: no results; apu estimate study all makes them")
     for name, record in found.items():
         try:
-            REPORTS[name].claims(catalogue.results(record))
+            catalogue.STUDIES[name].report.claims(catalogue.results(record))
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as e:
             raise DataError(
                 f"{catalogue.path_of(catalogue.STUDIES[name], folder)}: damaged: its results "
@@ -112,52 +61,33 @@ def claims(records: Mapping[str, Mapping[str, Any]]) -> list[Claim]:
     every: list[Claim] = []
     for name, r in records.items():
         with understood(name):
-            every += REPORTS[name].claims(catalogue.results(r))
+            every += catalogue.STUDIES[name].report.claims(catalogue.results(r))
     return sorted(every, key=lambda c: 9 if c.goal == JOINT else int(c.goal))
 
 
 def sensor_table(sensors: SensorSet) -> str:
     """Return a sensor set as a Markdown table."""
-    return markdown_table(
-        ("signal", "noise, 1 sigma", "gain error, 1 sigma", "source"),
-        [
-            (
-                s.name,
-                f"{100 * s.noise:g} % of the reading" if s.relative else f"{s.noise:g} {s.unit}",
-                f"{100 * s.gain:g} %" if s.gain else "none",
-                s.source,
-            )
-            for s in sensors.sensors
-        ],
-    )
-
-
-def _met(c: Claim) -> str:
-    return "" if c.met is None else "yes" if c.met else "**no**"
-
-
-def _first_table(found: list[Claim]) -> str:
     rows = [
-        (f"{c.goal}, {GOALS[c.goal]}" if isinstance(c.goal, int) else str(c.goal), c.what, c.target,
-         c.achieved, c.interval, c.seeds, _met(c))
-        for c in found
-    ]  # fmt: skip
-    head = ("goal", "what", "target", "achieved", "interval, remark", "seeds", "met")
-    return markdown_table(head, rows)
+        {
+            "name": s.name,
+            "noise": f"{100 * s.noise:g} % of the reading"
+            if s.relative
+            else f"{s.noise:g} {s.unit}",
+            "gain": f"{100 * s.gain:g} %" if s.gain else "none",
+            "source": s.source,
+        }
+        for s in sensors.sensors
+    ]
+    return TEXT.table("sensor", rows, right=())
 
 
-ASKED = {
-    1: "linear models: largest difference <= 1e-9",
-    2: "RMSE over bound <= 1.2, mismatched 1.5",
-    3: "NEES and NIS in their 95 % bands at >= 90 % of checkpoints",
-    4: "shaft power takes >= 50 % off the error, with efficiency bias >= 30 %",
-    5: "h = 1e-4 in 20 periods, 3e-4 in 50; <= 1 false alarm an hour",
-    6: "Cohen's kappa >= 0.8",
-    7: "95 % intervals cover 93 to 97 %",
-    8: "EKF step <= 5 us, UKF <= 20 us, 14 s joint in <= 5 s",
-}
-MARKS = ("<!-- estimation: begin -->", "<!-- estimation: end -->")
-"""What the summary in the README stands between."""
+def _claim_table(found: list[Claim]) -> str:
+    said = {None: "", True: "yes", False: "**no**"}
+    rows = []
+    for c in found:
+        goal = f"{c.goal}, {GOALS[c.goal]}" if isinstance(c.goal, int) else c.goal
+        rows.append(vars(c) | {"goal": goal, "met": said[c.met]})
+    return TEXT.table("claim", rows, right=())
 
 
 def summary(records: Mapping[str, Mapping[str, Any]]) -> str:
@@ -165,12 +95,12 @@ def summary(records: Mapping[str, Mapping[str, Any]]) -> str:
     rows = []
     for goal, name in GOALS.items():
         some = [c for c in claims(records) if c.goal == goal and c.met is not None]
+        reached = ", ".join(c.achieved if c.met else f"**{c.achieved}**" for c in some)
+        counts = {"met": sum(bool(c.met) for c in some), "of": len(some)}
         if some:
-            rows.append((
-                f"{goal}, {name}", ASKED[goal], f"{sum(bool(c.met) for c in some)} of {len(some)}",
-                ", ".join(c.achieved if c.met else f"**{c.achieved}**" for c in some),
-            ))  # fmt: skip
-    return markdown_table(("goal", "asked", "met", "reached (bold: missed)"), rows)
+            about = {"goal": f"{goal}, {name}", "asked": ASKED[goal], "reached": reached}
+            rows.append(about | counts)
+    return TEXT.table("summary", rows, right=())
 
 
 def preliminary(records: Mapping[str, Mapping[str, Any]]) -> str:
@@ -182,9 +112,7 @@ def preliminary(records: Mapping[str, Mapping[str, Any]]) -> str:
             asked = study.parts[key].seeds(study.seeds) if key in study.parts else 0
             if part["seeds"] and part["seeds"][1] < asked:
                 few.setdefault(name, f"{name} ({part['seeds'][1]} of {asked})")
-    if not few:
-        return ""
-    return "**Preliminary**: run with fewer seeds than asked for: " + ", ".join(few.values()) + "."
+    return TEXT.text("preliminary", few=", ".join(few.values())) if few else ""
 
 
 def put_summary(text: str, records: Mapping[str, Mapping[str, Any]]) -> str:
@@ -208,64 +136,59 @@ def page(records: Mapping[str, Mapping[str, Any]]) -> str:
     found = claims(records)
     asked = [c for c in found if c.met is not None]
     missed = [c for c in asked if not c.met]
-    blocks = [_TOP.strip(), "## Goals and what was reached"]
-    if preliminary(records):
-        blocks.append(preliminary(records))
-    blocks.append(f"{len(asked) - len(missed)} of {len(asked)} met.")
-    blocks.append(_first_table(found))
+    blocks = [TEXT.raw("top"), "## Goals and what was reached", preliminary(records)]
+    blocks.append(TEXT.text("met", met=len(asked) - len(missed), asked=len(asked)))
+    blocks.append(_claim_table(found))
     if missed:
+        why = (
+            vars(c) | {"why": f"{c.why[0].upper()}{c.why[1:]}." if c.why else ""} for c in missed
+        )
         blocks.append("### What was missed, and why")
-        blocks.append("\n".join(
-            f"- {c.what}: {c.achieved} where {c.target} is asked. {_sentence(c.why)}"
-            for c in missed
-        ))  # fmt: skip
-    absent = [n for n in catalogue.STUDIES if n not in records]
-    if absent:
-        blocks.append("Not run yet: " + ", ".join(absent) + ".")
+        blocks.append("\n".join(TEXT.text("missed", **c) for c in why))
+    blocks.append(_not_run([n for n in catalogue.STUDIES if n not in records]))
     for name, record in records.items():
         blocks += _study(name, record, figures[name])
-    blocks += [
-        _SENSORS.strip(), "Gas path, every 20 ms:", sensor_table(GAS_PATH),
-        "Electrical, at 10 kHz:", sensor_table(ELECTRICAL), _HOW.strip(), _durations(records),
-        _LIMITS.strip(),
-    ]  # fmt: skip
-    return "\n\n".join(blocks) + "\n"
+    blocks += [TEXT.raw("sensors"), "Gas path, every 20 ms:", sensor_table(GAS_PATH)]
+    blocks += ["Electrical, at 10 kHz:", sensor_table(ELECTRICAL)]
+    blocks += [TEXT.raw("how"), _durations(records), TEXT.raw("limits")]
+    return "\n\n".join(b for b in blocks if b) + "\n"
 
 
-def _sentence(text: str) -> str:
-    return "" if not text else f"{text[0].upper()}{text[1:]}."
+def _missed(c: Claim) -> str:
+    why = f"{c.why[0].upper()}{c.why[1:]}." if c.why else ""
+    return TEXT.text("missed", **{**vars(c), "why": why})
+
+
+def _not_run(names: list[str]) -> str:
+    return TEXT.text("not run", names=", ".join(names)) if names else ""
 
 
 def _study(name: str, record: Mapping[str, Any], figures: Pictures) -> list[str]:
-    study, report = catalogue.STUDIES[name], REPORTS[name]
+    study = catalogue.STUDIES[name]
     parts = record["parts"]
-    blocks = [f"## {study.title}", f"Goal: {study.goal}", report.intro]
+    blocks = [f"## {study.title}", f"Goal: {study.goal}", study.template.text("intro")]
     with understood(name):
-        blocks += report.section(catalogue.results(record))
+        blocks += study.report.section(catalogue.results(record))
     blocks += [f"![{text}]({IMAGES}/{file})" for text, (file, _) in figures.items()]
-    absent = [p for p in study.parts if p not in parts]
-    if absent:
-        blocks.append("Not run yet: " + ", ".join(absent) + ".")
+    blocks.append(_not_run([p for p in study.parts if p not in parts]))
     seeds = sorted({tuple(p["seeds"]) for p in parts.values() if p["seeds"]})
-    said = ", ".join(f"{n} from {first}" for first, n in seeds) or "none"
-    versions = next(iter(parts.values()))["versions"] if parts else {}
-    blocks.append(
-        f"Seeds: {said}; {record.get('tuned', study.tuned)}. Constants and all numbers: "
-        f"[docs/estimation/{name}.json](docs/estimation/{name}.json). Made with "
-        + ", ".join(f"{k} {v}" for k, v in versions.items()) + "."
-    )  # fmt: skip
-    return blocks
+    values = {
+        "seeds": ", ".join(f"{n} from {first}" for first, n in seeds) or "none",
+        "tuned": record.get("tuned", study.tuned),
+        "versions": ", ".join(
+            f"{k} {v}" for p in list(parts.values())[:1] for k, v in p["versions"].items()
+        ),
+    }
+    return [*blocks, TEXT.text("made", name=name, **values)]
 
 
 def _durations(records: Mapping[str, Mapping[str, Any]]) -> str:
     rows = []
     for name, record in records.items():
-        parts = record["parts"]
-        rows.append((
-            f"`apu estimate study {name}`", f"{sum(p['seconds'] for p in parts.values()):.0f}",
-            ", ".join(f"{k} {p['seconds']:.0f}" for k, p in parts.items()),
-        ))  # fmt: skip
-    return markdown_table(("command", "s", "of which"), rows)
+        seconds = {k: p["seconds"] for k, p in record["parts"].items()}
+        parts = ", ".join(f"{k} {s:.0f}" for k, s in seconds.items())
+        rows.append({"name": name, "seconds": sum(seconds.values()), "parts": parts})
+    return TEXT.table("duration", rows, right=())
 
 
 def pictures(records: Mapping[str, Mapping[str, Any]]) -> dict[str, Pictures]:
@@ -273,7 +196,7 @@ def pictures(records: Mapping[str, Mapping[str, Any]]) -> dict[str, Pictures]:
     found = {}
     for name, r in records.items():
         with understood(name):
-            found[name] = REPORTS[name].figures(catalogue.results(r))
+            found[name] = catalogue.STUDIES[name].report.figures(catalogue.results(r))
     return found
 
 

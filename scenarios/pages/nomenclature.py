@@ -22,47 +22,9 @@ from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.generator import NEUTRALS, Generator
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.apu import Apu
+from scenarios.shell.template import Template
 
-STATIONS = (
-    ("0", "ambient air, static"),
-    ("1", "intake entrance"),
-    ("2", "compressor inlet"),
-    ("3", "compressor outlet"),
-    ("31", "combustor inlet, after the bleeds"),
-    ("4", "combustor outlet"),
-    ("41", "turbine rotor inlet, vane cooling mixed in: the turbine's work starts here"),
-    ("50", "turbine rotor exit, before the rotor cooling mixes in"),
-    ("5", "turbine outlet"),
-    ("8", "exhaust exit"),
-)
-
-LETTERS = (
-    ("T, P, W", "total temperature, total pressure, mass flow, with the station's number"),
-    ("Ts, Ps", "static temperature and pressure"),
-    ("PR, NPR", "pressure ratio, above one also in the turbine; of the exhaust to ambient"),
-    ("FAR, war", "burnt fuel and water per dry air, by mass"),
-    ("n, N", "corrected speed over its design value; speed"),
-    ("eta, f_...", "efficiency; health factor, one when healthy"),
-    ("lam_, i_, v_, V_", "flux linkage, current, voltage (v at an instant, V otherwise)"),
-    ("_s, _fd, _kd, _kq", "stator, field winding, d damper, q damper"),
-    ("_q, _d, _0; _a, _b, _c", "axes after Park's transform, q first; phases"),
-    ("w_r, theta_e", "electrical rotor speed and angle"),
-    ("mu, k_rf, kappa, h", "severity of a turn-to-turn short circuit; h = mu/(k_rf + 1 - mu)"),
-)
-
-CLASHES = (
-    ("r_fd", "field resistance; the paper's R_f in Table 1"),
-    ("r_fault", "resistance of the fault branch; the paper's R_f in (9)"),
-    ("i_fault", "current of the fault branch; the paper's i_f, which is also the field current"),
-    ("n_pp", "pole pairs; P is pressure or power"),
-    (
-        "PW, P_...",
-        "power is PW at the shaft and P with a word elsewhere; P with a number is pressure",
-    ),
-    ("N", "gas generator speed, rad/s; the paper's XNHPC in r/min"),
-    ("SM", "stability margin as a fraction; the paper's HPCSM in percent"),
-)
-
+TEXT = Template.of("nomenclature.md")
 _WORDS = {"inductive": "R-L", "capacitive": "R-C", "constant_power": "constant-power"}
 _LOADS = {kind: _WORDS.get(kind, kind) for c in LOADS.classes for kind in c.examples()}
 _FAULTS: dict[str | None, str] = {None: "no"}
@@ -106,11 +68,8 @@ def _variants(generator: Generator) -> dict[Variant, Any]:
 def _condition(where: set[Variant], every: set[Variant]) -> str:
     """Say in as few words as possible in which variants something appears; "" for all."""
     words = []
-    axes: tuple[tuple[Mapping[Any, str], str], ...] = (
-        (_LOADS, "load"),
-        (_FAULTS, "fault"),
-        (_NEUTRALS, "neutral"),
-    )
+    axes: list[tuple[Mapping[Any, str], str]] = [(_LOADS, "load"), (_FAULTS, "fault")]
+    axes.append((_NEUTRALS, "neutral"))
     for k, (names, noun) in enumerate(axes):
         values = {v[k] for v in where}
         said = [text for key, text in names.items() if key in values]
@@ -132,9 +91,7 @@ def _vectors(models: Mapping[Variant, Any], vector: str) -> str:
             union.setdefault(s.name, s)
             where.setdefault(s.name, set()).add(variant)
     every = set(models)
-    rows = [
-        (f"`{n}`", s.unit, s.doc, _condition(where[n], every)) for n, s in union.items()
-    ]  # fmt: skip
+    rows = [(f"`{n}`", s.unit, s.doc, _condition(where[n], every)) for n, s in union.items()]
     return table(("name", "unit", "meaning", "only with"), rows)
 
 
@@ -157,14 +114,19 @@ def _choices(apu: Apu) -> str:
     return table(("name", "value"), rows)
 
 
+def _listed(block: str, head: str, form: str = "`{}`") -> str:
+    """Return a block of two columns as a table."""
+    rows = (row.split(" | ") for row in TEXT.raw(block).splitlines())
+    meaning = "place" if block == "stations" else "meaning"
+    return table((head, meaning), ((form.format(a), b) for a, b in rows))
+
+
 def page() -> str:
     """Return the whole page as Markdown."""
     apu = Apu()
     models = _variants(apu.generator)
     known = {s.name for s in GasGenerator.Y}
-    channels = [
-        (f"`{n}`", unit, doc) for n, (unit, doc) in CHANNELS.items() if n not in known
-    ]  # fmt: skip
+    channels = [(f"`{n}`", *of) for n, of in CHANNELS.items() if n not in known]
     sets = {
         "gas_generator": ("Gas generator, design data", apu.gas_generator.parameters),
         "compressor_map": ("Compressor map", apu.gas_generator.compressor_map.calibration),
@@ -174,58 +136,21 @@ def page() -> str:
         "governor": ("Governor", apu.governor),
         "coupling": ("Gearbox", apu.coupling),
     }
-    parts = [
-        "# Names",
-        "This page is made from the code by `python -m scenarios.pages.nomenclature >"
-        " docs/NOMENCLATURE.md`. Change a name, unit or source there, where it is declared, and"
-        " write the page again.",
-        "Units are SI without prefix; `1` marks fractions and ratios. A quantity in another unit"
-        " carries the unit in its name (`N_rpm`, `P3_kPa`) and appears only in files, tables and"
-        " plots. Symbols follow ARP 755 for stations and the paper (Mao and Guo) elsewhere. Numbers"
-        " in parentheses are the paper's equations.",
-        "## Stations",
-        table(("number", "place"), STATIONS),
-        "## Letters",
-        table(("symbol", "meaning"), ((f"`{a}`", b) for a, b in LETTERS)),
-        "## Clashes settled",
-        table(("name", "meaning"), ((f"`{a}`", b) for a, b in CLASHES)),
-        "## Gas generator",
-        "### States `GasGenerator.X`",
-        _signals(GasGenerator.X),
-        "### Inputs `GasGenerator.U`",
-        _signals(GasGenerator.U),
-        "### Health factors `GasGenerator.THETA`",
-        _signals(GasGenerator.THETA),
-        "### Algebraic unknowns `GasGenerator.z`",
-        _signals(apu.gas_generator.z),
-        "### Outputs `GasGenerator.Y`",
-        _signals(GasGenerator.Y),
-        "## Starter/generator",
-        "The vectors depend on the load, the fault and the neutral;"
-        " `Generator.state_space(load_kind, faulted)` returns the variant. An empty last column"
-        " means: always.",
-        "### States `x`",
-        _vectors(models, "x"),
-        "### Algebraic unknowns `z`",
-        _vectors(models, "z"),
-        "### Inputs `u`",
-        _vectors(models, "u"),
-        "### Fault parameters `theta`",
-        _vectors(models, "theta"),
-        "### Outputs `y`",
-        _vectors(models, "y"),
-        "## Results of a joint run",
-        "The dataset holds the outputs of the gas generator on `time`, and some of the following."
-        " Measured copies carry `_meas`. Names of one generator are those of each of the two.",
-        table(("name", "unit", "meaning"), channels),
-        "## Parameters",
-        "The full name of a parameter is that of its set, a dot and its own: `machine.r_s`. A"
-        " scenario's `[parameters]` table and `Apu.change` take these names.",
-    ]
-    for key, (title, p) in sets.items():
-        parts += [f"### {title}: `{key}`", _parameters(p)]
-    parts += ["### Choices", _choices(apu)]
-    return "\n\n".join(parts) + "\n"
+    parameters = [f"### {head}: `{key}`\n\n{_parameters(p)}" for key, (head, p) in sets.items()]
+    vectors = {"X": GasGenerator.X, "U": GasGenerator.U, "THETA": GasGenerator.THETA}
+    vectors |= {"z": apu.gas_generator.z, "Y": GasGenerator.Y}
+    text = TEXT.text(
+        "top",
+        stations=_listed("stations", "number", "{}"),
+        letters=_listed("letters", "symbol"),
+        clashes=_listed("clashes", "name"),
+        vectors={v: _vectors(models, v) for v in ("x", "z", "u", "theta", "y")},
+        channels=table(("name", "unit", "meaning"), channels),
+        parameters="\n\n".join(parameters),
+        choices=_choices(apu),
+        **{name: _signals(signals) for name, signals in vectors.items()},
+    )
+    return text + "\n"
 
 
 if __name__ == "__main__":

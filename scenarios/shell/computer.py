@@ -16,7 +16,8 @@ PACKAGES = ("apu-casadi", "casadi", "numpy", "scipy", "xarray")
 
 def machine() -> dict[str, Any]:
     """Return cores, processor, versions, backend, and how busy the machine is."""
-    from apu_casadi.core.backend import available_threads, backend_in_use
+    from apu_casadi.core.backend import backend_in_use
+    from apu_casadi.core.calling import available_threads
 
     model = platform.processor() or platform.machine()
     try:
@@ -33,7 +34,5 @@ def machine() -> dict[str, Any]:
         except PackageNotFoundError:
             versions[p] = "from its folder"
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else math.nan
-    return {
-        "processor": model, "cores": available_threads(), "system": platform.system(),
-        "backend": backend_in_use(), "load_before": round(load, 2), "versions": versions,
-    }  # fmt: skip
+    made = {"processor": model, "cores": available_threads(), "system": platform.system()}
+    return made | {"backend": backend_in_use(), "load_before": round(load, 2), "versions": versions}

@@ -85,8 +85,8 @@ def locked(
 
 def _open(path: Path) -> IO[bytes]:
     try:
-        return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666),
-                         "r+b", buffering=0)  # fmt: skip
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        return os.fdopen(os.open(path, flags, 0o666), "r+b", buffering=0)
     except OSError as e:
         raise DataError(f"{path}: cannot be written: {e.strerror or e}") from None
 
@@ -106,10 +106,8 @@ def _try_lock(f: IO[bytes], path: Path) -> bool:
     except OSError as e:
         if e.errno in _BUSY:
             return False
-        _log.warning(
-            "%s: no locks on this file system (%s); see to it that no other process works in "
-            "this folder", path, e.strerror or e,
-        )  # fmt: skip
+        why = "see to it that no other process works in this folder"
+        _log.warning("%s: no locks on this file system (%s); %s", path, e.strerror or e, why)
     return True
 
 

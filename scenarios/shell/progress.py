@@ -6,6 +6,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 def tell(text: str, *, quiet: bool = False) -> None:
@@ -20,23 +21,35 @@ def tell(text: str, *, quiet: bool = False) -> None:
 
 
 Progress = Callable[[float, float], None]
+_SECONDS = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:g} s simulated [{elapsed}<{remaining}]"
 
 
 @contextmanager
-def bar(name: str, total: float, *, show: bool) -> Iterator[Progress]:
-    """Yield a callback that moves a progress bar on stderr, or does nothing."""
+def moving(name: str, total: float, *, show: bool, **how: Any) -> Iterator[Any]:
+    """Yield a bar of tqdm on stderr, not wider than 100 columns; None if it is not to be shown."""
     if not show:
-        yield lambda done, total: None
+        yield None
         return
     from tqdm import tqdm
 
-    form = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:g} s simulated [{elapsed}<{remaining}]"
     columns = min(shutil.get_terminal_size((80, 24)).columns, 100)
-    with tqdm(
-        total=total, desc=name, bar_format=form, ncols=columns, nrows=24, file=sys.stderr
-    ) as moved:
+    with tqdm(total=total, desc=name, ncols=columns, nrows=24, file=sys.stderr, **how) as bar:
+        yield bar
+
+
+@contextmanager
+def bar(name: str, total: float, *, show: bool, **how: Any) -> Iterator[Progress]:
+    """Yield a callback that moves a progress bar on stderr, or does nothing.
+
+    Args:
+        name: what stands before it.
+        total: end of the bar; seconds that are simulated, unless ``unit`` is given.
+        how: arguments of tqdm instead.
+    """
+    with moving(name, total, show=show, **(how or {"bar_format": _SECONDS})) as moved:
 
         def progress(done: float, _: float) -> None:
-            moved.update(min(done, total) - moved.n)
+            if moved is not None:
+                moved.update(min(done, total) - moved.n)
 
         yield progress

@@ -87,10 +87,8 @@ def explain(e: Exception, *, program: bool) -> tuple[str, int] | None:
     frames = traceback.extract_tb(e.__traceback__)
     ours = [f for f in frames if Path(f.filename).is_relative_to(ROOT)] or frames
     at = f"{Path(ours[-1].filename).name}, line {ours[-1].lineno}"
-    return (
-        f"{type(e).__name__}: {one_line(e)} ({at}): a fault of this program; please report it, "
-        "with what APU_TRACEBACK=1 shows", 1,
-    )  # fmt: skip
+    ask = "a fault of this program; please report it, with what APU_TRACEBACK=1 shows"
+    return f"{type(e).__name__}: {one_line(e)} ({at}): {ask}", 1
 
 
 def _system(e: OSError) -> str:

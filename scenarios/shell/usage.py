@@ -6,7 +6,8 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from apu_casadi.core.errors import ScenarioError, nearest
@@ -66,12 +67,74 @@ def count(option: str, value: int | None, *, least: int = 1, most: int = 1_000_0
         raise ScenarioError(f"{option} must be {least} to {most}, got {value}")
 
 
+def declare(parser: argparse.ArgumentParser, table: str) -> None:
+    """Declare the options of a table, one a line: what it is, a bar, its help.
+
+    Left of the bar stand, separated by blanks, the flags (or the name of an argument), and any of:
+    a metavar; ``int`` or ``float``; ``{a,b}``, the choices; ``=VALUE``, the default; ``?`` or
+    ``+``, how many; ``...``, may be given again; ``>name``, the attribute.  An option without
+    metavar and type is a switch, with ``=on`` one that ``--no-...`` turns off.  A line that begins
+    with the bar continues the help above it.
+    """
+    rows: list[tuple[str, str]] = []
+    for line in table.strip().splitlines():
+        what, _, text = (part.strip() for part in f" {line.strip()}".partition(" | "))
+        rows.append((what, text) if what else (rows[-1][0], f"{rows.pop()[1]} {text}"))
+    for what, text in rows:
+        flags, options = _option(what.split())
+        parser.add_argument(*flags, **options, help=text)
+
+
+def part(text: str) -> float | dict[str, Any]:
+    """Return a finite number, or a table of ``key = value`` with commas between, as TOML has it."""
+    if "=" not in text:
+        return finite(text)
+    try:
+        return tomllib.loads(f"part = {{ {text.strip().strip('{}')} }}")["part"]
+    except tomllib.TOMLDecodeError as e:
+        raise argparse.ArgumentTypeError(f"'key = value, ...' is expected ({e})") from None
+
+
+_TYPES: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "part": part}
+
+
+_ON = {"action": argparse.BooleanOptionalAction, "default": True}
+
+
+def _option(words: list[str]) -> tuple[list[str], dict[str, Any]]:
+    """Return flags and keywords of ``add_argument`` from the left side of a line."""
+    flags, options = [words[0]], dict[str, Any]()
+    for word in words[1:]:
+        if word.startswith("-"):
+            flags.append(word)
+        elif word in _TYPES:
+            options["type"] = _TYPES[word]
+        elif word == "...":
+            options |= {"action": "append", "default": []}
+        elif word in ("?", "+"):
+            options["nargs"] = word
+        elif word[0] == "=":
+            options["default"] = word[1:]
+        elif word[0] == ">":
+            options["dest"] = word[1:]
+        elif word[0] == "{" and word[-1] == "}":
+            options["choices"] = tuple(word[1:-1].split(","))
+        else:
+            options["metavar"] = word
+    if flags[0].startswith("-") and not {"metavar", "type", "choices"} & set(options):
+        on = options.get("default") == "on"
+        options |= _ON if on else {"action": "store_true"}
+    if "default" in options and "type" in options:
+        options["default"] = options["type"](options["default"])
+    return flags, options
+
+
 class ShowVersion(argparse.Action):
     """Print the installed version; looked up only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         """Print it and end the command."""
-        from importlib.metadata import version
+        from apu_casadi.core.version import installed
 
-        print(f"apu-casadi {version('apu-casadi')}")
+        print(f"apu-casadi {installed()}")
         parser.exit()

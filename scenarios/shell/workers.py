@@ -20,10 +20,10 @@ from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
 
-THREADS = (
-    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-)  # fmt: skip
+from apu_casadi.core import interrupts
+
+_LIBRARIES = "OMP OPENBLAS MKL NUMEXPR"
+THREADS = (*(f"{n}_NUM_THREADS" for n in _LIBRARIES.split()), "VECLIB_MAXIMUM_THREADS")
 _PR_SET_PDEATHSIG = 1
 
 
@@ -104,18 +104,14 @@ def stoppable() -> Iterator[Callable[[], None]]:
     turned the first one into an error of its own.  A signal that is ignored stays so, a handler
     of the caller's own is called first, and outside the main thread nothing changes.
     """
-    asked = threading.Event()
     before: dict[int, Any] = {}
+    outermost = not interrupts.owned()
 
     def handler(number: int, frame: FrameType | None) -> None:
-        asked.set()
+        interrupts.record(number)
         if callable(before[number]):
             before[number](number, frame)
         raise KeyboardInterrupt
-
-    def check() -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -123,8 +119,13 @@ def stoppable() -> Iterator[Callable[[], None]]:
             if callable(old) or old == signal.SIG_DFL:
                 before[number] = old
                 signal.signal(number, handler)
+        if before:
+            interrupts.own(True)
     try:
-        yield check
+        yield interrupts.check
     finally:
         for n, handled in before.items():
             signal.signal(n, handled)
+        if outermost and before:
+            interrupts.own(False)
+            interrupts.clear()

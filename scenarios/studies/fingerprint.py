@@ -1,80 +1,33 @@
-"""With which filters a study's numbers were made: a digest of their equations.
+"""What a study's numbers depend on: the constants of modules, and the equations of its filters.
 
-It is taken of the functions themselves, as CasADi writes them down: comments, names of Python and
-the place of code do not change it; an operation, a constant or a default of the filters does.  What
-a study draws, and how it scores, is outside.  Digests of two versions of CasADi cannot be compared.
+The equations are taken of the functions themselves, as CasADi writes them down: comments, names of
+Python and the place of code do not change their digest; an operation, a constant or a default of
+the filters does.  What a study draws, and how it scores, is outside.  Digests of two versions of
+CasADi cannot be compared.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import json
+import re
 from collections.abc import Callable, Sequence
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import Any
 
 import casadi as ca
 
 from apu_casadi.core.sharing import once
 
-__all__ = ["FUNCTIONS", "digest", "digest_of"]
+__all__ = ["constants", "digest", "digest_of"]
+
+TESTS = ("JUMP_TEST", "TEST", "DEFAULT", "SNAPSHOT")
+"""Constants that are dataclasses: what a test of jumps, or a protocol, is made of."""
 
 
-def _linear() -> list[ca.Function]:
-    from estimators.filters.ekf import ekf_step
-    from estimators.filters.ukf import ukf_step
-    from scenarios.studies.correctness import linear_model
-
-    return [f(linear_model()).function for f in (ekf_step, ukf_step)]
-
-
-def _electrical() -> list[ca.Function]:
-    from estimators.apu.electrical.electricalfilter import GAINS, electrical_filter
-    from estimators.filters.ekf import ekf_step
-
-    return [ekf_step(electrical_filter(gains=g).model).function for g in GAINS]
-
-
-def _gas_path() -> list[ca.Function]:
-    from estimators.apu.gaspath import ITERATED, ITERATIONS, gas_path_filter
-    from estimators.filters.ekf import ekf_step
-    from scenarios.studies.gaspath_study import ETA_SIGMA
-
-    filters = (gas_path_filter(), gas_path_filter(eta=ETA_SIGMA, consider_eta=False))
-    return [ekf_step(f.model, ITERATIONS, ITERATED).function for f in filters]
-
-
-def _both() -> list[ca.Function]:
-    return [*_electrical(), *_gas_path()]
-
-
-def _isolation() -> list[ca.Function]:
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.isolation.windowmodel import jump_model
-    from estimators.filters.ekf import ekf_step
-
-    return [ekf_step(jump_model(GasGenerator())).function]
-
-
-def _fitting() -> list[ca.Function]:
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.fitting import OUTPUTS, engine_model
-
-    return [engine_model(GasGenerator(), OUTPUTS, steady=s).stage for s in (True, False)]
-
-
-FUNCTIONS: dict[str, Callable[[], list[ca.Function]]] = {
-    "correctness": _linear,
-    "electrical": _electrical,
-    "detection": _electrical,
-    "gaspath": _gas_path,
-    "shaft-power": _gas_path,
-    "isolation": _isolation,
-    "fitting": _fitting,
-    "joint": _both,
-    "speed": _both,
-}
-"""What makes the filters of each study, by its name."""
-
-
-def digest_of(functions: Sequence[ca.Function]) -> str:
+def digest(functions: Sequence[ca.Function]) -> str:
     """Return the digest of functions, twelve characters: that of all they are made of."""
     h = hashlib.sha256()
     for f in functions:
@@ -83,6 +36,30 @@ def digest_of(functions: Sequence[ca.Function]) -> str:
 
 
 @once
-def digest(study: str) -> str:
-    """Return the digest of a study's filters as the code makes them now; a second or two."""
-    return digest_of(FUNCTIONS[study]())
+def digest_of(filters: Callable[[], list[ca.Function]]) -> str:
+    """Return the digest of the functions that ``filters`` makes; a second or two."""
+    return digest(filters())
+
+
+def constants(*modules: str) -> dict[str, Any]:
+    """Return the constants in capitals that JSON can hold, of modules and of packages' modules."""
+    names: list[str] = []
+    for module in modules:
+        inner = iter_modules(getattr(import_module(module), "__path__", []), f"{module}.")
+        names += [module, *(m.name for m in inner)]
+    found: dict[str, Any] = {}
+    for space in (vars(import_module(name)) for name in names):
+        for name, value in space.items():
+            if re.fullmatch(r"[A-Z][A-Z0-9_]*", name):
+                try:
+                    json.dumps(value, allow_nan=False)
+                except (TypeError, ValueError):
+                    continue
+                found[name] = value
+        for name in TESTS:
+            value = space.get(name)
+            if dataclasses.is_dataclass(value) and not isinstance(value, type):
+                fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+                kinds = int | float | str | tuple
+                found[name] = {k: v for k, v in fields.items() if isinstance(v, kinds)}
+    return found

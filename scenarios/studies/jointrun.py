@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,28 +19,100 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.sharing import last
+from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
-from estimators.apu.electrical.terminalsignals import PHASES
-from estimators.apu.gaspath import DT, HEALTH
+from estimators.apu.gaspathmodel import DT, HEALTH
 from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
+from estimators.apu.sensors import gas_path_table
 from scenarios import registry
+from scenarios.schema import Scenario
+from scenarios.shell.template import Template
+from scenarios.studies.registration import series
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import xarray as xr
 
-    from scenarios.schema import Scenario
-
 __all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
 
+TEXT = Template("""
+@made
+Ambient {day}; load of each generator {loads}; truth by {solver}, exchange {exchange} every {ms:g}
+ms; apu-casadi {version}.
+
+@none
+No short circuit happened and none was reported.
+
+@none falsely
+No short circuit happened, but {n} samples of 20 ms report one.
+
+@short circuit
+The short circuit in phase {true_phase} at {onset:g} s {when}; {before}
+
+@at once
+was reported {ms:.0f} ms later, at the next sample of 20 ms
+
+@later
+was reported {ms:.0f} ms later
+
+@not found
+was not found
+
+@before
+none was reported before it.
+
+@before falsely
+before it {n} samples report one that is not there.
+
+@severity
+Its severity is h = {h:.4e} +- {half_width:.1e} (true {h_true:.4e}). More the terminals do not tell:
+with full coupling mu and k_rf act through h alone, so every pair on the ridge mu = h (1 + k_rf)/(1
++ h) fits equally well, such as (mu, k_rf) = {pairs}.
+
+@change found
+The change of gas-path health at {onset:g} s was reported {ms:.0f} ms later.
+
+@change missed
+The change of gas-path health at {onset:g} s was not reported.
+
+@other
+A change of health that is not there was reported at {times} s.
+
+@no other
+No other change of health was reported.
+
+@unmoved
+The short circuit moved no estimated health factor by more than 1 sigma within {seconds:.2g} s
+({name} most, {change:+.2f} % where 1 sigma is {sigma:.2f} %): its loss is explained by h, not by
+the gas path.
+
+@moved
+The short circuit moved the estimated {name} by {change:+.2f} % within {seconds:.2g} s, more than
+its 1 sigma of {sigma:.2f} %.
+
+@h moved
+The change of health at {onset:g} s moved {name} by {of_n:+.1e} within {seconds:.2g} s (1 sigma is
+{sigma_n:.1e}).
+
+@caption
+Scenario {scenario}, seed {seed}; gain errors drawn for all sensors.
+""")
 FINE = 0.005  # s; exchange step of the truth
 WAVEFORM = 1e-4  # s; sampling of the electrical sensors
 Z95 = 1.96
-HEALTH_WORDS = {
-    "f_eta_c": "compressor efficiency", "f_W_c": "compressor flow",
-    "f_eta_t": "turbine efficiency", "f_W_t": "turbine flow",
-}  # fmt: skip
+_TOLD = (
+    "ambient",
+    "loads",
+    "faults",
+    "apu_casadi_version",
+    "exchange_error",
+    "validity",
+    "warnings",
+)
+"""What an estimate takes over from the truth, as it was recorded."""
+_PLACES = ("compressor efficiency", "compressor flow", "turbine efficiency", "turbine flow")
+HEALTH_WORDS = dict(zip(HEALTH, _PLACES, strict=True))
 SHOWN = ("N", *HEALTH, "h_a", "h_b", "h_c", "P_total")
 
 
@@ -76,11 +149,12 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
         )
     if s.duration < 3 * DT:
         raise ScenarioError(f"{s.name}: {s.duration:g} s are too short to estimate anything in")
+    given: dict[str, Any] = {**s.start(), "ambient": s.ambient, "events": s.events()}
+    fine: dict[str, Any] = {"dt": FINE, "exchange": "corrected", "waveform_dt": WAVEFORM}
+    fine["solver"] = "cvodes"
     ds = simulate_joint(
-        registry.unit_of(json.dumps(dict(s.parameters), sort_keys=True)),
-        duration=s.duration, **s.start(), ambient=s.ambient, events=s.events(), dt=FINE,
-        exchange="corrected", waveform_dt=WAVEFORM, progress=progress,
-    )  # fmt: skip
+        registry.unit_for(s), duration=s.duration, progress=progress, **given, **fine
+    )
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     return ds
@@ -96,22 +170,32 @@ def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
     """
     case = joint_case(seed)
     s = json.loads(ds.attrs["scenario"])
-    unit = registry.unit_of(json.dumps(s.get("parameters", {}), sort_keys=True))
-    found = estimate_joint(
-        ds, seed, apu=unit, gas_gains=case.gas_gains, electrical_gains=case.electrical_gains,
-        **options,
-    )  # fmt: skip
-    found.attrs |= {
-        "scenario": ds.attrs["scenario"], "phases": ds.attrs["phases"], "seed": seed,
-        "gas_gains": json.dumps(case.gas_gains),
-        "electrical_gains": json.dumps(case.electrical_gains),
-    }  # fmt: skip
-    told = ("ambient", "loads", "faults", "solver", "apu_casadi_version", "exchange_error",
-            "validity", "warnings")  # fmt: skip
-    found.attrs |= {
-        f"truth_{n}" if n == "solver" else n: ds.attrs[n] for n in told if n in ds.attrs
-    }
+    unit = registry.unit_for(Scenario.from_dict(s))
+    options.setdefault("gas_sensors", gas_path_table())
+    gains: dict[str, Any] = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
+    found = estimate_joint(ds, seed, apu=unit, **gains, **options)
+    found.attrs |= {n: json.dumps(v) for n, v in gains.items()} | {"seed": seed}
+    found.attrs |= {n: ds.attrs[n] for n in ("scenario", "phases")}
+    found.attrs |= {n: ds.attrs[n] for n in (*_TOLD, "apu_casadi_version") if n in ds.attrs}
+    if "solver" in ds.attrs:
+        found.attrs["truth_solver"] = ds.attrs["solver"]
     return found
+
+
+def joint_seconds(scenario: str = "joint", repeat: int = 3, seed: int = 1) -> dict[str, Any]:
+    """Time the joint estimation of a scenario on one core; compiled before, fastest of some.
+
+    Returns:
+        ``seconds`` of measuring and estimating, and ``simulated`` seconds.
+    """
+    ds = truth(scenario)
+    best = math.inf
+    estimate(ds, seed)  # compiles
+    for _ in range(repeat):
+        began = time.perf_counter()
+        estimate(ds, seed)
+        best = min(best, time.perf_counter() - began)
+    return {"seconds": best, "simulated": float(ds["time"].values[-1])}
 
 
 # ------------------------------------------------------------------------------ what it says
@@ -151,25 +235,22 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         for n in SHOWN:
             x, true = (float(e[f"{n}{end}"].values[k]) for end in ("", "_true"))
             s = float(_sigma(e, n)[k])
-            values[n] = {"true": true, "estimate": x, "half_width": Z95 * s,
-                         "inside": bool(abs(x - true) <= Z95 * s)}  # fmt: skip
+            inside = bool(abs(x - true) <= Z95 * s)
+            values[n] = {"true": true, "estimate": x, "half_width": Z95 * s, "inside": inside}
         found = int(e["faulty_phase"].values[k])
-        rows.append({
-            "name": p["name"], "start": p["start"], "end": p["end"], "values": values,
-            "faulty_phase": PHASES[found - 1] if found else None,
-        })  # fmt: skip
-    return {
-        "scenario": scenario["name"], "title": scenario.get("title", ""), "seed": e.attrs["seed"],
-        **made_with(e), "phases": rows, "short_circuit": _short_circuit(e), "health": _health(e),
-        "cross_talk": _cross_talk(e),
-    }  # fmt: skip
+        place = {n: p[n] for n in ("name", "start", "end")}
+        phase = PHASES[found - 1] if found else None
+        rows.append({**place, "values": values, "faulty_phase": phase})
+    about = {"scenario": scenario["name"], "title": scenario.get("title", "")}
+    found_out = {"short_circuit": _short_circuit(e), "health": _health(e)}
+    out = {**about, "seed": e.attrs["seed"], **made_with(e), "phases": rows, **found_out}
+    return {**out, "cross_talk": _cross_talk(e)}
 
 
 def made_with(e: xr.Dataset) -> dict[str, Any]:
     """Return what the truth was simulated with and what must be known of it, ready for JSON."""
-    told = {"ambient": "ambient", "loads": "loads", "validity": "validity", "warnings": "warnings",
-            "truth_solver": "truth_solver"}  # fmt: skip
-    out: dict[str, Any] = {k: json.loads(e.attrs.get(a, "null")) for k, a in told.items()}
+    told = ("ambient", "loads", "validity", "warnings", "truth_solver")
+    out: dict[str, Any] = {k: json.loads(e.attrs.get(k, "null")) for k in told}
     return out | {"apu_casadi_version": e.attrs.get("apu_casadi_version", "")}
 
 
@@ -180,12 +261,10 @@ def made_words(r: Mapping[str, Any]) -> str:
     if not (r.get("ambient") and r.get("loads")):
         return ""
     loads = ", ".join(f"{x['load']} from {x['t']:g} s" for x in r["loads"])
-    made_by = r.get("truth_solver") or {}
-    return (
-        f"Ambient {day_words(r['ambient'])}; load of each generator {loads}; truth by "
-        f"{made_by.get('solver')}, exchange {made_by.get('exchange')} every "
-        f"{1e3 * made_by.get('dt', 0.0):g} ms; apu-casadi {r['apu_casadi_version']}."
-    )
+    by = {"solver": None, "exchange": None, "dt": 0.0} | (r.get("truth_solver") or {})
+    version = r["apu_casadi_version"]
+    values = {"solver": str(by["solver"]), "exchange": str(by["exchange"]), "ms": 1e3 * by["dt"]}
+    return TEXT.text("made", day=day_words(r["ambient"]), loads=loads, version=version, **values)
 
 
 def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:
@@ -211,14 +290,13 @@ def _short_circuit(e: xr.Dataset) -> dict[str, Any] | None:
     onset = float(t[max(first - 1, 0)]) if first else float(t[0])
     right = np.flatnonzero(said[first:] == i + 1)
     x, s = (float(e[f"h_{PHASES[i]}{end}"].values[-1]) for end in ("", "_sigma"))
-    return out | {
-        "true_phase": PHASES[i], "onset": onset,
-        "found_after": float(t[first + right[0]] - onset) if right.size else None,
-        "false_reports": int(np.count_nonzero(said[:first])),
-        "wrong_phase_samples": int(np.count_nonzero((said[first:] != i + 1) & (said[first:] > 0))),
-        "h": x, "half_width": Z95 * s, "h_true": float(true[i, -1]),
-        "ridge": ridge(x) if x > 0 else [],
-    }  # fmt: skip
+    wrong = (said[first:] != i + 1) & (said[first:] > 0)
+    out |= {"true_phase": PHASES[i], "onset": onset}
+    out["found_after"] = float(t[first + right[0]] - onset) if right.size else None
+    out["false_reports"] = int(np.count_nonzero(said[:first]))
+    out["wrong_phase_samples"] = int(np.count_nonzero(wrong))
+    severity = {"h": x, "half_width": Z95 * s, "h_true": float(true[i, -1])}
+    return {**out, **severity, "ridge": ridge(x) if x > 0 else []}
 
 
 def _health(e: xr.Dataset) -> dict[str, Any]:
@@ -252,11 +330,10 @@ def _cross_talk(e: xr.Dataset) -> dict[str, Any]:
                 continue
             later = [j - 1 for j in every if j > k]
             before, after = k - 1, min([_at(t, t[k] + 1.0), *later])
-            out[key].append({
-                "onset": float(t[before]), "seconds": float(t[after] - t[before]),
-                "change": {n: float(e[n].values[after] - e[n].values[before]) for n in effect},
-                "sigma": {n: float(e[f"{n}_sigma"].values[after]) for n in effect},
-            })  # fmt: skip
+            row = {"onset": float(t[before]), "seconds": float(t[after] - t[before])}
+            change = {n: float(e[n].values[after] - e[n].values[before]) for n in effect}
+            sigma = {n: float(e[f"{n}_sigma"].values[after]) for n in effect}
+            out[key].append({**row, "change": change, "sigma": sigma})
     return out
 
 
@@ -296,83 +373,50 @@ def table(r: Mapping[str, Any]) -> str:
 
 def words(r: Mapping[str, Any]) -> list[str]:
     """Return what was found, in sentences."""
-    out = []
-    s = r["short_circuit"]
-    if s["true_phase"] is None:
-        n = s["false_reports"]
-        out.append(
-            "No short circuit happened and none was reported." if not n else
-            f"No short circuit happened, but {n} samples of 20 ms report one."
-        )  # fmt: skip
-    else:
-        when = (
-            f"was reported {1e3 * s['found_after']:.0f} ms later, at the next sample of 20 ms"
-            if s["found_after"] is not None and s["found_after"] <= DT + 1e-9 else
-            f"was reported {1e3 * s['found_after']:.0f} ms later" if s["found_after"] is not None
-            else "was not found"
-        )  # fmt: skip
-        false = s["false_reports"]
-        out.append(
-            f"The short circuit in phase {s['true_phase']} at {s['onset']:g} s {when}; "
-            + ("none was reported before it." if not false else
-               f"before it {false} samples report one that is not there.")
-        )  # fmt: skip
-        if s["ridge"]:
-            pairs = ", ".join(f"({p['mu']:.3g}, {p['k_rf']:g})" for p in s["ridge"])
-            out.append(
-                f"Its severity is h = {s['h']:.4e} +- {s['half_width']:.1e} (true "
-                f"{s['h_true']:.4e}). More the terminals do not tell: with full coupling mu and "
-                "k_rf act through h alone, so every pair on the ridge mu = h (1 + k_rf)/(1 + h) "
-                f"fits equally well, such as (mu, k_rf) = {pairs}."
-            )
-    for c in r["health"]["changes"]:
+    health, talk = r["health"], r["cross_talk"]
+    out = _short_circuit_words(r["short_circuit"])
+    for c in health["changes"]:
         late = c["found_after"]
-        out.append(
-            f"The change of gas-path health at {c['onset']:g} s "
-            + ("was not reported." if late is None else f"was reported {1e3 * late:.0f} ms later.")
-        )
-    other = r["health"]["other_alarms"]
-    if other:
-        out.append(
-            "A change of health that is not there was reported at "
-            + ", ".join(f"{a:g}" for a in other) + " s."
-        )  # fmt: skip
-    elif r["health"]["changes"]:
-        out.append("No other change of health was reported.")
-    for c in r["cross_talk"]["short_circuit_on_health"]:
+        block = "change missed" if late is None else "change found"
+        out.append(TEXT.text(block, onset=c["onset"], ms=1e3 * (late or 0.0)))
+    if health["other_alarms"]:
+        out.append(TEXT.text("other", times=", ".join(f"{a:g}" for a in health["other_alarms"])))
+    elif health["changes"]:
+        out.append(TEXT.text("no other"))
+    for c in talk["short_circuit_on_health"]:
         n = max(HEALTH, key=lambda n: abs(c["change"][n]) / c["sigma"][n])
-        change, sigma = 100 * c["change"][n], 100 * c["sigma"][n]
-        within = f"within {c['seconds']:.2g} s"
-        out.append(
-            f"The short circuit moved no estimated health factor by more than 1 sigma {within} "
-            f"({HEALTH_WORDS[n]} most, {change:+.2f} % where 1 sigma is {sigma:.2f} %): its loss "
-            "is explained by h, not by the gas path."
-            if abs(change) < sigma else
-            f"The short circuit moved the estimated {HEALTH_WORDS[n]} by {change:+.2f} % {within}, "
-            f"more than its 1 sigma of {sigma:.2f} %."
-        )  # fmt: skip
-    for c in r["cross_talk"]["health_on_h"]:
+        values = {"change": 100 * c["change"][n], "sigma": 100 * c["sigma"][n]}
+        block = "unmoved" if abs(values["change"]) < values["sigma"] else "moved"
+        out.append(TEXT.text(block, name=HEALTH_WORDS[n], seconds=c["seconds"], **values))
+    for c in talk["health_on_h"]:
         n = max(c["change"], key=lambda n: abs(c["change"][n]))
-        out.append(
-            f"The change of health at {c['onset']:g} s moved {n} by {c['change'][n]:+.1e} within "
-            f"{c['seconds']:.2g} s (1 sigma is {c['sigma'][n]:.1e})."
-        )
+        out.append(TEXT.text("h moved", name=n, of_n=c["change"][n], sigma_n=c["sigma"][n], **c))
+    return out
+
+
+def _short_circuit_words(s: Mapping[str, Any]) -> list[str]:
+    false = s["false_reports"]
+    if s["true_phase"] is None:
+        return [TEXT.text("none falsely" if false else "none", n=false)]
+    late = s["found_after"]
+    when = "not found" if late is None else "at once" if late <= DT + 1e-9 else "later"
+    values = {"when": TEXT.text(when, ms=1e3 * (late or 0.0))}
+    values["before"] = TEXT.text("before falsely" if false else "before", n=false)
+    out = [TEXT.text("short circuit", **values, **s)]
+    if s["ridge"]:
+        pairs = ", ".join(f"({p['mu']:.3g}, {p['k_rf']:g})" for p in s["ridge"])
+        out.append(TEXT.text("severity", pairs=pairs, **s))
     return out
 
 
 def saved(e: xr.Dataset, every: int = 2) -> dict[str, Any]:
     """Return an estimate for JSON: the report, and every second sample for the figure."""
-    keep = slice(None, None, every)
-    return {
-        "report": report(e),
-        "t": e["time"].values[keep],
-        "curves": {
-            key: values[keep] for n in SHOWN for key, values in (
-                (n, e[n].values), (f"{n}_sigma", _sigma(e, n)), (f"{n}_true", e[f"{n}_true"].values)
-            )
-        },
-        "alarms": json.loads(e.attrs["alarms"]),
-    }  # fmt: skip
+    keep, curves = slice(None, None, every), {}
+    for n in SHOWN:
+        curves[n], curves[f"{n}_sigma"] = e[n].values[keep], _sigma(e, n)[keep]
+        curves[f"{n}_true"] = e[f"{n}_true"].values[keep]
+    t, alarms = e["time"].values[keep], json.loads(e.attrs["alarms"])
+    return {"report": report(e), "t": t, "curves": curves, "alarms": alarms}
 
 
 def draw(kept: Mapping[str, Any], path: Path, *, dpi: int | None = None) -> Path:
@@ -385,10 +429,7 @@ def figure(kept: Mapping[str, Any]) -> Any:
     from scenarios.figures.jointestimateplot import plot_joint_estimate
 
     r = kept["report"]
-    return plot_joint_estimate(
-        kept["t"],
-        {n: np.array([np.nan if x is None else x for x in v]) for n, v in kept["curves"].items()},
-        phases=[(p["name"], p["start"]) for p in r["phases"]], alarms=kept["alarms"],
-        note=f"Scenario {r['scenario']}, seed {r['seed']}; gain errors drawn for all sensors. "
-        + made_words(r),
-    )  # fmt: skip
+    curves = {n: series(v) for n, v in kept["curves"].items()}
+    phases = [(p["name"], p["start"]) for p in r["phases"]]
+    note = TEXT.text("caption", **r) + " " + made_words(r)
+    return plot_joint_estimate(kept["t"], curves, phases=phases, alarms=kept["alarms"], note=note)

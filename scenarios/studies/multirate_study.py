@@ -38,11 +38,13 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Event, FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.monolithic import simulate_monolithic
 from apu_casadi.unit.multirate import simulate_joint
-from scenarios.shell.markdown import fill, markdown_table
+from scenarios.shell.markdown import fill
+from scenarios.shell.template import Template
 
 if TYPE_CHECKING:
     import xarray as xr
 
+TEXT = Template.of("multirate.md")
 STEPS = (0.002, 0.005, 0.010, 0.020, 0.040, 0.080)
 """Exchange steps, s; the paper's is 20 ms."""
 PAPER_STEP = 0.020  # s
@@ -73,10 +75,8 @@ class Case:
         self, simulate: Callable[..., xr.Dataset], apu: Apu, *, duration: float, **options: Any
     ) -> xr.Dataset:
         """Simulate with either model."""
-        return simulate(
-            apu, duration=duration, load=self.load, health=self.health, events=[self.event],
-            **options,
-        )  # fmt: skip
+        start: dict[str, Any] = {"load": self.load, "health": self.health, "events": [self.event]}
+        return simulate(apu, duration=duration, **start, **options)
 
 
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)
@@ -140,14 +140,14 @@ def errors(ds: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
     }
 
 
-_SPLIT = ("predicted speed", "predicted fuel")
+SPLIT = ("predicted speed", "predicted fuel")
 
 
 def simulated(
     steps: Sequence[float] = STEPS, *, cases: int = len(CASES), exchanges: int = len(COMPARED)
 ) -> float:
     """Return the simulated time, s, of all runs of :func:`measure` with its other defaults."""
-    runs = exchanges * len(steps) + len(_SPLIT) + 2  # two: the truth, and the one model
+    runs = exchanges * len(steps) + len(SPLIT) + 2  # two: the truth, and the one model
     return cases * runs * DURATION
 
 
@@ -176,7 +176,7 @@ def measure(
     apu = apu or Apu()
     plan = [(ex, dt) for ex in exchanges for dt in steps]
     if contributions is not None:
-        plan += [(ex, contributions) for ex in _SPLIT]
+        plan += [(ex, contributions) for ex in SPLIT]
     total, done = len(cases) * (len(plan) + 2) * DURATION, 0.0  # two: truth and one model
 
     def tick(t: float, _: float) -> None:
@@ -195,7 +195,8 @@ def measure(
             options: dict[str, Any] = {"rtol": _RTOL, "progress": tick}
             if ex != "one model":
                 simulate = simulate_joint
-                options |= {"dt": dt, "exchange": ex, "waveform_dt": None, "warn_exchange": False}
+                options |= {"dt": dt, "exchange": ex, "waveform_dt": None, "solver": "cvodes"}
+                options["warn_exchange"] = False
             # build the integrators first: that is paid once, and is no part of the comparison
             case.run(simulate, apu, duration=T_EVENT + COMMON, **{**options, "progress": None})
             start = time.process_time()
@@ -240,25 +241,21 @@ def _faster(rows: Sequence[Measured], r: Measured) -> float:
     return one.cpu / r.cpu
 
 
-_HEAD = (
-    "exchange", "step [ms]", *QUANTITIES.values(), "speed, as the run estimates", "time [s]",
-    "times faster",
-)  # fmt: skip
-
-
-def _cells(rows: Sequence[Measured], case: str) -> list[tuple[str, ...]]:
-    """Rows of the table of one case, its orders included."""
-    cells: list[tuple[str, ...]] = []
+def _cells(rows: Sequence[Measured], case: str) -> list[dict[str, str]]:
+    """Return rows of the table of one case, its orders included."""
+    cells: list[dict[str, str]] = []
     for ex in dict.fromkeys(r.exchange for r in rows if r.case == case):
         group = select(rows, case, ex)
         for r in group:
             step = "-" if math.isnan(r.dt) else f"{1e3 * r.dt:g}"
-            numbers = (f"{getattr(r, q):.1e}" for q in QUANTITIES)
             own = "-" if math.isnan(r.estimate) else f"{r.estimate:.1e}"
-            cells.append((ex, step, *numbers, own, f"{r.cpu:.1f}", f"{_faster(rows, r):.1f}"))
+            about = {"exchange": ex, "step": step, "estimate": own, "cpu": f"{r.cpu:.1f}"}
+            numbers = {q: f"{getattr(r, q):.1e}" for q in QUANTITIES}
+            cells.append({**about, **numbers, "faster": f"{_faster(rows, r):.1f}"})
         if not math.isnan(order(group, "N")):
-            numbers = (f"{order(group, q):.2f}" for q in QUANTITIES)
-            cells.append((f"{ex}: order", "", *numbers, "", "", ""))
+            numbers = {q: f"{order(group, q):.2f}" for q in QUANTITIES}
+            nothing = dict.fromkeys(("step", "estimate", "cpu", "faster"), "")
+            cells.append({"exchange": f"{ex}: order", **nothing, **numbers})
     return cells
 
 
@@ -266,19 +263,18 @@ def table(rows: Sequence[Measured]) -> str:
     """Return the study as text."""
     lines = []
     for case in dict.fromkeys(r.case for r in rows):
-        body = [_HEAD, *_cells(rows, case)]
-        widths = [max(len(c[k]) for c in body) for k in range(len(_HEAD))]
+        body = TEXT.rows("case", _cells(rows, case))
+        widths = [max(len(c[k]) for c in body) for k in range(len(body[0]))]
         lines.append(f"\n{case}")
-        for row in body:
-            cells = [c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(
-                zip(row, widths, strict=True))]  # fmt: skip
-            lines.append("  " + "  ".join(cells).rstrip())
+        for first, *others in body:
+            padded = (c.rjust(w) for c, w in zip(others, widths[1:], strict=True))
+            lines.append("  " + "  ".join([first.ljust(widths[0]), *padded]).rstrip())
     return "\n".join(lines)
 
 
 def figure(rows: Sequence[Measured]) -> Any:
     """Draw errors over exchange step, a panel for each quantity; return a matplotlib Figure."""
-    from scenarios.figures import plotting
+    from scenarios.figures.exchangeplot import figure_exchange_error
 
     curves = {
         (case, ex): (
@@ -291,7 +287,7 @@ def figure(rows: Sequence[Measured]) -> Any:
     }
     if not curves:
         raise ScenarioError("nothing to draw: at least two exchange steps are needed")
-    return plotting.figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
+    return figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
 
 
 def write_figure(rows: Sequence[Measured], path: Path, dpi: float | None = None) -> Path:
@@ -331,7 +327,7 @@ def fault_words() -> str:
     event = CASES["TTSC fault"].event
     assert isinstance(event, FaultChange) and isinstance(event.fault, Ttsc)
     f = event.fault
-    return f"mu = {100 * f.mu:g} %, k_rf = {f.k_rf:g} (assumed), kappa = {f.kappa:g} = mu"
+    return TEXT.text("fault", percent=100 * f.mu, k_rf=f.k_rf, kappa=f.kappa)
 
 
 def _span(values: Sequence[float], form: str = ".1e") -> str:
@@ -342,72 +338,20 @@ def _span(values: Sequence[float], form: str = ".1e") -> str:
 def page(rows: Sequence[Measured]) -> str:
     """Return docs/MULTIRATE.md: one paragraph with the measured numbers, the figure, the tables."""
     cases = list(dict.fromkeys(r.case for r in rows))
-
-    def at(ex: str) -> list[Measured]:
-        return [r for r in rows if r.exchange == ex and abs(r.dt - PAPER_STEP) < 1e-9]
-
-    def percent(ex: str, q: str) -> str:
-        return _span([100 * getattr(r, q) for r in at(ex)], ".2g") + " %"
-
-    def orders(ex: str, q: str) -> str:
-        return _span([order(select(rows, c, ex), q) for c in cases if c != "TTSC fault"], ".1f")
-
-    def faster(ex: str) -> str:
-        return _span([_faster(rows, r) for r in at(ex)], ".0f")
-
-    one = [max(r.N, r.P, r.V, r.E) for r in rows if r.exchange == "one model"]
+    values: dict[str, Any] = {"faster": {}}
+    for ex in (*COMPARED, *SPLIT):
+        of = [r for r in rows if r.exchange == ex and abs(r.dt - PAPER_STEP) < 1e-9]
+        percent = {q: _span([100 * getattr(r, q) for r in of], ".2g") + " %" for q in QUANTITIES}
+        values[ex.replace(" ", "_")] = percent
+        values["faster"][ex] = _span([_faster(rows, r) for r in of], ".0f")
+    for ex in ("paper", "predicted"):
+        slopes = [order(select(rows, c, ex), "N") for c in cases if c != "TTSC fault"]
+        values[f"order_{ex}"] = _span(slopes, ".1f")
     mode = regulator_mode()
-    period = 1e3 / mode.frequency
-    text = f"""# What the multi-rate exchange loses, and what it saves
-
-Made by `apu multirate --page docs/MULTIRATE.md`; the numbers below are measured, not typed.
-
-Section 3 of the paper lets the machine run for 20 ms at the speed of the beginning of the step,
-hands its mean power to the gas generator, and argues that the error of the first "can be ignored"
-and that the second has none. Against the same unit as one model with one solver
-(`apu_casadi/unit/monolithic.py`) the second holds, energy being handed over exactly, and the first
-does not: at 20 ms the speed is wrong by {percent("paper", "N")} of its excursion after a load
-step, a gas-path fault and a stator fault, and the voltage by {percent("paper", "V")}, the power by
-{percent("paper", "P")} and the energy by {percent("paper", "E")} of their values. The error falls
-with the first power of the step (measured order of the speed {orders("paper", "N")}), since what
-is held is half a step late on average. The speed's error is that of the fuel held by the sampled
-governor: with the fuel alone taken at mid-step it is {percent("predicted fuel", "N")}, with the
-machine's speed alone predicted still {percent("predicted speed", "N")}. Power and voltage see the
-held speed directly, and its staircase meets the voltage regulator's own mode ({mode.frequency:.0f}
-Hz, damping ratio {mode.damping:.2f} at 100 kW) when the step is near the mode's period of
-{period:.0f} ms, which the paper's 20 ms is. `simulate_joint(..., exchange="predicted")` lets the
-speed go on with its last slope and takes the fuel of mid-step: at 20 ms the errors are
-{percent("predicted", "N")} (speed), {percent("predicted", "V")} (voltage), {
-        percent("predicted", "P")
-    } (power) and {percent("predicted", "E")} (energy), of measured order {
-        orders("predicted", "N")
-    } (speed), at the same price. `exchange="corrected"` computes each step twice:
-{percent("corrected", "N")}, {percent("corrected", "V")}, {percent("corrected", "P")} and
-{percent("corrected", "E")}. What the scheme saves is real: with 20 ms it runs {faster("paper")}
-times faster than the one model, {faster("predicted")} times with `"predicted"` and
-{faster("corrected")} times with `"corrected"`, all with a relative tolerance of {_RTOL:g}.
-
-![Error over exchange step](images/multirate_error.png)
-
-How it is measured. Each case starts steady, has its event at {T_EVENT:g} s and ends at
-{DURATION:g} s; the stator fault is {fault_words()}. All runs meet every {1e3 * COMMON:g} ms.
-Speed: largest error over the largest excursion of the true speed. Power and voltage: largest
-relative error of the mean, and of the three phases' rms value (from the mean output into the
-resistive load), over {1e3 * COMMON:g} ms. Energy:
-largest error of the energy taken since the event, over that energy. Order: least-squares slope
-over all steps; in the text, of load step and gas-path fault. Every run estimates its own speed
-error, without the one model (`apu_casadi/unit/validity.py`); it does so at every exchange instant,
-the study at those that all runs share. After the stator fault the better exchanges stop at an
-error of another kind: torque and so speed ripple at 800 Hz, and a governor sampled every 5, 10 or
-20 ms, whole multiples of the ripple's 1.25 ms, meets it always in the same phase and takes it for
-a speed error; a continuous governor, or one sampled every 2 ms, averages it. "One model" is the
-truth's own model at the tolerance of the other runs instead of a tenth of it: its error is at most
-{max(one):.0e}. Times are processor times of one run of {DURATION:g} s without the building of the
-integrators; they vary with the machine. The governor of the truth is continuous, so that its
-sampling counts as part of the scheme's error.
-"""
-    text = fill(text)
+    values |= {**mode._asdict(), "period": 1e3 / mode.frequency, "rtol": _RTOL}
+    values |= {"event": T_EVENT, "duration": DURATION, "common": 1e3 * COMMON}
+    values["one"] = max(max(r.N, r.P, r.V, r.E) for r in rows if r.exchange == "one model")
+    text = fill(TEXT.filled("page", fault=fault_words(), **values))
     for case in cases:
-        text += f"\n## {case[0].upper()}{case[1:]}\n\n"
-        text += markdown_table(_HEAD, _cells(rows, case), right=range(1, len(_HEAD))) + "\n"
+        text += f"\n## {case[0].upper()}{case[1:]}\n\n{TEXT.table('case', _cells(rows, case))}\n"
     return text

@@ -96,10 +96,9 @@ def run(
     fixed = asked.pop("fixed")
     few = min(points, 400)  # compile and load beforehand
     head = {k: v[:few] for k, v in asked.items() if k != "theta"}
-    trim_batch(
-        gg, {"N": fixed["N"], "PW": np.append(fixed["PW"][: few - 1], 1e9)}, n_threads=n_threads,
-        theta={k: v[:few] for k, v in asked["theta"].items()}, **head,
-    )  # fmt: skip
+    head["theta"] = {k: v[:few] for k, v in asked["theta"].items()}
+    first = {"N": fixed["N"], "PW": np.append(fixed["PW"][: few - 1], 1e9)}
+    trim_batch(gg, first, n_threads=n_threads, **head)
     t, c = time.perf_counter(), time.process_time()
     batch = trim_batch(gg, fixed, n_threads=n_threads, **asked)
     t, c = time.perf_counter() - t, time.process_time() - c
@@ -113,15 +112,15 @@ def run(
         at = np.flatnonzero(batch.status == s)
         if at.size and s != Status.SOLVED:
             examples[MEANING[s]] = batch.reason(int(at[0]))
-    return Report(
-        points=points, seed=seed, backend=backend.backend_in_use(), counts=batch.counts(),
-        cold=int(cold.sum()), continued=int((solved & ~cold).sum()),
-        iterations=float(batch.iterations[cold].mean()) if cold.any() else float("nan"),
-        wrong=int((residual[solved] > RESIDUAL_TOL).sum() + (~np.isfinite(residual[solved])).sum()),
-        worst=float(residual[solved].max(initial=0.0)), unexplained=unexplained, seconds=t, cpu=c,
-        threads=backend.available_threads() if n_threads is None else n_threads,
-        examples=examples,
-    )  # fmt: skip
+    left = residual[solved]
+    about: dict[str, Any] = {"points": points, "seed": seed, "counts": batch.counts()}
+    about |= {"cold": int(cold.sum()), "continued": int((solved & ~cold).sum())}
+    about["iterations"] = float(batch.iterations[cold].mean()) if cold.any() else float("nan")
+    about["wrong"] = int((left > RESIDUAL_TOL).sum() + (~np.isfinite(left)).sum())
+    about |= {"worst": float(left.max(initial=0.0)), "unexplained": unexplained}
+    about |= {"backend": backend.backend_in_use(), "seconds": t, "cpu": c, "examples": examples}
+    threads = backend.available_threads() if n_threads is None else n_threads
+    return Report(**about, threads=threads)
 
 
 def recheck(gg: GasGenerator, batch: TrimBatch) -> np.ndarray:
@@ -142,28 +141,26 @@ def recheck(gg: GasGenerator, batch: TrimBatch) -> np.ndarray:
 
 def table(r: Report) -> str:
     """Return the report as text."""
-    per = 100.0 / r.points
+    solved = r.counts["solved"]
+    refused = r.points - solved
+
+    def line(what: str, count: int, of: int | None = None, more: str = "") -> str:
+        share = f"{100.0 / r.points * (count if of is None else of):6.2f} %"
+        return f"  {what:<26}{count:7d}  {share}{more}"
+
     lines = [
         f"{r.points} random points, seed {r.seed}, backend {r.backend}, {r.threads} threads",
-        f"  solved                    {r.counts['solved']:7d}  {per * r.counts['solved']:6.2f} %",
-        f"    from a cold start       {r.cold:7d}  {per * r.cold:6.2f} %"
-        f"  ({r.iterations:.2f} Newton steps)",
-        f"    by continuation         {r.continued:7d}  {per * r.continued:6.2f} %",
+        line("solved", solved),
+        line("  from a cold start", r.cold, more=f"  ({r.iterations:.2f} Newton steps)"),
+        line("  by continuation", r.continued),
+        line("refused with a reason", refused - r.unexplained, refused),
     ]
-    refused = r.points - r.counts["solved"]
-    lines.append(
-        f"  refused with a reason     {refused - r.unexplained:7d}  {per * refused:6.2f} %"
-    )
-    lines += [
-        f"    {k:<24}{v:7d}  {per * v:6.2f} %"
-        for k, v in r.counts.items()
-        if v and k not in ("solved", MEANING[Status.UNEXPLAINED])
-    ]
+    apart = ("solved", MEANING[Status.UNEXPLAINED])
+    lines += [line(f"  {k}", v) for k, v in r.counts.items() if v and k not in apart]
+    wall, cpu = (1e6 * t / r.points for t in (r.seconds, r.cpu))
     lines += [
         f"  wrong (residual > 1e-9)   {r.wrong:7d}          (largest {r.worst:.1e})",
         f"  unexplained               {r.unexplained:7d}",
-        f"  time per point            {1e6 * r.seconds / r.points:7.1f} us wall, "
-        f"{1e6 * r.cpu / r.points:.1f} us processor",
+        f"  time per point            {wall:7.1f} us wall, {cpu:.1f} us processor",
     ]
-    lines += [f"  e.g. {v}" for v in r.examples.values()]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"  e.g. {v}" for v in r.examples.values())])

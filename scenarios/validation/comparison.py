@@ -11,19 +11,12 @@ import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module, resources
+from importlib import resources
 
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError, nearest
+from scenarios.shell.registered import Registry
 
 KINDS = ("input", "calibrated", "predicted", "check")
-MODULES = (
-    "scenarios.validation.paper_tables",
-    "scenarios.validation.paper_figures",
-    "scenarios.validation.checks",
-    "scenarios.validation.peers.gas",
-    "scenarios.validation.peers.machine",
-    "scenarios.validation.peers.cycle",
-)
 
 
 class SkippedError(ApuError):
@@ -63,26 +56,24 @@ class Row:
 
 
 Section = Callable[[], list[Row]]
-_SECTIONS: dict[str, tuple[str, Section]] = {}
+SECTIONS: Registry[tuple[str, Section]] = Registry(
+    "scenarios.validation", "validation section", scripts=("dpsim_run", "pycycle_run")
+)
 
 
-def section(name: str, title: str) -> Callable[[Section], Section]:
-    """Register a section under a short name."""
+def section(name: str, title: str, order: float) -> Callable[[Section], Section]:
+    """Register a section under a short name; ``order`` is its place on the page, ascending."""
 
     def register(function: Section) -> Section:
-        if name in _SECTIONS and _SECTIONS[name][1].__qualname__ != function.__qualname__:
-            raise ScenarioError(f"validation section {name!r} is registered twice")
-        _SECTIONS[name] = (title, function)
+        SECTIONS.add(name, order, (title, function))
         return function
 
     return register
 
 
 def sections() -> dict[str, tuple[str, Section]]:
-    """Return every section as ``{name: (title, function)}``, in the order of the modules."""
-    for module in MODULES:
-        import_module(module)
-    return dict(_SECTIONS)
+    """Return every section as ``{name: (title, function)}``, in the order of the page."""
+    return SECTIONS.all()
 
 
 def run(name: str) -> list[Row]:
@@ -117,7 +108,24 @@ def relative(ours: float, reference: float) -> float:
     return (ours - reference) / abs(reference) if reference else ours - reference
 
 
+def compared(
+    what: str, unit: str, reference: float, ours: float, tolerance: float, reason: str, kind: str
+) -> Row:
+    """Return the row of two values with their relative error."""
+    return Row(what, unit, reference, ours, relative(ours, reference), tolerance, reason, kind)
+
+
+def check(what: str, error: float, tolerance: float, reason: str) -> Row:
+    """Return the row of an error that a check defines, relative."""
+    return Row(what, "1", 0.0, error, error, tolerance, reason, "check")
+
+
+def timing(what: str, unit: str, value: float) -> Row:
+    """Return the row of a time, of which nothing is asked."""
+    return Row(what, unit, math.nan, value, 0.0, math.inf, "a timing is no test", "check")
+
+
 def mean_row(rows: list[Row], what: str, tolerance: float, reason: str) -> Row:
     """Summarise: the mean absolute error of ``rows``."""
     m = sum(abs(r.error) for r in rows) / len(rows)
-    return Row(f"mean of {len(rows)} {what} rows", "1", 0.0, m, m, tolerance, reason, "check")
+    return check(f"mean of {len(rows)} {what} rows", m, tolerance, reason)

@@ -29,7 +29,7 @@ from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
-from scenarios.validation.comparison import Row, relative, run, section
+from scenarios.validation.comparison import Row, compared, run, section
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,16 +55,18 @@ def with_cubic_load(gg: GasGenerator) -> StateSpace:
     u, theta = ca.MX.sym("u", len(ss.u)), ca.MX.sym("theta", len(ss.theta))
     loaded = ca.vertcat(u[0], u[1] * (x[0] / gg.parameters.N) ** 3, u[2:])
     name, args, names = "gas_generator_cubic", [x, u, theta], ["x", "u", "theta"]
-    return StateSpace(
-        name=name, x=ss.x, z=ss.z, u=ss.u, theta=ss.theta, y=ss.y,
-        residual=ca.Function(
-            f"{name}_residual", [x, z, u, theta], ss.residual(x, z, loaded, theta),
-            ["x", "z", "u", "theta"], ["ode", "alg"],
-        ),
-        f=ca.Function(f"{name}_f", args, [ss.f(x, loaded, theta)], names, ["xdot"]),
-        g=ca.Function(f"{name}_g", args, [ss.g(x, loaded, theta)], names, ["y"]),
-        z_of=ca.Function(f"{name}_z", args, [ss.z_of(x, loaded, theta)], names, ["z"]),
-    )  # fmt: skip
+
+    def function(end: str, value: ca.MX, out: str) -> ca.Function:
+        return ca.Function(f"{name}_{end}", args, [value], names, [out])
+
+    given, outputs = ["x", "z", "u", "theta"], ["ode", "alg"]
+    left = ss.residual(x, z, loaded, theta)
+    residual = ca.Function(f"{name}_residual", [x, z, u, theta], left, given, outputs)
+    f = function("f", ss.f(x, loaded, theta), "xdot")
+    g = function("g", ss.g(x, loaded, theta), "y")
+    z_of = function("z", ss.z_of(x, loaded, theta), "z")
+    vectors: dict[str, Any] = {v: getattr(ss, v) for v in ("x", "z", "u", "theta", "y")}
+    return StateSpace(name=name, residual=residual, f=f, g=g, z_of=z_of, **vectors)
 
 
 def gas_generator_transient(
@@ -104,8 +106,8 @@ def gas_generator_transient(
         # at the switching instant: the value before it, as in the discrete route
         values = {y.name: ds[y.name].to_numpy() for y in gg.Y}
         at = ss.y.unpack(ss.g(ds["N"].to_numpy()[k_step], before, point.theta).full().ravel())
-        values = {name: np.where(np.arange(n + 1) == k_step, at[name], v)
-                  for name, v in values.items()}  # fmt: skip
+        there = np.arange(n + 1) == k_step
+        values = {name: np.where(there, at[name], v) for name, v in values.items()}
     else:
         x, z = point.x, point.z
         Y = [point.y]
@@ -117,10 +119,8 @@ def gas_generator_transient(
             y, z = gg.output(x, u, point.theta, z0=z)
             Y.append(y)
         values = dict(zip(gg.Y.names, np.array(Y).T, strict=True))
-    return dataset(
-        {"time": t}, {"time": values}, signals=gg.Y,
-        attrs={"route": route, "turbine_flow": turbine_flow, **health},
-    )  # fmt: skip
+    attrs: dict[str, str | int | float] = {"route": route, "turbine_flow": turbine_flow, **health}
+    return dataset({"time": t}, {"time": values}, signals=gg.Y, attrs=attrs)
 
 
 # --------------------------------------------------------------------------- starter/generator
@@ -178,30 +178,24 @@ def _table_mean(table: str) -> float:
 
 
 @section(
-    "table6", "Table 6: mean relative errors of the gas generator (reference: the paper's own)"
+    "table6",
+    "Table 6: mean relative errors of the gas generator (reference: the paper's own)",
+    order=20,
 )
 def table6() -> list[Row]:
     """Compare mean errors; the paper runs GasTurb's own code, so its 1e-6 is a rounding error."""
-    rows = [
-        _summary("design point, ours against GasTurb (Table 4)", 1.0285e-6, _table_mean("table4"),
-                 2e-4, "independent calculation; the paper's module is GasTurb's own code"),
-        _summary("off-design, ours against GasTurb (Table 5; one of ten points is printed)",
-                 2.3461e-5, _table_mean("table5"), 5e-4, "as Table 5"),
-    ]  # fmt: skip
+    what, why = "design point, ours against GasTurb (Table 4)", "independent calculation; "
+    why += "the paper's module is GasTurb's own code"
+    rows = [_summary(what, 1.0285e-6, _table_mean("table4"), 2e-4, why)]
+    what = "off-design, ours against GasTurb (Table 5; one of ten points is printed)"
+    rows.append(_summary(what, 2.3461e-5, _table_mean("table5"), 5e-4, "as Table 5"))
+    why = "load power of the last step, first order in 20 ms; the paper reports 8.4317e-5 "
+    why += "against GasTurb's unpublished curve"
     for sign in HEALTH:
         a, b = _gas(sign, "discrete"), _gas(sign, "cvodes")
-        rows.append(
-            _summary(
-                "transient with fault, 20 ms step (12) against CVODES, f_W_t = "
-                f"{HEALTH[sign]['f_W_t']:g}",
-                math.nan,
-                mean_error(a, b, SHOWN),
-                1e-4,
-                "load power of the last step, first order in 20 ms; the paper reports 8.4317e-5 "
-                "against GasTurb's unpublished curve",
-                "check",
-            )
-        )
+        f_W_t = HEALTH[sign]["f_W_t"]
+        what = f"transient with fault, 20 ms step (12) against CVODES, f_W_t = {f_W_t:g}"
+        rows.append(_summary(what, math.nan, mean_error(a, b, SHOWN), 1e-4, why, "check"))
     return rows
 
 
@@ -215,39 +209,43 @@ def _machine(kind: str, solver: str) -> xr.Dataset:
     return machine_transient(kind, solver)
 
 
-@section("table9", "Table 9: mean relative errors of the generator (reference: the paper's own)")
+@section(
+    "table9",
+    "Table 9: mean relative errors of the generator (reference: the paper's own)",
+    order=21,
+)
 def table9() -> list[Row]:
     """Compare mean errors with SM-MATLAB's columns, and the transients by two solvers."""
-    rows = [
-        _summary("design point, ours against SM-MATLAB (Table 7)", 7.3673e-5,
-                 _table_mean("table7"), 3e-4, "voltage calibrated to the mean of its phases",
-                 "calibrated"),
-        _summary("off-design, ours against SM-MATLAB (Table 8; one of ten points is printed)",
-                 1.8746e-4, _table_mean("table8"), 3e-4, "as Table 8"),
-    ]  # fmt: skip
+    what, why = "design point, ours against SM-MATLAB (Table 7)", "voltage calibrated to the mean"
+    why += " of its phases"
+    rows = [_summary(what, 7.3673e-5, _table_mean("table7"), 3e-4, why, "calibrated")]
+    what = "off-design, ours against SM-MATLAB (Table 8; one of ten points is printed)"
+    rows.append(_summary(what, 1.8746e-4, _table_mean("table8"), 3e-4, "as Table 8"))
     gen, fault = Generator(), FAULTS["k_rf = 1"]
     R, R_sh = KW225.R[0], fault.R_shunt(gen.machine)
     shunted = SeriesLoad(R=(R * R_sh / (R + R_sh), R, R))
     equivalent = gen.simulate(KW225, T_MACHINE, switches=[(T_SWITCH, shunted)])
-    goal = "goal of two solvers; the paper reports "
-    checks = (
-        ("healthy transient, CVODES against IDAS", _machine("healthy", "cvodes"),
-         _machine("healthy", "idas"), WAVES, 1e-5,
-         goal + "5.2122e-4 against SM-MATLAB's unpublished curve"),
-        ("TTSC transient, k_rf = 1, CVODES against IDAS", _machine("k_rf = 1", "cvodes"),
-         _machine("k_rf = 1", "idas"), WAVES, 1e-5,
-         goal + '"consistent patterns" with another machine\'s measurement'),
-        ("TTSC transient, k_rf = 1, against the healthy machine with a shunt",
-         # the shunt's current is part of the load's in one and of i_a in the other
-         _machine("k_rf = 1", "cvodes"), equivalent, ("v_a", "v_b", "v_c", "i_b", "i_c"), 1e-6,
-         "exact equivalence; the rounding of two solutions with rtol 1e-8"),
-    )  # fmt: skip
-    for what, a, b, names, tolerance, reason in checks:
-        rows.append(_summary(what, math.nan, mean_error(a, b, names), tolerance, reason, "check"))
-    return rows
+    reported = {
+        "healthy": "5.2122e-4 against SM-MATLAB's unpublished curve",
+        "k_rf = 1": '"consistent patterns" with another machine\'s measurement',
+    }
+    for kind, text in reported.items():
+        label = "healthy transient" if kind == "healthy" else f"TTSC transient, {kind}"
+        what, why = (
+            f"{label}, CVODES against IDAS",
+            f"goal of two solvers; the paper reports {text}",
+        )
+        error = mean_error(_machine(kind, "cvodes"), _machine(kind, "idas"), WAVES)
+        rows.append(_summary(what, math.nan, error, 1e-5, why, "check"))
+    # the shunt's current is part of the load's in one and of i_a in the other
+    names = tuple(n for n in WAVES if n != "i_a")
+    error = mean_error(_machine("k_rf = 1", "cvodes"), equivalent, names)
+    what = "TTSC transient, k_rf = 1, against the healthy machine with a shunt"
+    why = "exact equivalence; the rounding of two solutions with rtol 1e-8"
+    return [*rows, _summary(what, math.nan, error, 1e-6, why, "check")]
 
 
-@section("table10", "Table 10: the joint run, phase by phase (reference: steady values)")
+@section("table10", "Table 10: the joint run, phase by phase (reference: steady values)", order=22)
 def table10() -> list[Row]:
     """Compare the end of every phase with published steady values and with our own trims.
 
@@ -271,21 +269,20 @@ def table10() -> list[Row]:
             ours = p[f"{'V' if 'Voltage' in name else 'I'}_{letter}_rms"]
             ref = float(r["SM_MATLAB"])
             kind = "calibrated" if table == "table7" else "predicted"
-            rows.append(Row(f"{phase}: {name}, SM-MATLAB of Table {table[5:]}", r["unit"], ref,
-                            ours, relative(ours, ref), 7e-3,
-                            "the paper's own Table 10 has 6.6e-3 and 7.1e-3", kind))  # fmt: skip
+            what = f"{phase}: {name}, SM-MATLAB of Table {table[5:]}"
+            why = "the paper's own Table 10 has 6.6e-3 and 7.1e-3"
+            rows.append(compared(what, r["unit"], ref, ours, 7e-3, why, kind))
     gg, units = Apu().gas_generator, {"T3": "K", "P3": "kPa", "T4": "K", "Wf": "kg/s"}
     for phase, p in phases.items():
         theta = {k: p[k] for k in gg.THETA.names}
-        trim = trim_gas_generator(gg, {"N": p["N_rpm"] / 30 * math.pi, "PW": 1e3 * p["PW_kW"]},
-                                  theta=theta)  # fmt: skip
+        mean = {"N": p["N_rpm"] / 30 * math.pi, "PW": 1e3 * p["PW_kW"]}
+        trim = trim_gas_generator(gg, mean, theta=theta)
+        why = "mean of the last 0.5 s, in which the governor still settles"
         for name, unit in units.items():
             ref = trim[name] * (1e-3 if unit == "kPa" else 1.0)
             ours = p[name if unit != "kPa" else f"{name}_kPa"]
-            rows.append(Row(f"{phase}: {name}, own steady point of mean speed and power", unit, ref,
-                            ours, relative(ours, ref), 1e-3,
-                            "mean of the last 0.5 s, in which the governor still settles",
-                            "check"))  # fmt: skip
+            what = f"{phase}: {name}, own steady point of mean speed and power"
+            rows.append(compared(what, unit, ref, ours, 1e-3, why, "check"))
     return rows
 
 
@@ -299,31 +296,32 @@ def write_figures(folder: str | os.PathLike[str], *, joint: bool = True) -> list
         DataError: the folder cannot be written.
     """
     from scenarios import registry
-    from scenarios.figures import plotting
+    from scenarios.figures import moduleplots, plotting
+    from scenarios.figures.figstyle import DPI
 
     out = registry.prepare(folder)
     draw = {
         key: partial(
-            plotting.figure_gas_generator,
+            moduleplots.figure_gas_generator,
             key,
             [_gas(sign, "discrete") for sign in HEALTH],
             [_gas(sign, "cvodes") for sign in HEALTH],
             T_STEP,
         )
-        for key in list(plotting.MODULE_FIGURES)[:3]
+        for key in list(moduleplots.MODULE_FIGURES)[:3]
     }
     draw["fig18_healthy_transient"] = partial(
-        plotting.figure_18, _machine("healthy", "cvodes"), _machine("healthy", "idas"), T_SWITCH
+        moduleplots.figure_18, _machine("healthy", "cvodes"), _machine("healthy", "idas"), T_SWITCH
     )
     draw["fig19_ttsc_currents"] = partial(
-        plotting.figure_19,
+        moduleplots.figure_19,
         {kind: _machine(kind, "cvodes") for kind in FAULTS},
         T_SWITCH,
         {k: f"µ = 5 %, $k_{{{{rf}}}}$ = {f.k_rf:g}, h = {f.h:.4f}" for k, f in FAULTS.items()},
     )
     made = []
     for key, figure in draw.items():
-        made.append(files.save_figure(figure(), out / f"{key}.png", dpi=plotting.DPI))
+        made.append(files.save_figure(figure(), out / f"{key}.png", dpi=DPI))
     if joint:
         made += plotting.save_figures(registry.run("joint"), out)
     return made

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 
 from apu_casadi.core.sharing import once
-from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator
+from apu_casadi.gaspath.designdata import RPM
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
-from scenarios.validation.comparison import Row, mean_row, reference, relative, section
+from scenarios.validation.comparison import Row, compared, mean_row, reference, section
 
 #: paper's row name: (output of the model, factor from SI to the table's unit)
 _ROWS = {
@@ -25,10 +26,10 @@ _ROWS = {
     "SNOx": ("SNOx", 1.0),
     "HPCSM": ("SM", 100.0),
     "P1": ("P0", 1e-3),
-    **{n: (n, 1.0) for n in ("T1", "T2", "W2", "T3", "W3", "T4", "W4", "T41", "W41", "T5", "W5",
-                             "T8", "W8")},
+    **{f"T{n}": (f"T{n}", 1.0) for n in (1, 2, 3, 4, 41, 5, 8)},
+    **{f"W{n}": (f"W{n}", 1.0) for n in (2, 3, 4, 41, 5, 8)},
     **{n: (n, 1e-3) for n in ("P2", "P3", "Ps3", "P4", "P5", "P8")},
-}  # fmt: skip
+}
 
 
 def design_point(gg: GasGenerator | None = None) -> OperatingPoint:
@@ -67,18 +68,14 @@ def _compare(
         ours, ref = point[output] * factor, float(r["GasTurb"])
         kind = "input" if name in inputs else "calibrated" if name in calibrated else "predicted"
         tol = 1e-4 if kind != "predicted" else tolerance
-        why = (
-            "given to the calculation; digits of the printed table"
-            if kind == "input"
-            else "a map number was fitted to this row"
-            if kind == "calibrated"
-            else reason
-        )
-        rows.append(Row(name, r["unit"], ref, ours, relative(ours, ref), tol, why, kind))
+        given = "given to the calculation; digits of the printed table"
+        fitted = "a map number was fitted to this row"
+        why = {"input": given, "calibrated": fitted}.get(kind, reason)
+        rows.append(compared(name, r["unit"], ref, ours, tol, why, kind))
     return rows
 
 
-@section("table4", "Table 4: design point, 0 km, Mach 0, 500 kW")
+@section("table4", "Table 4: design point, 0 km, Mach 0, 500 kW", order=10)
 def table4() -> list[Row]:
     """Compute every row from the inputs; no map enters at the design point but for HPCSM."""
     rows = _compare(
@@ -93,7 +90,7 @@ def table4() -> list[Row]:
     return [*rows, mean_row(predicted, "predicted", 2e-4, "goal for a calculation without tuning")]
 
 
-@section("table5", "Table 5: off-design point, 8000 m, Mach 0.7, 222 kW")
+@section("table5", "Table 5: off-design point, 8000 m, Mach 0.7, 222 kW", order=11)
 def table5() -> list[Row]:
     """Compute every row; W2, T3, P3, T5 and HPCSM were used to calibrate the maps."""
     rows = _compare(
@@ -108,7 +105,7 @@ def table5() -> list[Row]:
     return [*rows, mean_row(predicted, "predicted", 5e-4, "goal for the rows not calibrated")]
 
 
-def _terminal(table: str, P: float, voltage_kind: str, tolerance: float, reason: str) -> list[Row]:
+def _terminal(table: str, P: float, kind: str, tolerance: float, reason: str) -> list[Row]:
     gen = Generator()
     point = gen.steady_state(SeriesLoad.from_power(P), V_ref=gen.V_ref_default)
     V = point.y["V_t"]
@@ -117,19 +114,18 @@ def _terminal(table: str, P: float, voltage_kind: str, tolerance: float, reason:
     for r in reference(table):
         name, ref = r["parameter"], float(r["SM_MATLAB"])
         ours = I if "Current" in name else V * math.sqrt(3) if "Line" in name else V
-        kind = voltage_kind
-        rows.append(Row(name, r["unit"], ref, ours, relative(ours, ref), tolerance, reason, kind))
+        rows.append(compared(name, r["unit"], ref, ours, tolerance, reason, kind))
     return rows
 
 
-@section("table7", "Table 7: starter/generator, 225 kW")
+@section("table7", "Table 7: starter/generator, 225 kW", order=12)
 def table7() -> list[Row]:
     """Terminal voltage is where V_ref was set (calibrated); currents follow from the load."""
     reason = "the reference's own phases scatter by 3e-4 of their mean"
     return _terminal("table7", 225e3, "calibrated", 3e-4, reason)
 
 
-@section("table8", "Table 8: starter/generator, 100 kW")
+@section("table8", "Table 8: starter/generator, 100 kW", order=13)
 def table8() -> list[Row]:
     """Predict the terminal voltage at 100 kW with the voltage setting of Table 7."""
     reason = "regulator droop with K_A = 250, known only to lie between 215 and 264"

@@ -9,6 +9,7 @@ from scenarios.validation.peers import machine
 
 
 # not importorskip: its C++ libraries belong into the process of the script, not into this one
+@pytest.mark.ci  # a fifth of a minute
 @pytest.mark.skipif(find_spec("dpsimpy") is None, reason="dpsim is not installed (extra 'peers')")
 def test_every_row_is_within_its_tolerance(tmp_path, monkeypatch):
     """Load steps, short circuit, faults as shunts; nothing is left in the working directory."""

@@ -42,9 +42,8 @@ def mix_cooling(
     FAR_mix = fuel / ((W_mix - fuel) / (1 + war))
     enthalpy = W * gas.h(T, FAR, war) + W_cool * gas.h(T_cool, 0.0, war)
     scale = W * gas.cp(T, FAR, war) * T
-    return MixOut(
-        W_mix, FAR_mix, (enthalpy - W_mix * gas.h(T_mix, FAR_mix, war)) / scale
-    )  # fmt: skip
+    res = (enthalpy - W_mix * gas.h(T_mix, FAR_mix, war)) / scale
+    return MixOut(W_mix, FAR_mix, res)
 
 
 def turbine(

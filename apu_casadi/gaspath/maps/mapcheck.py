@@ -196,9 +196,14 @@ def surge_points(W: np.ndarray, PR: np.ndarray, noise: float) -> list[Finding]:
 
 
 def implausible(
-    kind: str, N: np.ndarray, beta: np.ndarray, W: np.ndarray, PR: np.ndarray, eta: np.ndarray,
+    kind: str,
+    N: np.ndarray,
+    beta: np.ndarray,
+    W: np.ndarray,
+    PR: np.ndarray,
+    eta: np.ndarray,
     surge: tuple[np.ndarray, np.ndarray] | None = None,
-) -> list[Finding]:  # fmt: skip
+) -> list[Finding]:
     """Return what is implausible in a map, the worst first; lines only if no cell is."""
     up = kind == "compressor"
     tables = (("W", np.log(W), up), ("PR", np.log(PR), up), ("eta", eta, False))

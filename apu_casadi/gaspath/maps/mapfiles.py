@@ -22,25 +22,14 @@ rising::
 Columns may stand in any order; empty lines and empty cells at the end of a line, as spreadsheets
 write them, are ignored.
 
-**GasTurb/GSP.**  A title line that begins with ``99``, a line ``Reynolds: ...``, then sections
-``Mass Flow``, ``Efficiency``, ``Pressure Ratio`` and ``Surge Line``.  Each section is a table
-whose first number codes its size, ``rows.columns`` with three digits for the columns: ``11.016``
-is 11 rows of 16 numbers, 10 speed lines by 15 beta values.  Numbers follow row by row, wrapped at
-will: first the code and the beta values, then each speed and its values.  ``Surge Line`` has two
-rows: code and flows, any number and pressure ratios.  Turbines have ``Min Pressure Ratio`` and
-``Max Pressure Ratio`` instead (two rows: code and speeds, any number and values), and
-PR = min + beta (max - min).  The Reynolds line is kept in the table's ``source`` and not applied:
-:class:`apu_casadi.gaspath.maps.scaledmaps.MapCalibration` has its own Reynolds term.
+**GasTurb/GSP.**  See :mod:`apu_casadi.gaspath.maps.gasturbmaps`.
 """
 
 from __future__ import annotations
 
 import csv
-import dataclasses
-import math
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -50,14 +39,17 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, MapError, nearest
 from apu_casadi.core.sharing import once
+from apu_casadi.gaspath.maps.gasturbmaps import read_map_gasturb, section_of
 from apu_casadi.gaspath.maps.mapcheck import Finding
+from apu_casadi.gaspath.maps.mapreading import file_lines, number, one_line, table_of
 from apu_casadi.gaspath.maps.maptable import (
     GRID_COLUMNS,
     SURGE_COLUMNS,
     MapTable,
     fault,
-    found_text,
 )
+
+__all__ = ["SHIPPED", "read_map", "read_map_csv", "read_map_gasturb", "shipped", "write_map_csv"]
 
 SHIPPED = ("axi5", "lpt2269")
 
@@ -76,10 +68,10 @@ def read_map(path: str | Path, *, trim: bool = False, check: bool = True) -> Map
         DataError: the file is missing, damaged, or in no layout known here.
         MapError: the numbers are readable but make no map.
     """
-    lines = _lines(path)
+    lines = file_lines(path)
     words = [text.strip().lower() for text in lines]
     first = next((w for w in words if w and not w.startswith("#")), "")
-    if re.match(r"99(\s|$)", first) or any(_section(w) for w in words):
+    if re.match(r"99(\s|$)", first) or any(section_of(w) for w in words):
         return read_map_gasturb(path, trim=trim, check=check)
     if "," in first or ";" in first:
         return read_map_csv(path, check=check)
@@ -88,56 +80,6 @@ def read_map(path: str | Path, *, trim: bool = False, check: bool = True) -> Map
         f"(title '99 ...', sections such as 'Mass Flow'); see "
         "apu_casadi.gaspath.maps.mapfiles for both"
     )
-
-
-def _lines(path: str | Path) -> list[str]:
-    try:
-        data = Path(path).read_bytes()
-    except OSError as e:
-        raise DataError(f"{path}: cannot read the map file: {e.strerror}") from None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-    if not text.strip():
-        raise DataError(f"{path}: the map file is empty")
-    return text.splitlines()
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        if "_" in text or not text.isascii():  # float() takes 1_0 and digits of other scripts
-            raise ValueError
-        value = float(text)
-    except ValueError:
-        hint = " (write decimal points, not commas)" if re.fullmatch(r"-?\d+,\d+", text) else ""
-        raise DataError(f"{where}: a number expected, got {text!r}{hint}") from None
-    if not math.isfinite(value):
-        raise DataError(
-            f"{where}: {text!r} is not finite; maps may have no holes: fill the cell "
-            f"or remove the whole speed or beta line"
-        )
-    return value
-
-
-def _table(
-    path: str | Path, check: bool, where: Callable[[Finding], str], **fields: object
-) -> MapTable:
-    """Construct the table; its errors name the file, and ``where`` the line of a finding."""
-    try:
-        table = MapTable(**fields, check=False)  # type: ignore[arg-type]
-    except MapError as e:
-        raise MapError(f"{path}: {e}") from None
-    found = table.implausible()
-    if not found:
-        return dataclasses.replace(table, check=True)
-    if check:
-        f = found[0]
-        raise MapError(f"{path}{where(f)}, {table.place(f)}: {found_text(table, f)}")
-    note = f"accepted with check=False: {len(found)} implausible values or lines, the worst at "
-    note += table.place(found[0])
-    source = "; ".join(t for t in (table.source, note) if t)
-    return dataclasses.replace(table, source=source)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -153,9 +95,53 @@ def read_map_csv(path: str | Path, *, check: bool = True) -> MapTable:
         DataError: missing key or column, cell that is no number, ragged grid (file, line, column).
         MapError: values outside their range, fewer than 4 lines, order not rising.
     """
+    meta, grid, surge = _csv_blocks(path)
+    if not grid:
+        raise DataError(f"{path}: no map rows; a header {','.join(GRID_COLUMNS)} and rows expected")
+    if "kind" not in meta:
+        raise DataError(f"{path}: no line '# kind: compressor' or '# kind: turbine'; add one")
+    N, beta = _csv_axes(path, grid)
+    W, PR, eta = (np.array([r[c] for _, r in grid]).reshape(N.size, -1) for c in (2, 3, 4))
+    for (ka, a), (kb, b) in pairwise(surge):
+        if b[0] <= a[0]:
+            raise MapError(
+                f"{path}, line {kb}, column W_surge: {b[0]:g} does not rise above {a[0]:g} of "
+                f"line {ka}; sort the surge line by flow"
+            )
+    ref = {}
+    for key in ("N_ref", "beta_ref"):
+        text, k = meta.get(key.lower(), ("", 0))
+        ref[key] = number(text, f"{path}, line {k}, {key}") if text else None
+
+    def where(f: Finding) -> str:
+        if f.name == "PR_surge":
+            return f", line {surge[f.i][0]}"
+        first, last = max(f.i, 0) * beta.size + max(f.j, 0), -1
+        if f.j < 0:
+            last = first + beta.size - 1
+        elif f.i < 0:
+            last = first + (N.size - 1) * beta.size
+        lines = (
+            f"line {grid[first][0]}" if last < 0 else f"lines {grid[first][0]} to {grid[last][0]}"
+        )
+        return f", {lines}, column {f.name}"
+
+    line = np.array([r for _, r in surge]).T if surge else (None, None)
+    grid_values = {"N": N, "beta": beta, "W": W, "PR": PR, "eta": eta}
+    surge_values = {"surge_W": line[0], "surge_PR": line[1]}
+    name = meta.get("name", (Path(path).stem, 0))[0]
+    told = {"kind": meta["kind"][0].lower(), "name": name, "source": meta.get("source", ("",))[0]}
+    return table_of(path, check, where, **grid_values, **surge_values, **ref, **told)
+
+
+_Rows = list[tuple[int, list[float]]]
+
+
+def _csv_blocks(path: str | Path) -> tuple[dict[str, tuple[str, int]], _Rows, _Rows]:
+    """Return the keys of comments, the rows of grid and surge line, each with its line."""
     meta: dict[str, tuple[str, int]] = {}
-    grid: list[tuple[int, list[float]]] = []
-    surge: list[tuple[int, list[float]]] = []
+    grid: _Rows = []
+    surge: _Rows = []
     columns: list[str] = []  # of the block being read; empty before the first header
     rows = grid
     for k, cells in _csv_rows(path):
@@ -182,57 +168,12 @@ def read_map_csv(path: str | Path, *, check: bool = True) -> MapTable:
             )
         values = {}
         for name, cell in zip(columns, row, strict=True):
-            values[name] = _number(cell, f"{path}, line {k}, column {name}")
+            values[name] = number(cell, f"{path}, line {k}, column {name}")
             if wrong := fault(name, values[name]):
                 raise MapError(f"{path}, line {k}, column {name}: {cell}; {wrong}")
         wanted = GRID_COLUMNS if rows is grid else SURGE_COLUMNS
         rows.append((k, [values[name] for name in wanted]))
-    if not grid:
-        raise DataError(f"{path}: no map rows; a header {','.join(GRID_COLUMNS)} and rows expected")
-    if "kind" not in meta:
-        raise DataError(f"{path}: no line '# kind: compressor' or '# kind: turbine'; add one")
-    N, beta = _csv_axes(path, grid)
-    W, PR, eta = (np.array([r[c] for _, r in grid]).reshape(N.size, -1) for c in (2, 3, 4))
-    for (ka, a), (kb, b) in pairwise(surge):
-        if b[0] <= a[0]:
-            raise MapError(
-                f"{path}, line {kb}, column W_surge: {b[0]:g} does not rise above {a[0]:g} of "
-                f"line {ka}; sort the surge line by flow"
-            )
-    ref = {}
-    for key in ("N_ref", "beta_ref"):
-        text, k = meta.get(key.lower(), ("", 0))
-        ref[key] = _number(text, f"{path}, line {k}, {key}") if text else None
-
-    def where(f: Finding) -> str:
-        if f.name == "PR_surge":
-            return f", line {surge[f.i][0]}"
-        first, last = max(f.i, 0) * beta.size + max(f.j, 0), -1
-        if f.j < 0:
-            last = first + beta.size - 1
-        elif f.i < 0:
-            last = first + (N.size - 1) * beta.size
-        lines = (
-            f"line {grid[first][0]}" if last < 0 else f"lines {grid[first][0]} to {grid[last][0]}"
-        )
-        return f", {lines}, column {f.name}"
-
-    return _table(
-        path,
-        check,
-        where,
-        kind=meta["kind"][0].lower(),
-        N=N,
-        beta=beta,
-        W=W,
-        PR=PR,
-        eta=eta,
-        surge_W=np.array([r[0] for _, r in surge]) if surge else None,
-        surge_PR=np.array([r[1] for _, r in surge]) if surge else None,
-        **ref,
-        name=meta.get("name", (Path(path).stem, 0))[0],
-        source=meta.get("source", ("", 0))[0],
-    )
+    return meta, grid, surge
 
 
 def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
@@ -241,7 +182,7 @@ def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
     Raises:
         DataError: a cell that is longer than any number, such as one behind an open quotation mark.
     """
-    reader, k = csv.reader(_lines(path)), 0
+    reader, k = csv.reader(file_lines(path)), 0
     while True:
         k += 1
         try:
@@ -313,9 +254,9 @@ def write_map_csv(table: MapTable, path: str | Path) -> None:
     Raises:
         DataError: the file cannot be written.
     """
-    out = [f"# kind: {table.kind}", f"# name: {_one_line(table.name)}"]
+    out = [f"# kind: {table.kind}", f"# name: {one_line(table.name)}"]
     if table.source:
-        out.append(f"# source: {_one_line(table.source)}")
+        out.append(f"# source: {one_line(table.source)}")
     for key in ("N_ref", "beta_ref"):
         ref = getattr(table, key)
         if ref is not None:
@@ -330,245 +271,6 @@ def write_map_csv(table: MapTable, path: str | Path) -> None:
             out.append(f"{float(W)!r},{float(PR)!r}")
     refusal = "cannot write the map file"
     files.write_text(path, "\n".join(out) + "\n", refusal=refusal, make_folder=False)
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
-
-
-# ---------------------------------------------------------------------------------------------
-# GasTurb/GSP text layout
-
-_SECTIONS = (
-    "Mass Flow",
-    "Efficiency",
-    "Pressure Ratio",
-    "Surge Line",
-    "Min Pressure Ratio",
-    "Max Pressure Ratio",
-)
-
-
-def _section(word: str) -> str | None:
-    """Return the section that a line opens, or None; a section line is the bare name."""
-    plain = " ".join(word.strip().rstrip(":").split()).lower()
-    return next((s for s in _SECTIONS if s.lower() == plain), None)
-
-
-@dataclass
-class _Block:
-    """One section of a GasTurb file: its numbers, and the file line of each."""
-
-    title: str
-    line: int
-    values: list[float] = field(default_factory=list)
-    lines: list[int] = field(default_factory=list)
-    array: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-
-    def where(self, i: int, j: int) -> int:
-        """Return the file line of the number in row i, column j."""
-        return self.lines[i * self.array.shape[1] + j]
-
-
-def read_map_gasturb(path: str | Path, *, trim: bool = False, check: bool = True) -> MapTable:
-    """Read a map from the GasTurb/GSP text layout that the module's text describes.
-
-    The file with a surge line and a pressure ratio table is a compressor, the one with minimum and
-    maximum pressure ratios a turbine.  A first surge point at zero flow or at PR = 1 (the origin)
-    is left out: the surge line is continued as a power law there.
-
-    Args:
-        path: the file.
-        trim: many compressor maps of this layout reach PR <= 1 at low speed or near choke, which no
-            operating point of an engine needs and the surface cannot hold.  True leaves out the
-            outermost speed or beta lines, each time the one with the largest share of such points,
-            until none is left, and says so in the table's ``source``; False raises.
-        check: as in :func:`read_map`.
-
-    Raises:
-        DataError: missing, doubled, truncated or overlong section, or a cell that is no number.
-        MapError: values outside their range, fewer than 4 lines, order not rising.
-    """
-    head: list[str] = []
-    blocks: dict[str, _Block] = {}
-    block: _Block | None = None
-    for k, text in enumerate(_lines(path), 1):
-        title = _section(text)
-        if title:
-            if title in blocks:
-                raise DataError(f"{path}, line {k}: second section {title!r}, remove one")
-            block = blocks[title] = _Block(title, k)
-        elif block is None:
-            if text.strip():
-                head.append(_one_line(text))
-        else:
-            for cell in text.split():
-                where = f"{path}, line {k}, section {block.title!r}"
-                if not block.values or len(block.values) < _size(path, block):
-                    block.values.append(_number(cell, where))
-                    block.lines.append(k)
-                elif re.match(r"[-+.\d]", cell):
-                    raise DataError(
-                        f"{where}: more than the {_size(path, block)} numbers that its first "
-                        f"number {block.values[0]:.3f} (rows.columns) announces"
-                    )
-                else:
-                    break  # text after a complete section
-    if not blocks:
-        raise DataError(f"{path}: no section {', '.join(_SECTIONS[:4])} found")
-    turbine = "Min Pressure Ratio" in blocks or "Max Pressure Ratio" in blocks
-    needed = (
-        ("Mass Flow", "Efficiency", "Min Pressure Ratio", "Max Pressure Ratio")
-        if turbine
-        else ("Mass Flow", "Efficiency", "Pressure Ratio", "Surge Line")
-    )
-    missing = [s for s in needed if s not in blocks]
-    if missing:
-        kind = "turbine" if turbine else "compressor"
-        raise DataError(
-            f"{path}: section {', '.join(missing)} missing; a {kind} needs {', '.join(needed)}"
-        )
-    for title in needed:
-        _shape(path, blocks[title])
-    flow, eta = blocks["Mass Flow"], blocks["Efficiency"]
-    N, beta = flow.array[1:, 0], flow.array[0, 1:]
-    _same_grid(path, flow, eta)
-    _check_values(path, flow, "W")
-    _check_values(path, eta, "eta")
-    surge_W: np.ndarray | None = None
-    surge_PR: np.ndarray | None = None
-    if turbine:
-        lo, hi = blocks["Min Pressure Ratio"], blocks["Max Pressure Ratio"]
-        for b in (lo, hi):
-            _check_pair(path, b)
-            _same_axis(path, b, "speeds", b.array[0, 1:], N)
-            if not trim:
-                _check_values(path, b, "PR")
-        PR = lo.array[1, 1:, None] + beta * (hi.array[1, 1:] - lo.array[1, 1:])[:, None]
-    else:
-        ratio, surge = blocks["Pressure Ratio"], blocks["Surge Line"]
-        _same_grid(path, flow, ratio)
-        if not trim:
-            _check_values(path, ratio, "PR")
-        PR = ratio.array[1:, 1:]
-        _check_pair(path, surge)
-        surge_W, surge_PR = surge.array[0, 1:], surge.array[1, 1:]
-        if surge_W.size and (surge_W[0] <= 0 or surge_PR[0] <= 1):
-            surge_W, surge_PR = surge_W[1:], surge_PR[1:]
-    rows, columns, note = _trimmed(N, beta, PR) if trim else (slice(None), slice(None), "")
-    title = re.sub(r"^99\s*", "", head[0]) if head else ""
-
-    def place(f: Finding) -> str:
-        title = {"W": "Mass Flow", "eta": "Efficiency", "PR_surge": "Surge Line"}.get(
-            f.name, "Max Pressure Ratio" if turbine else "Pressure Ratio"
-        )
-        b = blocks[title]
-        if f.name == "PR_surge":
-            row, column = 1, b.array.shape[1] - surge_W.size + f.i if surge_W is not None else 1
-        elif title == "Max Pressure Ratio":
-            row, column = 1, 1 + (rows.start or 0) + max(f.i, 0)
-        else:
-            row = 1 + (rows.start or 0) + max(f.i, 0)
-            column = 1 + (columns.start or 0) + max(f.j, 0)
-        return f", line {b.where(row, column)}, section {title!r}"
-
-    return _table(
-        path,
-        check,
-        place,
-        kind="turbine" if turbine else "compressor",
-        N=N[rows],
-        beta=beta[columns],
-        W=flow.array[1:, 1:][rows, columns],
-        PR=PR[rows, columns],
-        eta=eta.array[1:, 1:][rows, columns],
-        surge_W=surge_W,
-        surge_PR=surge_PR,
-        name=title or Path(path).stem,
-        source="; ".join(
-            [f"GasTurb/GSP text file {Path(path).name}", *head[1:], *([note] if note else [])]
-        ),
-    )
-
-
-def _trimmed(N: np.ndarray, beta: np.ndarray, PR: np.ndarray) -> tuple[slice, slice, str]:
-    """Return the rows and columns to keep so that PR > 1, and a remark on what is left out."""
-    r0, r1, c0, c1 = 0, N.size, 0, beta.size
-    bad = ~(PR > 1)
-    while r0 < r1 and c0 < c1 and bad[r0:r1, c0:c1].any():
-        part = bad[r0:r1, c0:c1]
-        share = [part[0].mean(), part[-1].mean(), part[:, 0].mean(), part[:, -1].mean()]
-        step = np.eye(4, dtype=int)[int(np.argmax(share))]
-        r0, r1, c0, c1 = r0 + step[0], r1 - step[1], c0 + step[2], c1 - step[3]
-    out = [f"N = {v:g}" for v in (*N[:r0], *N[r1:])]
-    out += [f"beta = {v:g}" for v in (*beta[:c0], *beta[c1:])]
-    note = f"left out, since PR <= 1 there: {', '.join(out)}" if out else ""
-    return slice(r0, r1), slice(c0, c1), note
-
-
-def _size(path: str | Path, block: _Block) -> int:
-    """Return the count of numbers that the code ``rows.columns`` announces."""
-    code = block.values[0]
-    rows = int(code)
-    columns = round((code - rows) * 1000)
-    if rows < 2 or columns < 2:
-        raise DataError(
-            f"{path}, line {block.lines[0]}, section {block.title!r}: the first number must code "
-            f"the table's size as rows.columns (11.016 is 11 rows of 16), got {code:g}"
-        )
-    return rows * columns
-
-
-def _shape(path: str | Path, block: _Block) -> None:
-    """Arrange the numbers of a section in rows and columns; refuse a truncated one."""
-    where = f"{path}, section {block.title!r} at line {block.line}"
-    if not block.values:
-        raise DataError(f"{where} is empty")
-    size = _size(path, block)
-    if len(block.values) != size:
-        raise DataError(
-            f"{where}: {size} numbers announced by its first number {block.values[0]:.3f} "
-            f"(rows.columns), {len(block.values)} found up to line {block.lines[-1]}; "
-            f"is the section truncated or a row short?"
-        )
-    block.array = np.array(block.values).reshape(int(block.values[0]), -1)
-
-
-def _check_pair(path: str | Path, block: _Block) -> None:
-    if block.array.shape[0] != 2:
-        raise DataError(
-            f"{path}, section {block.title!r} at line {block.line}: two rows expected "
-            f"(code 2.0xx), got {block.array.shape[0]}"
-        )
-
-
-def _same_grid(path: str | Path, flow: _Block, other: _Block) -> None:
-    _same_axis(path, other, "beta values", other.array[0, 1:], flow.array[0, 1:])
-    _same_axis(path, other, "speeds", other.array[1:, 0], flow.array[1:, 0])
-
-
-def _same_axis(
-    path: str | Path, block: _Block, what: str, got: np.ndarray, wanted: np.ndarray
-) -> None:
-    where = f"{path}, section {block.title!r} at line {block.line}"
-    if got.size != wanted.size:
-        raise DataError(f"{where}: {got.size} {what}, but {wanted.size} in 'Mass Flow'")
-    # the layout is written with six or more digits: what differs more is another grid
-    off = np.abs(got - wanted) > 1e-5 * max(1.0, float(np.max(np.abs(wanted))))
-    if np.any(off):
-        k = int(np.argmax(off))
-        raise DataError(
-            f"{where}: {what} differ from 'Mass Flow', {got[k]:g} against {wanted[k]:g}"
-        )
-
-
-def _check_values(path: str | Path, block: _Block, name: str) -> None:
-    for i, j in np.ndindex(block.array.shape):
-        if i and j and (wrong := fault(name, float(block.array[i, j]))):
-            raise MapError(
-                f"{path}, line {block.where(i, j)}, section {block.title!r}, row {i + 1}, column "
-                f"{j + 1}: {block.array[i, j]:g}; {wrong}"
-            )
 
 
 # ---------------------------------------------------------------------------------------------

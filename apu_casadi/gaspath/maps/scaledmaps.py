@@ -32,11 +32,9 @@ law.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -46,7 +44,7 @@ from scipy.interpolate import BSpline
 from apu_casadi.core.errors import MapError
 from apu_casadi.core.parameters import Parameters, par
 from apu_casadi.core.sharing import Parametric, derived, kept
-from apu_casadi.gaspath.maps.mapfiles import MapTable
+from apu_casadi.gaspath.maps.maptable import MapTable
 
 REACH = 2.0  # table spans from the table's edge to where everything is held
 LOWEST = 0.05  # held below this fraction of the table's lowest speed
@@ -160,6 +158,11 @@ def local_cubics(knots: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarr
     )
 
 
+def per(x: Any, number: Any) -> Any:
+    """x over a number of the engine, whose reciprocal is computed once for all derivatives."""
+    return x * (1 / number)
+
+
 def _held(x: Any, breaks: np.ndarray) -> Any:
     """Hold a query within the ends."""
     return ca.fmin(ca.fmax(x, float(breaks[0])), float(breaks[-1]))
@@ -223,7 +226,7 @@ def surface_logs(table: MapTable, N: Any, beta: Any, cell: Any) -> tuple[Any, li
 
 
 @kept
-def _log_map(table: MapTable) -> ca.Function:
+def table_logs(table: MapTable) -> ca.Function:
     """(N, beta) -> N as held, and (ln W, ln(PR - 1), ln eta) stacked."""
     N, beta, cell = ca.SX.sym("N"), ca.SX.sym("beta"), ca.SX.sym("cell", N_CELL)
     held, logs = surface_logs(table, N, beta, cell)
@@ -240,7 +243,7 @@ def map_function(table: MapTable) -> ca.Function:
     N, beta : scalars in the table's units.  W, PR, eta : scalars in the table's units.
     """
     N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
-    _, y = _log_map(table)(N, beta)
+    _, y = table_logs(table)(N, beta)
     out = [ca.exp(y[0]), 1 + ca.exp(y[1]), ca.exp(y[2])]
     return ca.Function("map", [N, beta], out, ["N", "beta"], ["W", "PR", "eta"])
 
@@ -312,6 +315,10 @@ def off_function(table: MapTable) -> ca.Function:
     )
 
 
+def _bend(default: float, doc: str, lo: float, hi: float) -> Any:
+    return par(default, unit="1", source="identity", doc=doc, lo=lo, hi=hi)
+
+
 @dataclass(frozen=True)
 class MapCalibration(Parameters):
     """Numbers that bend a scaled map to documented points; all leave the design point in place.
@@ -320,54 +327,14 @@ class MapCalibration(Parameters):
     design point.  RNI is the Reynolds number index, 1 at the design point.
     """
 
-    a_W: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="flow is multiplied by n**a_W",
-        lo=-5.0,
-        hi=5.0,
+    a_W: float = _bend(0.0, "flow is multiplied by n**a_W", -5, 5)
+    n_Re: float = _bend(0.0, "loss 1 - eta is multiplied by RNI**(-n_Re)", 0, 1)
+    c_PR: float = _bend(0.0, "eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)", 0, 200)
+    c_N: float = _bend(0.0, "eta is multiplied by exp(-c_N (n - 1)**2)", 0, 1000)
+    k_SM: float = _bend(
+        1.0, "PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)", 0.2, 5
     )
-    n_Re: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="loss 1 - eta is multiplied by RNI**(-n_Re)",
-        lo=0.0,
-        hi=1.0,
-    )
-    c_PR: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="eta is multiplied by exp(-c_PR ln((PR - 1)/(PR_des - 1))**2)",
-        lo=0.0,
-        hi=200.0,
-    )
-    c_N: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="eta is multiplied by exp(-c_N (n - 1)**2)",
-        lo=0.0,
-        hi=1000.0,
-    )
-    k_SM: float = par(
-        1.0,
-        unit="1",
-        source="identity",
-        doc="PR_surge - 1 is multiplied by k_SM (this one moves the design point's margin)",
-        lo=0.2,
-        hi=5.0,
-    )
-    a_SM: float = par(
-        0.0,
-        unit="1",
-        source="identity",
-        doc="PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)",
-        lo=-0.9,
-        hi=0.9,
-    )
+    a_SM: float = _bend(0.0, "PR_surge - 1 is multiplied by 1 + a_SM tanh((n - 1)/0.1)", -0.9, 0.9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -429,59 +396,40 @@ class ScaledMap(Parametric):
     @derived
     def function(self) -> ca.Function:
         """(n, beta, RNI) -> W, PR, eta, for a compressor SM, and off."""
-        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
-        out = self._bent(n, beta, RNI, self.cal)
+        n, beta, RNI, t = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI"), self.table
+        N_held, y = table_logs(t)(self.N_map_des * n, beta)
+        surge = surge_function(t) if t.kind == "compressor" else None
+        out = self._scaled(N_held, ca.vertsplit(y), RNI, surge)
+        out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
         names = ["n", "beta", "RNI"]
         return ca.Function("scaled_map", [n, beta, RNI], list(out.values()), names, list(out))
 
     @derived
-    def calibrated(self) -> ca.Function:
-        """As ``function`` with the numbers of the calibration as fourth argument.
-
-        (n, beta, RNI, cal) with cal of shape (6,) in the order of :class:`MapCalibration`'s fields,
-        for derivatives by them.
-        """
-        n, beta, RNI = ca.MX.sym("n"), ca.MX.sym("beta"), ca.MX.sym("RNI")
-        fields = [f.name for f in dataclasses.fields(MapCalibration)]
-        cal = ca.MX.sym("cal", len(fields))
-        numbers = SimpleNamespace(**dict(zip(fields, ca.vertsplit(cal), strict=True)))
-        out = self._bent(n, beta, RNI, numbers)
-        args, names = [n, beta, RNI, cal], ["n", "beta", "RNI", "cal"]
-        return ca.Function("calibrated_map", args, list(out.values()), names, list(out))
-
-    def _bent(self, n: ca.MX, beta: ca.MX, RNI: ca.MX, cal: Any) -> dict[str, ca.MX]:
-        """Return the outputs by name, with the numbers of ``cal`` floats or symbols."""
-        t = self.table
-        N_held, y = _log_map(t)(self.N_map_des * n, beta)
-        surge = surge_function(t) if t.kind == "compressor" else None
-        out = self._scaled(N_held, ca.vertsplit(y), RNI, cal, surge)
-        out["off"] = off_function(t)(self.N_map_des * n, beta)[0]
-        return {k: out[k] for k in MapPoint._fields if k in out}
-
-    @derived
-    def _design_logs(self) -> tuple[float, float, float]:
+    def design_logs(self) -> tuple[float, float, float]:
         """ln W, ln(PR - 1), ln eta of the table where the design point lies."""
-        _, y = _log_map(self.table)(self.N_map_des, self.beta_des)
+        _, y = table_logs(self.table)(self.N_map_des, self.beta_des)
         W, PR, eta = np.asarray(y).ravel().tolist()
         return W, PR, eta
 
     def _scaled(
-        self, N_held: Any, y: list[Any], RNI: Any, cal: Any, surge: Callable[[Any], Any] | None
+        self, N_held: Any, y: list[Any], RNI: Any, surge: Callable[[Any], Any] | None
     ) -> dict[str, Any]:
         """Scale and bend what the table says: W, PR, eta, and SM if there is a surge line.
 
         ``surge`` gives the unscaled line's pressure ratio by the unscaled flow.
         """
-        des = self._design_logs
-        held = N_held / self.N_map_des  # > 0, so that powers of it exist
-        W = self.W_des * ca.exp(y[0] - des[0]) * held**cal.a_W
+        des, cal = self.design_logs, self.cal
+        held = per(N_held, self.N_map_des)  # > 0, so that powers of it exist
+        # powers are written as exponentials, which are cheaper when differentiated
+        W = self.W_des * ca.exp(y[0] - des[0] + cal.a_W * ca.log(held))
         PR = 1 + (self.PR_des - 1) * ca.exp(y[1] - des[1])
         # ln((PR - 1)/(PR_des - 1)) is y - des itself
         droop = cal.c_PR * (y[1] - des[1]) ** 2 + cal.c_N * (held - 1) ** 2
-        eta = 1 - (1 - self.eta_des * ca.exp(y[2] - des[2] - droop)) * RNI ** (-cal.n_Re)
+        loss = 1 - self.eta_des * ca.exp(y[2] - des[2] - droop)
+        eta = 1 - loss * ca.exp(-cal.n_Re * ca.log(RNI))
         out = {"W": W, "PR": PR, "eta": eta}
         if surge is not None:
-            line = (surge(self._table_flow(W)) - 1) * (self.PR_des - 1) / math.exp(des[1])
+            line = (surge(self._table_flow(W)) - 1) * per(self.PR_des - 1, ca.exp(des[1]))
             # a tilt about n = 1 that saturates: a power law fitted above the design speed would
             # move the whole surge line at part speed, about which it knows nothing
             tilt = 1 + cal.a_SM * ca.tanh((held - 1) / TILT_WIDTH)
@@ -490,7 +438,7 @@ class ScaledMap(Parametric):
 
     def _table_flow(self, W: Any) -> Any:
         """Flow of the table that stands for a scaled flow."""
-        return W / self.W_des * math.exp(self._design_logs[0])
+        return W * per(ca.exp(self.design_logs[0]), self.W_des)
 
     def at(self, n: Any, beta: Any, RNI: Any, cell: Any, surge: Any = None) -> tuple[MapPoint, Any]:
         """Read the map at a point of a known cell; plain expressions, also of SX.
@@ -507,7 +455,7 @@ class ScaledMap(Parametric):
         t = self.table
         N_held, y = surface_logs(t, self.N_map_des * n, beta, cell)
         line = None if surge is None else lambda W: surge_PR(t, W, surge)
-        out = self._scaled(N_held, y, RNI, self.cal, line)
+        out = self._scaled(N_held, y, RNI, line)
         off = off_function(t)(self.N_map_des * n, beta)[0]
         return MapPoint(out["W"], out["PR"], out["eta"], out.get("SM"), off), self._table_flow(
             out["W"]

@@ -17,8 +17,10 @@ import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import OperatingPointError, SignalError
+from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.gaspath.steady.trimkernel import AMBIENT, LAW, N_FIRST, NZ
+from apu_casadi.gaspath.health import HEALTH_RANGE
+from apu_casadi.gaspath.steady.trimkernel import LAW, N_FIRST, NZ
 
 GIVEN = ("T0", "P0", "T1", "P1", "T2", "P2", "off_c", "off_t", "residual", "P_acceleration")
 """Outputs that cannot be fixed: the ambient gives them, or the equations."""
@@ -311,7 +313,7 @@ def stop_text(
 
 def input_ranges(gg: GasGenerator) -> dict[str, tuple[float, float]]:
     """Lowest and highest value of ambient inputs and health factors, by name."""
-    return gg.input_ranges | {n: (0.3, 2.0) for n in gg.THETA.names}
+    return gg.input_ranges | dict.fromkeys(gg.THETA.names, HEALTH_RANGE)
 
 
 def range_text(gg: GasGenerator, p: np.ndarray) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from apu_casadi.core.checked import array
 from apu_casadi.core.errors import SignalError, nearest
-from apu_casadi.gaspath.conditions import DEFAULT_DAY
+from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import (
     MEANING,
@@ -31,7 +31,7 @@ from apu_casadi.gaspath.steady.steadypoint import (
     stop_text,
 )
 from apu_casadi.gaspath.steady.trimbranch import Roots, may_fold, settle
-from apu_casadi.gaspath.steady.trimkernel import AMBIENT, DIRECT, NZ
+from apu_casadi.gaspath.steady.trimkernel import DIRECT, NZ
 from apu_casadi.gaspath.steady.trimsolver import (
     COMPILE_FROM,
     FLOORS,
@@ -210,20 +210,23 @@ def trim_batch(
     for k, a in enumerate(arrays):
         p[k] = np.broadcast_to(a, shape).reshape(-1)
     solver = solver_of(gg, spec)
-    out = _Arrays(len(keep), M)
+    out = _Arrays(rows, M)
     for k in range(0, M, CHUNK):
-        _solve_chunk(solver, limits, p[:, k : k + CHUNK], rows, k, out, n_threads, M)
-    return TrimBatch(
-        out.y, keep, out.w, p, names, out.status, out.residual, out.reached, out.iterations, shape,
-        out.N_second, gg, limits, out.stop,
-    )  # fmt: skip
+        _solve_chunk(out, k, solver, limits, p[:, k : k + CHUNK], n_threads)
+    solved = {k: getattr(out, k) for k in _SOLVED}
+    asked: dict[str, Any] = {"names": keep, "p": p, "fixed": names, "shape": shape}
+    return TrimBatch(**solved, **asked, _gg=gg, _limits=limits, _stop=out.stop)
+
+
+_SOLVED = ["y", "w", "status", "residual", "reached", "iterations", "N_second"]
 
 
 class _Arrays:
-    """What a batch fills."""
+    """What a batch of M points fills; ``rows`` are the outputs that are kept."""
 
-    def __init__(self, n_y: int, M: int) -> None:
-        self.y, self.w = np.full((n_y, M), np.nan), np.full((NZ + 3, M), np.nan)
+    def __init__(self, rows: list[int], M: int) -> None:
+        self.rows, self.size = rows, M
+        self.y, self.w = np.full((len(rows), M), np.nan), np.full((NZ + 3, M), np.nan)
         self.status = np.full(M, Status.INPUT, dtype=np.int8)
         self.residual, self.reached = np.full(M, np.inf), np.zeros(M)
         self.iterations = np.full(M, -1, dtype=np.int32)
@@ -232,9 +235,9 @@ class _Arrays:
 
 
 def _solve_chunk(
-    solver: Solver, limits: Limits, p: np.ndarray, rows: list[int], first: int, out: _Arrays,
-    n_threads: int | None, total: int,
-) -> None:  # fmt: skip
+    out: _Arrays, first: int, solver: Solver, limits: Limits, p: np.ndarray, n_threads: int | None
+) -> None:
+    """Solve the points ``p``, which begin at ``first``."""
     gg = solver.gg
     valid = np.all(np.isfinite(p), axis=0)
     for k, name in enumerate((*AMBIENT, *gg.THETA.names)):
@@ -244,7 +247,7 @@ def _solve_chunk(
     if not index.size:
         return
     p = p[:, index]
-    compile = total >= COMPILE_FROM
+    compile = out.size >= COMPILE_FROM
     w, y, r, _s, count = solver.many("cold", p, n_threads=n_threads, compile=compile)
     residual, reached = norms(r), np.ones(index.size)
     count = count[0].round().astype(np.int32)
@@ -293,7 +296,7 @@ def _solve_chunk(
     at = first + index
     out.status[at], out.reached[at], out.iterations[at] = status, reached, count
     out.residual[at] = np.where(solved, residual, np.inf)
-    out.y[:, at] = np.where(solved, y[rows], np.nan)
+    out.y[:, at] = np.where(solved, y[out.rows], np.nan)
     out.w[:, at] = np.where(solved, w, np.nan)
 
 
@@ -328,10 +331,9 @@ def performance_deck(
     grid = {k: np.atleast_1d(array(k, v)) for k, v in axes.items()}
     mesh = dict(zip(grid, np.meshgrid(*grid.values(), indexing="ij", sparse=True), strict=True))
     N = gg.parameters.N if N is None else N
-    batch = trim_batch(
-        gg, {"N": N, "PW": mesh.pop("PW")}, theta=theta, limits=limits, outputs=outputs,
-        n_threads=n_threads, **mesh,
-    )  # fmt: skip
+    fixed = {"N": N, "PW": mesh.pop("PW")}
+    how: dict[str, Any] = {"limits": limits, "outputs": outputs, "n_threads": n_threads}
+    batch = trim_batch(gg, fixed, theta=theta, **how, **mesh)
     flat = batch.to_dataset()
     dims = tuple(grid)
     data = {

@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.stations import Z
 from apu_casadi.gaspath.steady.steadypoint import Limits, Status, limit_status
-from apu_casadi.gaspath.steady.trimkernel import DIRECT, LAW, N_FIRST, N_W, Z_NAMES, Output
+from apu_casadi.gaspath.steady.trimkernel import DIRECT, LAW, N_FIRST, N_W, Output
 from apu_casadi.gaspath.steady.trimsolver import Solver, norms, origin_of, solver_of
 
 FIRST_STEP = 1e-3  # relative, of speed or T4; points closer than this count as one
@@ -62,7 +63,7 @@ def on_design_side(
     """Whether the determinant of the Jacobian has its sign of the design point, by columns."""
     origin, s0 = origin_of(solver)
     design = float(solver.one("side", s0, origin)[0][0])
-    s = solver.kernel.sought(w)
+    s = solver.sought(w)
     return solver.many("side", s, p, n_threads=1, compile=compile)[0][0] * design > 0
 
 
@@ -121,9 +122,14 @@ class _March:
     """Search in one direction of speed, or T4: where has the open quantity its value again?"""
 
     def __init__(
-        self, solver: Solver, limits: Limits, w: np.ndarray, p: np.ndarray, direction: float,
+        self,
+        solver: Solver,
+        limits: Limits,
+        w: np.ndarray,
+        p: np.ndarray,
+        direction: float,
         compile: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.solver, self.limits, self.w0, self.p, self.compile = solver, limits, w, p, compile
         spec = solver.kernel.spec
         if "N" in spec:
@@ -133,7 +139,7 @@ class _March:
         else:
             self.march = "N"
             held = next((n for n in WITH_SPEED if n in spec), next(n for n in spec if n != LAW))
-        self.row = DIRECT["N"] if self.march == "N" else Z_NAMES.index("T4")
+        self.row = DIRECT["N"] if self.march == "N" else Z.index("T4")
         self.open = next(n for n in spec if n != held)
         self.aside = solver_of(solver.gg, tuple(sorted((self.march, held))))
         self.march_first = self.aside.kernel.spec[0] == self.march
@@ -153,7 +159,7 @@ class _March:
         q = np.vstack([self.p[:N_FIRST, i], *(pair if self.march_first else pair[::-1])])
         w = w.copy()
         w[self.row] = x
-        s = self.aside.kernel.sought(w)
+        s = self.aside.sought(w)
         out = Output(*self.aside.many("warm", s, q, n_threads=1, compile=self.compile))
         return out.w, self._gap(i, out.y), norms(out.r) <= RESIDUAL_TOL
 
@@ -208,7 +214,7 @@ class _March:
             xa, xb = np.where(low, x, xa), np.where(low, xb, x)
             ga, gb = np.where(low, g, ga), np.where(low, gb, g)
             wa, wb = np.where(low, w, wa), np.where(low, wb, w)
-        s = self.solver.kernel.sought(wa)
+        s = self.solver.sought(wa)
         out = Output(*self.solver.many("warm", s, self.p[:, k], n_threads=1, compile=self.compile))
         found, margin = out.w[self.row], 1e-6 * np.abs(xa)
         residual = norms(out.r)
@@ -227,7 +233,7 @@ def _speeds(
     """
     choice = gg.compressor_map
     u = np.vstack([np.zeros((2, p.shape[1])), p[: len(gg.U) - 2]])
-    T1 = np.asarray(gg.cycle.ambient.map(u.shape[1])(u))[2]
+    T1 = np.asarray(gg.family.ambient.map(u.shape[1])(u))[2]
     unit = gg.parameters.N * np.sqrt(T1 / gg.design.values["T2"])
     n = choice.table.N / choice.N_map_des
     reach = min(limits.off_map, 1.0) * float(n[-1] - n[0])

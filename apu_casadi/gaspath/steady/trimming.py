@@ -28,6 +28,7 @@ import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import SignalError
+from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator, GasGeneratorState
 from apu_casadi.gaspath.steady.steadypoint import (
     Limits,
@@ -45,7 +46,7 @@ from apu_casadi.gaspath.steady.steadypoint import (
     stop_text,
 )
 from apu_casadi.gaspath.steady.trimbranch import Roots, may_fold, settle
-from apu_casadi.gaspath.steady.trimkernel import AMBIENT, N_FIRST, NZ
+from apu_casadi.gaspath.steady.trimkernel import N_FIRST, NZ
 from apu_casadi.gaspath.steady.trimsolver import (
     continue_one,
     norm,
@@ -137,10 +138,8 @@ def _point(
     gg: GasGenerator, w: np.ndarray, y: np.ndarray, p: np.ndarray, residual: float, total: int
 ) -> OperatingPoint:
     u = np.concatenate([w[NZ + 1 :], p[: len(AMBIENT)]])
-    theta = p[len(AMBIENT) : N_FIRST].copy()
-    return OperatingPoint(
-        w[NZ : NZ + 1], w[:NZ], u, theta, y, gg.Y.unpack(y), residual, total
-    )  # fmt: skip
+    x, z, theta = w[NZ : NZ + 1], w[:NZ], p[len(AMBIENT) : N_FIRST].copy()
+    return OperatingPoint(x, z, u, theta, y, gg.Y.unpack(y), residual, total)
 
 
 def _refuse(

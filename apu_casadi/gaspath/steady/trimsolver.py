@@ -1,4 +1,4 @@
-"""Solving steady points: compiled kernels by engine and pair of fixed quantities, continuation.
+"""Solving steady points: compiled kernels by pair of fixed quantities, continuation.
 
 :mod:`apu_casadi.gaspath.steady.trimkernel` writes the equations; here they are compiled or loaded,
 called for one point or for many, and helped along from the design point where Newton's method
@@ -17,9 +17,12 @@ import numpy as np
 from apu_casadi.core import backend
 from apu_casadi.core.errors import SignalError
 from apu_casadi.core.sharing import BUILDING, Rebuilt, building, keep, kept
-from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator, MapChoice
+from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.cycle import Cycle
+from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.steady.steadypoint import Limits, Status, limit_status
-from apu_casadi.gaspath.steady.trimkernel import AMBIENT, LAW, TrimKernel
+from apu_casadi.gaspath.steady.trimkernel import LAW, TrimKernel
 
 COMPILE_FROM = 300  # points from which compiling pays; below, a library is used if there is one
 FLOORS = (1e-3, 1e-5)  # smallest steps of a continuation; the second where the end is not clear
@@ -27,16 +30,16 @@ HOT = (("N", "PW"), ("N", "Wf"), ("N", "T4"), ("N", "T5"), ("PW", "Wf"), (LAW, "
 """Pairs worth compiling ahead of time, names sorted."""
 
 
-class Solver(Rebuilt):
-    """The kernel of one engine and one pair of fixed quantities, in the backend in use."""
+class TrimCode(Rebuilt):
+    """The kernel of a structure and a pair of fixed quantities, in the backend in use."""
 
     @building
-    def __init__(self, gg: GasGenerator, spec: tuple[str, str]) -> None:
+    def __init__(self, cycle: Cycle, spec: tuple[str, str]) -> None:
         """Compile nothing yet; functions are made or loaded when first called."""
-        self.gg, self.kernel = gg, TrimKernel(gg.cycle, spec)
-        self._digest = backend.recipe("trim", spec, gg.parameters, *map_digest(gg))
+        self.kernel = TrimKernel(cycle, spec)
+        tables = map(table_digest, (cycle.compressor, cycle.turbine))
+        self._digest = backend.recipe("trim", spec, cycle.gas_data, *tables)
         self._made: dict[tuple[str, str], Any] = {}
-        self.regular: bool | None = None
 
     def function(self, which: str, *, compile: bool) -> Any:
         """Return the kernel's function ``which``; ``compile=False`` only loads what there is."""
@@ -53,9 +56,10 @@ class Solver(Rebuilt):
             if not compile and tried in self._made:
                 return self._made[tried]
             f = backend.load_or_build(
-                f"{self._digest} {which}", lambda: getattr(self.kernel, which),
+                f"{self._digest} {which}",
+                lambda: getattr(self.kernel, which),
                 compile_missing=compile,
-            )  # fmt: skip
+            )
             loaded = compile or f.class_name() == "External"
             self._made[(which, "c") if loaded else tried] = f
             return f
@@ -70,9 +74,43 @@ class Solver(Rebuilt):
     ) -> tuple[np.ndarray, ...]:
         """Evaluate for columns; safe to call from several threads."""
         f = self.function(which, compile=compile)
-        return keep(self, "many", (which, f, n_threads), lambda: backend.mapped(f, n_threads))(
-            *args
-        )
+        many = keep(self, "many", (which, f, n_threads), lambda: backend.mapped(f, n_threads))
+        return many(*args)
+
+
+@kept
+def code_of(cycle: Cycle, spec: tuple[str, str]) -> TrimCode:
+    """Return the code of a structure and a pair of fixed quantities, made once."""
+    return TrimCode(cycle, spec)
+
+
+class Solver(Rebuilt):
+    """The steady points of one engine with one pair of fixed quantities."""
+
+    def __init__(self, gg: GasGenerator, spec: tuple[str, str]) -> None:
+        """Take the code that all engines of this structure share."""
+        self.gg, self.code = gg, code_of(gg.family.cycle, spec)
+        self.kernel, self.nominal = self.code.kernel, self.code.kernel.nominal(gg.numbers)
+        self.regular: bool | None = None
+
+    def one(self, which: str, *args: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Evaluate a function of the kernel for one point."""
+        return self.code.one(which, *args, self.gg.numbers)
+
+    def many(
+        self, which: str, *args: np.ndarray, n_threads: int | None, compile: bool = True
+    ) -> tuple[np.ndarray, ...]:
+        """Evaluate a function of the kernel for columns."""
+        c = self.gg.numbers
+        return self.code.many(which, *args, c, n_threads=n_threads, compile=compile)
+
+    def sought(self, w: np.ndarray) -> np.ndarray:
+        """Return the unknowns as sought from w = (z, N, Wf, PW), by columns."""
+        return self.kernel.sought(w, self.nominal)
+
+    def jacobian(self, s: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Return the Jacobian of the equations by the unknowns as sought."""
+        return np.asarray(self.kernel.equations(s, p, self.gg.numbers)[1].full())
 
 
 @kept
@@ -81,26 +119,21 @@ def solver_of(gg: GasGenerator, spec: tuple[str, str]) -> Solver:
     return Solver(gg, spec)
 
 
-def map_digest(gg: GasGenerator) -> list[str]:
-    """Tell the content of the maps, whose tables compare by identity."""
-
-    def of(m: MapChoice) -> str:
-        t = m.table
-        h = hashlib.sha256(repr((m.N_map_des, m.beta_des, m.calibration, t.kind)).encode())
-        for a in (t.N, t.beta, t.W, t.PR, t.eta, t.surge_W, t.surge_PR):
-            h.update(b"-" if a is None else a.tobytes() + repr(a.shape).encode())
-        return h.hexdigest()
-
-    return [of(gg.compressor_map), of(gg.turbine_map)]
+def table_digest(t: MapTable) -> str:
+    """Tell the content of a map table."""
+    h = hashlib.sha256(t.kind.encode())
+    for a in (t.N, t.beta, t.W, t.PR, t.eta, t.surge_W, t.surge_PR):
+        h.update(b"-" if a is None else a.tobytes() + repr(a.shape).encode())
+    return h.hexdigest()
 
 
 def hot_functions(gg: GasGenerator | None = None) -> list[str]:
-    """Compile the usual pairs of ``gg``, the default engine if None; return the names."""
+    """Compile the usual pairs for engines of ``gg``'s structure, the default's if None."""
     gg = GasGenerator() if gg is None else gg
     names = []
     for pair in HOT:
-        solver = solver_of(gg, pair)
-        names += [solver.function(which, compile=True).name() for which in ("cold", "warm")]
+        code = code_of(gg.family.cycle, pair)
+        names += [code.function(which, compile=True).name() for which in ("cold", "warm")]
     return names
 
 
@@ -122,26 +155,22 @@ def norms(r: np.ndarray) -> np.ndarray:
 def origin_of(solver: Solver) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters and unknowns of the design point."""
     gg, k = solver.gg, solver.kernel
-    par = gg.parameters
-    ambient = [getattr(par, n) for n in AMBIENT]
+    par, d = gg.parameters, gg.design.values
     values: list[float] = []
     for n in k.spec:
-        if n == LAW:
-            values += [k.PW_design, par.N, 3.0]
-        else:
-            values.append(_design_output(gg)[gg.Y.index(n)])
+        values += [d["PW"], par.N, 3.0] if n == LAW else [_design_output(gg)[gg.Y.index(n)]]
+    ambient = [getattr(par, n) for n in AMBIENT]
     p = np.array([*ambient, *np.ones(len(gg.THETA)), *values])
-    return p, k.design_start()
+    return p, k.design_start(gg.numbers)
 
 
 @kept
 def _design_output(gg: GasGenerator) -> np.ndarray:
-    k = TrimKernel(gg.cycle, ("N", "PW"))
     par, d = gg.parameters, gg.design
-    z = [d.z.get(n, 0.0) for n in gg.z.names]
-    z[-2:] = [gg.cycle.cmap.beta_des, gg.cycle.tmap.beta_des]
-    u = [d.values["Wf"], k.PW_design, *(getattr(par, n) for n in AMBIENT)]
-    return np.asarray(gg.equations(par.N, z, u, np.ones(len(gg.THETA)))[2]).ravel()
+    z = [*d.z.values(), *(m.beta_des for m in gg.maps)]
+    u = [d.values["Wf"], d.values["PW"], *(getattr(par, n) for n in AMBIENT)]
+    theta = gg.full(np.ones(len(gg.THETA)))
+    return np.asarray(gg.family.equations(par.N, z, u, theta)[2]).ravel()
 
 
 def on_the_way(solver: Solver, p: np.ndarray, t: float) -> np.ndarray:
@@ -178,9 +207,13 @@ def explained(gg: GasGenerator, limits: Limits, y: np.ndarray) -> np.ndarray:
 
 
 def continue_many(
-    solver: Solver, p: np.ndarray, *, floor: float, n_threads: int | None,
+    solver: Solver,
+    p: np.ndarray,
+    *,
+    floor: float,
+    n_threads: int | None,
     state: tuple[np.ndarray, ...] | None = None,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
+) -> tuple[np.ndarray, ...]:
     """As :func:`continue_one` for columns; returns w, y, r, s, t, dt."""
     origin, s0 = origin_of(solver)
     M, o = p.shape[1], origin[:, None]
@@ -223,15 +256,15 @@ def _determinant_left(solver: Solver, s: np.ndarray, p: np.ndarray, reached: flo
     """
     before = on_the_way(solver, p, max(reached - 0.02, 0.0))
     _, _, r, s_before, _ = solver.one("warm", s, before)
-    there = solver.kernel.equations(s, on_the_way(solver, p, reached))[1].full()
-    then = solver.kernel.equations(s_before, before)[1].full()
+    there = solver.jacobian(s, on_the_way(solver, p, reached))
+    then = solver.jacobian(s_before, before)
     if norm(r) > RESIDUAL_TOL or not (np.isfinite(there).all() and np.isfinite(then).all()):
         return math.inf
     return float(np.exp(np.linalg.slogdet(there)[1] - np.linalg.slogdet(then)[1]))
 
 
 def _sigma(solver: Solver, s: np.ndarray, p: np.ndarray) -> float:
-    J = solver.kernel.equations(s, p)[1].full()
+    J = solver.jacobian(s, p)
     # rows to unit size: a row's scale says nothing about a fold
     J = J / np.maximum(np.abs(J).max(axis=1, keepdims=True), 1e-300)
     if not np.all(np.isfinite(J)):

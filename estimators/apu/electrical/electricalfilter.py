@@ -12,7 +12,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, last
 from apu_casadi.machine.machinedata import MachineParameters
-from apu_casadi.machine.park import PHASE_ANGLE
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
     INPUTS,
@@ -30,7 +30,6 @@ from estimators.apu.electrical.terminalsignals import (
     GAIN_SENSORS,
     JUMP_SIZES,
     MEASURED,
-    PHASES,
     PHASES_I,
     PHASES_V,
     VOLTAGES,
@@ -58,9 +57,12 @@ from estimators.models.recording import SAME_TIME, Recording, plain_numbers
 __all__ = ["GAINS", "ElectricalFilter", "electrical_filter"]
 
 #: Harmonics that each channel consists of, for what is missing of it.
-HARMONICS_OF = {**dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3)),
-                **dict.fromkeys(("V_fd", "i_fd"), (0, 2))}  # fmt: skip
+HARMONICS_OF: dict[str, tuple[int, ...]] = dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3))
+HARMONICS_OF |= dict.fromkeys(("V_fd", "i_fd"), (0, 2))
 GAINS = ("none", "estimate", "consider")
+#: Phases onto the positive sequence; and the start of a leaky fault's admittance.
+TURN = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+Y_START = complex(LEAKY_START, -LEAKY_START)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,9 +172,8 @@ class ElectricalFilter(Parametric):
                     # what the ends are short of their readings, the middle is, too: it cancels
                     out[f"{n}_mid_smooth"] = given[f"{n}_mid"] - rest
                     out[f"{n}_next_smooth"] = np.append(p[1:], a[n][-1])
-        turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
         v, i = (
-            2 / 3 * (turn @ before(t, np.array([full[n] for n in names]), w, space=True))
+            2 / 3 * (TURN @ before(t, np.array([full[n] for n in names]), w, space=True))
             for names in (PHASES_V, PHASES_I)
         )
         p = self.machine
@@ -204,6 +205,70 @@ class ElectricalFilter(Parametric):
         Raises:
             DataError: fewer than eight samples in the period, or no voltage.
         """
+        first = _FirstPeriod.of(self.machine, samples, period)
+        at = self._start(first)
+        means = dict.fromkeys(self.model.x.names, 0.0) | at
+        means |= {n: LEAKY_START for n in ADMITTANCE.names if n in means}
+        spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
+        spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
+        spread |= {f"gain_{n}": self.sensors[n].gain for n in GAIN_SENSORS}
+        spread = {n: spread[n] for n in means}
+        for n, size in (sigma or {}).items():
+            self.model.x.index(n)
+            spread[n] = size
+        prior = Belief.of(self.model.x, means, spread)
+        e = 1e-6
+        moved = {n: self._start(first, h=e) for n in SHUNTS.names}
+        moved |= {"g_shunt": self._start(first, Y=Y_START + e)}
+        moved |= {"b_shunt": self._start(first, Y=Y_START - 1j * e)}
+        moved |= {f"gain_{n}": self._start(first, {n: -e}) for n in GAIN_SENSORS}
+        turned = np.eye(len(self.model.x))
+        for name, there in moved.items():
+            if name in self.model.x.names:
+                for n in at:
+                    change = there[n] - at[n]
+                    slope = (math.remainder(change, 2 * math.pi) if n == "theta_e" else change) / e
+                    turned[self.model.x.index(n), self.model.x.index(name)] += slope
+        return Belief(self.model.x, prior.mean, turned @ prior.cov @ turned.T)
+
+    def _start(
+        self,
+        first: _FirstPeriod,
+        share: Mapping[str, float] | None = None,
+        *,
+        h: float = 0.0,
+        Y: complex = Y_START,
+    ) -> dict[str, float]:
+        """Return the start with some readings taken for more by a share of them, a fault."""
+        p, turn = self.machine, TURN
+        by = [1 + (share or {}).get(n, 0.0) for n in (*PHASES_V, *PHASES_I, "i_fd")]
+        v, i = (complex(x * k @ turn) / 3 for x, k in ((first.v, by[:3]), (first.i, by[3:6])))
+        i_0 = float((first.i * by[3:6]).sum().real) / 3
+        i += h * v / (3 * p.r_s)
+        i_shunt = 0.0
+        if self.kappa is not None:
+            k = PHASES.index(str(self.phase))
+            drawn = -Y / p.r_s * first.v[k] * by[k]
+            i_shunt = float(drawn.real)
+            i -= drawn * turn[k] / 3
+            i_0 -= i_shunt / 3
+        at = balanced_state(p, v=v, i=i, w_r=first.w, i_fd=first.i_fd * by[6], i_0=i_0)
+        return at if self.kappa is None else at | {"i_shunt": i_shunt}
+
+
+@dataclass(frozen=True, eq=False)
+class _FirstPeriod:
+    """Phasors of the first electrical period: speed, voltages, currents, mean field current."""
+
+    w: float
+    v: np.ndarray
+    i: np.ndarray
+    i_fd: float
+
+    @classmethod
+    def of(
+        cls, machine: MachineParameters, samples: Mapping[str, Any], period: float | None
+    ) -> _FirstPeriod:
         names = ("t", "w_r", *VOLTAGES, *MEASURED)
         a = {n: plain_numbers(samples[n], n, gaps=True) for n in names}
         a = usable(a, ("w_r", *VOLTAGES))
@@ -220,57 +285,16 @@ class ElectricalFilter(Parametric):
         a = {n: v[first] for n, v in a.items()}
         tau = a["t"] - start_at
         basis = np.column_stack([np.cos(w * tau), -np.sin(w * tau), np.ones_like(tau)])
-        turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
 
         def phasors(names: Sequence[str]) -> np.ndarray:
             c = np.linalg.lstsq(basis, np.column_stack([a[n] for n in names]), rcond=None)[0]
             return np.asarray(c[0] + 1j * c[1])
 
-        v_abc, i_abc = phasors(PHASES_V), phasors(PHASES_I)
-        v = complex(v_abc @ turn) / 3
-        if abs(v) < 0.05 * self.machine.V_rated_rms:
-            raise DataError(f"no voltage to start from: positive sequence {abs(v):.3g} V")
-        p, i_fd, e = self.machine, float(a["i_fd"].mean()), 1e-6
-
-        Y_0 = complex(LEAKY_START, -LEAKY_START)
-
-        def start(share: Mapping[str, float], h: float = 0.0, Y: complex = Y_0) -> dict[str, float]:
-            """Return the start with some readings taken for more by a share of them, a fault."""
-            by = [1 + share.get(n, 0.0) for n in (*PHASES_V, *PHASES_I, "i_fd")]
-            v, i = (complex(x * k @ turn) / 3 for x, k in ((v_abc, by[:3]), (i_abc, by[3:6])))
-            i_0 = float((i_abc * by[3:6]).sum().real) / 3
-            i += h * v / (3 * p.r_s)
-            if self.kappa is None:
-                return balanced_state(p, v=v, i=i, w_r=w, i_fd=i_fd * by[6], i_0=i_0)
-            k = PHASES.index(str(self.phase))
-            i_shunt = -Y / p.r_s * v_abc[k] * by[k]
-            i -= i_shunt * turn[k] / 3
-            i_0 -= i_shunt.real / 3
-            there = balanced_state(p, v=v, i=i, w_r=w, i_fd=i_fd * by[6], i_0=i_0)
-            return there | {"i_shunt": float(i_shunt.real)}
-
-        at = start({})
-        means = dict.fromkeys(self.model.x.names, 0.0) | at
-        means |= {n: LEAKY_START for n in ADMITTANCE.names if n in means}
-        spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
-        spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
-        spread |= {f"gain_{n}": self.sensors[n].gain for n in GAIN_SENSORS}
-        spread = {n: spread[n] for n in means}
-        for n, size in (sigma or {}).items():
-            self.model.x.index(n)
-            spread[n] = size
-        prior = Belief.of(self.model.x, means, spread)
-        moved = {n: start({}, e) for n in SHUNTS.names}
-        moved |= {"g_shunt": start({}, Y=Y_0 + e), "b_shunt": start({}, Y=Y_0 - 1j * e)}
-        moved |= {f"gain_{n}": start({n: -e}) for n in GAIN_SENSORS}
-        turned = np.eye(len(self.model.x))
-        for name, there in moved.items():
-            if name in self.model.x:
-                for n in at:
-                    change = there[n] - at[n]
-                    slope = (math.remainder(change, 2 * math.pi) if n == "theta_e" else change) / e
-                    turned[self.model.x.index(n), self.model.x.index(name)] += slope
-        return Belief(self.model.x, prior.mean, turned @ prior.cov @ turned.T)
+        v, i = phasors(PHASES_V), phasors(PHASES_I)
+        size = abs(complex(v @ TURN) / 3)
+        if size < 0.05 * machine.V_rated_rms:
+            raise DataError(f"no voltage to start from: positive sequence {size:.3g} V")
+        return cls(w, v, i, float(a["i_fd"].mean()))
 
 
 def _middles(t: np.ndarray, v: np.ndarray, w_r: np.ndarray, jumped: np.ndarray) -> np.ndarray:

@@ -10,10 +10,11 @@ import numpy as np
 
 from apu_casadi.core.errors import EstimationError
 from apu_casadi.core.signals import Signals
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import LEAKY, shunt_parameters
 from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.machinemodel import leaky_pair
-from estimators.apu.electrical.terminalsignals import ADMITTANCE, PHASES
+from estimators.apu.electrical.terminalsignals import ADMITTANCE
 from estimators.apu.electrical.tuning import FAULT_LEVEL, LEAST_SUSCEPTANCE
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
@@ -57,7 +58,7 @@ def faulty_phase(belief: Belief | FilterResult, *, level: float = FAULT_LEVEL) -
     """
     b = belief.final if isinstance(belief, FilterResult) else belief
     names = [f"h_{k}" for k in PHASES]
-    if any(n not in b.x for n in names):
+    if any(n not in b.x.names for n in names):
         raise EstimationError(
             f"faulty_phase needs {', '.join(names)}; the belief has {', '.join(b.x.names)}"
         )

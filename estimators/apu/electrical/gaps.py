@@ -31,8 +31,9 @@ def usable(a: Mapping[str, np.ndarray], inputs: Sequence[str]) -> dict[str, np.n
     for n, v in a.items():
         if np.isinf(v).any():
             k = int(np.argmax(np.isinf(v)))
-            raise DataError(f"{n} is infinite at t = {a['t'][k]:.9g} s (sample {k}); what is "
-                            "missing is NaN")  # fmt: skip
+            raise DataError(
+                f"{n} is infinite at t = {a['t'][k]:.9g} s (sample {k}); what is missing is NaN"
+            )
     a = {n: v[np.isfinite(a["t"])] for n, v in a.items()}
     there = np.flatnonzero(np.all([np.isfinite(a[n]) for n in inputs], axis=0))
     if not there.size:

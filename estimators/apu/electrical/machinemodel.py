@@ -37,15 +37,15 @@ found again within a few samples, and h keeps what it knew.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import casadi as ca
-import numpy as np
 
 from apu_casadi.core.sharing import remade
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.machine.machinedata import MachineParameters
-from apu_casadi.machine.park import PHASE_ANGLE, Abc, Qd0, abc_to_qd0, qd0_to_abc
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES, Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.terminals import (
     ANGLE,
     FLUXES,
@@ -69,7 +69,6 @@ from estimators.apu.electrical.terminalsignals import (
     KEEP,
     LATER,
     MEASURED,
-    PHASES,
     PHASES_V,
     PREDICTED,
     VOLTAGES,
@@ -137,6 +136,120 @@ def _exponential(z: Any) -> tuple[Any, Any, Any, Any]:
     return (ca.exp(z), *weights)
 
 
+def _signals(
+    power: bool, leaky: bool, with_gains: bool
+) -> tuple[Signals, Signals, Signals, Signals]:
+    """States, inputs, parameters and noises of the model."""
+    X = [*FLUXES, ANGLE, *([I_SHUNT] if leaky else []), *([ENERGY] if power else [])]
+    U = [*INPUTS, *LATER, *JUMP_SIZES, DT_LAST, *([KEEP] if power else [])]
+    what = "relative gain error of the sensor of {}"
+    gain = [Signal(f"gain_{n}", "1", what.format(n), 0.0, 0.01) for n in GAIN_SENSORS if with_gains]
+    what = "error of the measured {} over its standard deviation"
+    W = [Signal(f"w_{n}", "1", what.format(n)) for n in (*VOLTAGES, "w_r")]
+    what = "unknown course of a jump of the voltage, {} axis"
+    W += [Signal(f"w_jump_{n}", "1", what.format(n)) for n in "qd0"]
+    par = [*(ADMITTANCE if leaky else SHUNTS), *gain]
+    return (Signals(X), Signals([*U, *(PREDICTED if with_gains else ())]), Signals(par), Signals(W))
+
+
+class _Readings(NamedTuple):
+    """Voltages and speed as the readings tell them.
+
+    Args:
+        start, middle, end: what the terminals see in a step.
+        predicted: voltages that the state holds at the sample.
+        added, added_qd0: what is added to the state for the reading at this sample: minus its
+            error, and, where the state holds a prediction in its place, what the reading is more
+            than that; on the rotor's axes by the reference angle.
+        reference: the angle of which the errors know nothing.
+        factor: true over reading, by sensor; with gains only.
+    """
+
+    start: Terminals
+    middle: Terminals
+    end: Terminals
+    predicted: Terminals
+    added: dict[str, Any]
+    added_qd0: Qd0
+    reference: Any
+    factor: dict[str, Any]
+
+
+def _readings(
+    sensors: SensorSet,
+    theta_e: Any,
+    u: Mapping[str, Any],
+    par: Mapping[str, Any],
+    w: Mapping[str, Any],
+    dt: Any,
+    with_gains: bool,
+) -> _Readings:
+    """Measured -> true: reading = (1 + gain) v + error; the next sample's error is that state's."""
+    rate_noise = sensors["w_r"].noise * (u["w_r"] if sensors["w_r"].relative else 1.0)
+    w_r = u["w_r"] - rate_noise * w["w_w_r"]
+    error = {n: sensors.sigma(n, 0.0) * w[f"w_{n}"] for n in VOLTAGES}
+    added = {n: -error[n] for n in VOLTAGES}
+    factor = {}
+    if with_gains:
+        factor = {n: 1.0 / (1.0 + par[f"gain_{n}"]) for n in GAIN_SENSORS}
+        added = {n: u[n] - u[f"{n}_smooth"] - error[n] for n in VOLTAGES}
+        now, mid, then = (
+            {n: factor[n] * u[f"{n}{when}_smooth"] for n in VOLTAGES}
+            for when in ("", "_mid", "_next")
+        )
+        reference = u["theta_smooth"]
+    else:
+        now, mid, then = ({n: u[f"{n}{when}"] for n in VOLTAGES} for when in ("", "_mid", "_next"))
+        reference = theta_e
+    added_qd0 = abc_to_qd0(reference, Abc(*(added[n] for n in PHASES_V)))
+    for n, a in zip(PHASES_V, qd0_to_abc(theta_e, added_qd0), strict=True):
+        added[n] = a if with_gains else added[n]
+
+    def seen(v: Mapping[str, Any], share: Mapping[str, Any]) -> Terminals:
+        phases = Abc(*(v[n] + share[n] * added[n] for n in PHASES_V))
+        return Terminals(w_r, phases, v["V_fd"] + share["V_fd"] * added["V_fd"])
+
+    amid = dict.fromkeys(VOLTAGES, middle_weight(u["w_r"], dt)) | {"V_fd": 0.5}
+    start, end = seen(now, dict.fromkeys(VOLTAGES, 1.0)), seen(then, dict.fromkeys(VOLTAGES, 0.0))
+    predicted = Terminals(w_r, Abc(*(now[n] for n in PHASES_V)), now["V_fd"])
+    middle = seen(mid, amid)
+    # in the middle, so that currents and rotor follow it; 2/3 of the middle counts in the integral
+    sizes = zip("qd0", (u["jump_qd"], u["jump_qd"], u["jump_0"]), strict=True)
+    jump = Qd0(*(1.5 * JUMP_SHARE * size * w[f"w_jump_{n}"] for n, size in sizes))
+    jump_abc = qd0_to_abc(theta_e, jump)
+    middle = middle._replace(v=Abc(*(a + b for a, b in zip(middle.v, jump_abc, strict=True))))
+    return _Readings(start, middle, end, predicted, added, added_qd0, reference, factor)
+
+
+class _Branch:
+    """The branch of a leaky fault, L di/dt = -v - R i, with an exact step of its own."""
+
+    def __init__(
+        self, p: MachineParameters, kappa: float, phase: str, par: Mapping[str, Any]
+    ) -> None:
+        g, b = par["g_shunt"], par["b_shunt"]
+        self.mu, k_rf = leaky_pair(p, kappa, g, b)
+        angle = PHASE_ANGLE[phase]
+        self.fault = {"mu": self.mu, "k_rf": k_rf, "kappa": kappa, "phase_angle": angle}
+        self.phase = phase
+        self.decay_rate = p.w_rated * g / b  # R/L
+        self.per_volt = p.w_rated * (g**2 + b**2) / b / p.r_s  # 1/L
+
+    def corrected(self, i: Any, u: Mapping[str, Any], added: Mapping[str, Any]) -> Any:
+        """Its current with what the reading at this sample adds."""
+        _, _, mid, last = _exponential(-self.decay_rate * u["dt_last"])
+        last += mid * middle_weight(u["w_r"], u["dt_last"])
+        return i - u["dt_last"] * self.per_volt * last * added[f"v_{self.phase}"]
+
+    def step(self, i: Any, seen: _Readings, dt: Any) -> Any:
+        """Its current at the next sample."""
+        decay, *weights = _exponential(-self.decay_rate * dt)
+        k = PHASES.index(self.phase)
+        course = seen.start, seen.middle, seen.end
+        driven = sum(c * there.v[k] for c, there in zip(weights, course, strict=True))
+        return decay * i - dt * self.per_volt * driven
+
+
 @remade
 def electrical_model(
     p: MachineParameters,
@@ -155,85 +268,28 @@ def electrical_model(
         kappa, phase: leakage partition and faulty phase of a leaky fault, or None and None.
         with_gains: whether the model has gain errors, and predictions of the readings as inputs.
     """
-    leaky = kappa is not None
-    X = FLUXES + Signals([ANGLE]) + Signals([I_SHUNT] if leaky else [])
-    X = X + Signals([ENERGY] if power else [])
-    U = INPUTS + LATER + JUMP_SIZES + Signals([DT_LAST]) + Signals([KEEP] if power else [])
-    U = U + (PREDICTED if with_gains else Signals())
-    gain = Signals(
-        [Signal(f"gain_{n}", "1", f"relative gain error of the sensor of {n}", default=0.0,
-                nominal=0.01) for n in GAIN_SENSORS if with_gains]
-    )  # fmt: skip
-    PAR = (ADMITTANCE if leaky else SHUNTS) + gain
-    W = Signals(
-        [Signal(f"w_{n}", "1", f"error of the measured {n} over its standard deviation")
-         for n in (*VOLTAGES, "w_r")]
-        + [Signal(f"w_jump_{n}", "1", f"unknown course of a jump of the voltage, {n} axis")
-           for n in "qd0"]
-    )  # fmt: skip
+    X, U, PAR, W = _signals(power, kappa is not None, with_gains)
     (xv, x), (uv, u), (pv, par), (wv, w) = X.sx(), U.sx(), PAR.sx(), W.sx()
     dt = ca.SX.sym("dt")
-
-    # measured -> true: reading = (1 + gain) v + error; the next sample's error is that state's
-    rate_noise = sensors["w_r"].noise * (u["w_r"] if sensors["w_r"].relative else 1.0)
-    w_r = u["w_r"] - rate_noise * w["w_w_r"]
-    error = {n: sensors.sigma(n, 0.0) * w[f"w_{n}"] for n in VOLTAGES}
-    share = dict.fromkeys(VOLTAGES, middle_weight(u["w_r"], dt)) | {"V_fd": 0.5}
-    # what is added to the state for the reading at this sample: minus its error, and, where the
-    # state holds a prediction in its place, what the reading is more than that
-    added = {n: -error[n] for n in VOLTAGES}
-    if with_gains:
-        factor = {n: 1.0 / (1.0 + par[f"gain_{n}"]) for n in GAIN_SENSORS}
-        added = {n: u[n] - u[f"{n}_smooth"] - error[n] for n in VOLTAGES}
-        now, mid, then = (
-            {n: factor[n] * u[f"{n}{when}_smooth"] for n in VOLTAGES}
-            for when in ("", "_mid", "_next")
-        )
-        reference = u["theta_smooth"]
-    else:
-        now, mid, then = ({n: u[f"{n}{when}"] for n in VOLTAGES} for when in ("", "_mid", "_next"))
-        reference = x["theta_e"]
-    added_qd0 = abc_to_qd0(reference, Abc(*(added[n] for n in PHASES_V)))
-    for n, a in zip(PHASES_V, qd0_to_abc(x["theta_e"], added_qd0), strict=True):
-        added[n] = a if with_gains else added[n]
-    start, middle, end = (
-        Terminals(w_r, Abc(*(v[n] + c[n] * added[n] for n in PHASES_V)),
-                  v["V_fd"] + c["V_fd"] * added["V_fd"])
-        for v, c in ((now, dict.fromkeys(VOLTAGES, 1.0)), (mid, share),
-                     (then, dict.fromkeys(VOLTAGES, 0.0)))
-    )  # fmt: skip
-
-    # in the middle, so that currents and rotor follow it; 2/3 of the middle counts in the integral
-    sizes = zip("qd0", (u["jump_qd"], u["jump_qd"], u["jump_0"]), strict=True)
-    jump = Qd0(*(1.5 * JUMP_SHARE * size * w[f"w_jump_{n}"] for n, size in sizes))
-    jump_abc = qd0_to_abc(x["theta_e"], jump)
-    middle = middle._replace(v=Abc(*(a + b for a, b in zip(middle.v, jump_abc, strict=True))))
-
+    seen = _readings(sensors, x["theta_e"], u, par, w, dt, with_gains)
     # x(k) = s(k) + G (reading - error - what s(k) holds of it)
-    more = held(p, w_r=u["w_r"], dt=u["dt_last"], v=added_qd0, V_fd=added["V_fd"])
+    added = seen.added
+    more = held(p, w_r=u["w_r"], dt=u["dt_last"], v=seen.added_qd0, V_fd=added["V_fd"])
     at = dict(x)
     for n, e in zip(FLUXES.names, more, strict=True):
         at[n] = x[n] + e
-    if leaky:
-        assert kappa is not None
-        mu, k_rf = leaky_pair(p, kappa, par["g_shunt"], par["b_shunt"])
-        fault = {"mu": mu, "k_rf": k_rf, "kappa": kappa, "phase_angle": PHASE_ANGLE[str(phase)]}
-        # L di/dt = -v - R i, with R/L and 1/L
-        decay_rate = p.w_rated * par["g_shunt"] / par["b_shunt"]
-        per_volt = p.w_rated * (par["g_shunt"] ** 2 + par["b_shunt"] ** 2) / par["b_shunt"] / p.r_s
-        _, _, mid, last = _exponential(-decay_rate * u["dt_last"])
-        last += mid * middle_weight(u["w_r"], u["dt_last"])
-        at["i_shunt"] = x["i_shunt"] - u["dt_last"] * per_volt * last * added[f"v_{phase}"]
-    else:
-        fault = {n: par[n] for n in SHUNTS.names}
+    branch = None if kappa is None else _Branch(p, kappa, str(phase), par)
+    if branch is not None:
+        at["i_shunt"] = branch.corrected(x["i_shunt"], u, added)
+    fault = {n: par[n] for n in SHUNTS.names} if branch is None else branch.fault
 
     def equations(s: Any, there: Terminals) -> tuple[dict[str, Any], dict[str, Any]]:
         d = X.unpack(s)
         lam = Windings(*(d[n] for n in FLUXES.names))
+        i_fault = None if branch is None else d["i_shunt"] / branch.mu
         return terminal_equations(
-            p, lam=lam, theta_e=d["theta_e"], at=there, fault=fault,
-            i_fault=d["i_shunt"] / mu if leaky else None,
-        )  # fmt: skip
+            p, lam=lam, theta_e=d["theta_e"], at=there, fault=fault, i_fault=i_fault
+        )
 
     def rate(s: Any, there: Terminals) -> Any:
         # a leaky fault's current follows the voltages alone, and has a step of its own
@@ -241,44 +297,24 @@ def electrical_model(
         return X.stack({n: rates[n] for n in X.names})
 
     s0 = X.stack(at)
-    x1 = advance(rate, s0, start, middle, end, dt)
-    if leaky:
-        decay, *weights = _exponential(-decay_rate * dt)
-        k = PHASES.index(str(phase))
-        driven = sum(c * there.v[k] for c, there in zip(weights, (start, middle, end), strict=True))
-        x1[X.index("i_shunt")] = decay * at["i_shunt"] - dt * per_volt * driven
-    y = equations(s0, start)[1]
+    x1 = advance(rate, s0, seen.start, seen.middle, seen.end, dt)
+    if branch is not None:
+        x1[X.index("i_shunt")] = branch.step(at["i_shunt"], seen, dt)
+    y = equations(s0, seen.start)[1]
     read = [y[n] for n in MEASURED]
     if with_gains:
         # what the state predicts, and apart from it what the reading adds, by the reference angle
-        first = equations(xv, Terminals(w_r, Abc(*(now[n] for n in PHASES_V)), now["V_fd"]))[1]
+        first = equations(xv, seen.predicted)[1]
         i_more = currents(p, more)
-        extra = [*qd0_to_abc(reference, i_more.stator), i_more.fd]
+        extra = [*qd0_to_abc(seen.reference, i_more.stator), i_more.fd]
         read = [
-            first[n] + e + (1.0 - factor[n]) * u[f"{n}_smooth"]
+            first[n] + e + (1.0 - seen.factor[n]) * u[f"{n}_smooth"]
             for n, e in zip(MEASURED, extra, strict=True)
         ]
     if power:
         x1[X.index("energy")] = u["keep"] * x["energy"] + dt * y["P_total"]
-    name = f"electrical_{'leaky' if leaky else 'shunts'}"
+    name = f"electrical_{'shunts' if branch is None else 'leaky'}"
     name += ("_power" if power else "") + ("_gains" if with_gains else "")
-    nx, none = len(X), ca.SX(0)
-    return FilterModel(
-        name,
-        X,
-        U,
-        PAR,
-        W,
-        Signals([OUTPUTS[k] for k in MEASURED]),
-        transition=ca.Function(
-            f"{name}_f", [xv, uv, pv, wv, dt], [x1, none], ["x", "u", "p", "w", "dt"],
-            ["x1", "check"], {"cse": True},
-        ),
-        output=ca.Function(
-            f"{name}_g", [xv, uv, pv, wv], [ca.vertcat(*read), none], ["x", "u", "p", "w"],
-            ["y", "check"], {"cse": True},
-        ),
-        walk=np.zeros(nx),
-        lower=np.full(nx, -np.inf),
-        upper=np.full(nx, np.inf),
-    )  # fmt: skip
+    signals = X, U, PAR, W, Signals([OUTPUTS[k] for k in MEASURED])
+    step, output = (x1, ca.SX(0)), (ca.vertcat(*read), ca.SX(0))
+    return FilterModel.of(name, signals, (xv, uv, pv, wv, dt), step, output, cse=True)

@@ -13,8 +13,8 @@ from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import RESET_LEVEL, RESET_SIGMA, RESET_WINDOW
 from estimators.filters.belief import Belief
-from estimators.filters.ekf import extended_kalman_filter
-from estimators.filters.filtering import FilterResult
+from estimators.filters.ekf import ekf_step
+from estimators.filters.filtering import FilterResult, StepMaker, run
 from estimators.models.recording import Recording
 
 __all__ = ["track", "window_power"]
@@ -25,6 +25,7 @@ def track(
     prior: Belief,
     data: Recording,
     *,
+    step: StepMaker = ekf_step,
     backend: str | None = None,
     max_resets: int = 20,
     own_level: bool | None = None,
@@ -39,6 +40,7 @@ def track(
 
     Args:
         filt, prior, data, backend: as of the filter.
+        step: makes the filter's step for the model.
         max_resets: more than these, and the model is refused.
         own_level: whether a window is compared with those before it (the first four are not judged)
             instead of with what white innovations give: where gain errors are considered (the
@@ -51,13 +53,13 @@ def track(
         EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
     """
     own_level = filt.gains == "consider" if own_level is None else own_level
-    begin = 0
+    begin, made = 0, step(filt.model)
     pieces: list[FilterResult] = []
     resets: list[float] = []
     rest = data
     mean_of = np.ones(RESET_WINDOW) / RESET_WINDOW
     while True:
-        r = extended_kalman_filter(filt.model, prior, rest, backend=backend)
+        r = run(made, prior, rest, backend=backend)
         # judged window by window; the first two after a start are not
         full = r.nis.size // RESET_WINDOW
         share = r.nis[: full * RESET_WINDOW].reshape(full, RESET_WINDOW) @ mean_of
@@ -79,13 +81,11 @@ def track(
         upto = rest.part(0, cut + 1)
         y = upto.y.copy()
         y[:, -1] = np.nan
-        r = extended_kalman_filter(
-            filt.model, prior, dataclasses.replace(upto, y=y), backend=backend
-        )
+        r = run(made, prior, dataclasses.replace(upto, y=y), backend=backend)
         pieces.append(_piece(r, cut))
         wide = np.zeros(len(filt.model.x))
         for name, s in RESET_SIGMA.items():
-            if name in filt.model.x:
+            if name in filt.model.x.names:
                 wide[filt.model.x.index(name)] = s**2
         prior = Belief(filt.model.x, r.final.mean, r.final.cov + np.diag(wide))
         begin += cut
@@ -105,19 +105,17 @@ def _usual(share: np.ndarray) -> np.ndarray:
     return out
 
 
+_COURSES = ("t", "mean", "variance", "innovation", "innovation_variance", "nis", "measured")
+
+
 def _piece(r: FilterResult, n: int) -> FilterResult:
     """Return the first n instants."""
-    return dataclasses.replace(
-        r, t=r.t[:n], mean=r.mean[:, :n], variance=r.variance[:, :n],
-        innovation=r.innovation[:, :n], innovation_variance=r.innovation_variance[:, :n],
-        nis=r.nis[:n], measured=r.measured[:n],
-    )  # fmt: skip
+    return dataclasses.replace(r, **{name: getattr(r, name)[..., :n] for name in _COURSES})
 
 
 def _joined(pieces: list[FilterResult]) -> FilterResult:
-    names = ("t", "mean", "variance", "innovation", "innovation_variance", "nis", "measured")
     joined: dict[str, Any] = {
-        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in names
+        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES
     }
     joined["loglik"] = sum(p.loglik for p in pieces)
     return dataclasses.replace(pieces[-1], **joined)

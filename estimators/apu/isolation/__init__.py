@@ -31,6 +31,6 @@ against its members by having more freedom.
 :mod:`estimators.apu.isolation.classifiers` ``glr`` and ``bank``
 :mod:`estimators.apu.isolation.scores`      confusion matrix, Cohen's kappa
 :mod:`estimators.apu.isolation.limit`       Bayes' rule in the linear problem
-:mod:`scenarios.studies.isolation_study`       fresh windows of every class
+:mod:`scenarios.studies.estimation.isolation`  fresh windows of every class
 ================================================= ==============================================
 """

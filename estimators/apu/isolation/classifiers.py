@@ -40,10 +40,12 @@ def recording_of(model: FilterModel, w: Windows, i: int, protocol: Protocol) -> 
     Wf, PW = w.reading[len(OUTPUTS) :, i]
     sensors = protocol.sensors
     # noise in proportion to the reading; the mean, since a noisy sigma would favour low readings
-    sigma = np.array([
-        protocol.noise * (protocol.h_noise if n == "h" else sensors.sigma(n, float(np.mean(v))))
-        for n, v in zip(OUTPUTS, np.nan_to_num(y), strict=True)
-    ])  # fmt: skip
+    sigma = np.array(
+        [
+            protocol.noise * (protocol.h_noise if n == "h" else sensors.sigma(n, float(np.mean(v))))
+            for n, v in zip(OUTPUTS, np.nan_to_num(y), strict=True)
+        ]
+    )
     inputs = dict(zip(AMBIENT, w.ambient[:, i], strict=True))
     inputs |= {
         "sigma_Wf": protocol.noise * sensors.sigma("Wf", float(np.mean(Wf))),

@@ -11,7 +11,8 @@ from scipy import special
 
 from apu_casadi.core.sharing import kept
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from apu_casadi.gaspath.steady.trimming import Limits, trim_gas_generator
+from apu_casadi.gaspath.steady.steadypoint import Limits
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu.isolation.evidence import class_evidence
 from estimators.apu.isolation.problem import CLASSES, DEFAULT, DT, FAULTS, OUTPUTS, Protocol
 from estimators.apu.isolation.scores import scores
@@ -45,11 +46,9 @@ def linear_problem(
     state = np.zeros((len(model.x), len(JUMPS)))
     for c, j in enumerate(JUMPS):
         state[model.x.index(j.name), c] = 1.0
-    return linear_filter(
-        y, A=F, H=H, Q=Fw @ Fw.T + DT * np.diag(model.walk**2),
-        R=np.diag(np.square(sigma)) + Hw @ Hw.T, P0=prior.cov, cross=Fw @ Hw.T,
-        names=FAULTS, state=state,
-    )  # fmt: skip
+    Q, R = Fw @ Fw.T + DT * np.diag(model.walk**2), np.diag(np.square(sigma)) + Hw @ Hw.T
+    noise = {"Q": Q, "R": R, "P0": prior.cov, "cross": Fw @ Hw.T}
+    return linear_filter(y, A=F, H=H, **noise, names=FAULTS, state=state)
 
 
 @kept

@@ -14,21 +14,14 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit.apu import Apu
 from estimators.apu.sensors import GAS_PATH, SensorSet
 
-__all__ = [
-    "CLASSES",
-    "DEFAULT",
-    "FAULTS",
-    "SNAPSHOT",
-    "Hypothesis",
-    "Protocol",
-    "severity_of_loss",
-]
+__all__ = ["CLASSES", "DEFAULT", "FAULTS", "SNAPSHOT", "Hypothesis", "Protocol", "severity_of_loss"]
 
 DT = 0.02  # s
 HEALTH = GasGenerator.THETA.names
-GAINS = ("P3", "T3", "T5", "Wf", "PW")
-OUTPUTS = ("N", "P3", "T3", "T5", "h")
-FAULTS = (*HEALTH, "gain_P3", "gain_T3", "gain_T5", "loss")
+GAINS = (*GAS_PATH.uncertain, "PW")
+OUTPUTS = (*GAS_PATH.outputs, "h")
+READ = tuple(n for n in GAS_PATH.outputs if n in GAINS)  # sensors of which a fault is told
+FAULTS = (*HEALTH, *(f"gain_{n}" for n in READ), "loss")
 """Directions in which something may jump; ``loss`` is shaft power lost in the generators, over the
 design power."""
 
@@ -63,8 +56,10 @@ class Hypothesis:
         """Mean and variance of a normal distribution of sizes that covers the ranges."""
         mean = [float(np.mean(r)) for r in self.ranges]
         # sqrt(3) wider than the uniform one: the filter's start, divided out again afterwards
-        var = [3 * float(np.mean([(a * a + a * b + b * b) / 3 for a, b in r])) - 3 * m * m
-               for r, m in zip(self.ranges, mean, strict=True)]  # fmt: skip
+        var = [
+            3 * float(np.mean([(a * a + a * b + b * b) / 3 for a, b in r])) - 3 * m * m
+            for r, m in zip(self.ranges, mean, strict=True)
+        ]
         return np.array(mean), np.array(var)
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
@@ -85,9 +80,7 @@ CLASSES = (
     Hypothesis("compressor pair", ("f_eta_c", "f_W_c"), ((LOSS,), (LOSS,))),
     Hypothesis("turbine pair", ("f_eta_t", "f_W_t"), ((LOSS,), EITHER)),
     Hypothesis("TTSC", ("loss",), ((GAIN,),)),
-    Hypothesis("P3 sensor", ("gain_P3",), (EITHER,)),
-    Hypothesis("T3 sensor", ("gain_T3",), (EITHER,)),
-    Hypothesis("T5 sensor", ("gain_T5",), (EITHER,)),
+    *(Hypothesis(f"{n} sensor", (f"gain_{n}",), (EITHER,)) for n in READ),
 )
 """The classes, equally likely a priori.  Efficiencies and compressor flow fall; turbine flow moves
 either way (fouling, erosion); a sensor errs either way."""

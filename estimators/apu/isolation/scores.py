@@ -8,7 +8,7 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError
 from estimators.apu.isolation.problem import CLASSES
-from estimators.information.intervals import share_interval
+from estimators.information.consistency import share_interval
 
 __all__ = ["cohen_kappa", "scores"]
 

@@ -9,13 +9,16 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled, mapped
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import mapped
 from apu_casadi.core.errors import EstimationError
+from apu_casadi.core.measuring import measure
 from apu_casadi.core.sharing import kept
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
-from apu_casadi.gaspath.steady.trimming import Limits, trim_gas_generator
-from apu_casadi.unit.control import GovernorParameters
+from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.isolation.problem import (
     CLASSES,
     DEFAULT,
@@ -24,6 +27,7 @@ from estimators.apu.isolation.problem import (
     HEALTH,
     OUTPUTS,
     P_RATED,
+    READ,
     Protocol,
     severity_of_loss,
 )
@@ -31,6 +35,7 @@ from estimators.apu.isolation.problem import (
 __all__ = ["Windows", "simulate_windows", "windows_of_engines"]
 
 SUBSTEPS = 4  # of the truth, in one sample
+READINGS = (*OUTPUTS, "Wf", "PW")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +64,7 @@ def _engine(gg: GasGenerator, _backend: str) -> Callable[..., tuple[np.ndarray, 
     x, z0, u, theta = c.symbols()
     z = c.solve(z0, x, u, theta)
     ode, alg, y = c.equations(x, z, u, theta)
-    rows = gg.Y.indices(("P3", "T3", "T5"))
+    rows = gg.Y.indices(READ)
     fun = ca.Function("isolation_truth", [z0, x, u, theta], [ode, y[rows], z, ca.norm_1(alg)])
     return mapped(compiled(fun), 1, chunk=256)
 
@@ -69,7 +74,7 @@ def simulate_windows(
     seeds: Sequence[int],
     protocol: Protocol = DEFAULT,
     gg: GasGenerator | None = None,
-    governor: GovernorParameters | None = None,
+    governor: Governor | None = None,
 ) -> Windows:
     """Simulate windows of the governed unit, one for each label and seed.
 
@@ -86,87 +91,129 @@ def simulate_windows(
         EstimationError: an engine left the region where its equations can be solved.
     """
     gg = GasGenerator() if gg is None else gg
-    gov = GovernorParameters() if governor is None else governor
-    n, K, pr = len(labels), protocol.size, protocol
-    N_ref = gg.parameters.N
-    theta = np.ones((2, len(HEALTH), n))  # before and after the onset
-    u0, x0, z0 = np.empty((len(gg.U), n)), np.full((1, n), N_ref), np.empty((len(gg.z), n))
-    gains = np.zeros((2, len(GAINS), n))
-    loss, h_0, onset = np.zeros(n), np.empty(n), np.empty(n, int)
-    load, white = np.empty((n, K)), np.empty((7, n, K))
-    sizes: list[dict[str, float]] = []
-    for i, (label, seed) in enumerate(zip(labels, seeds, strict=True)):
-        rng = np.random.default_rng([5, int(seed), int(label)])
-        s = CLASSES[label].draw(rng)
-        sizes.append(s)
-        onset[i] = rng.integers(pr.first, pr.last + 1)
-        theta[:, :, i] += pr.baseline * pr.wear * rng.standard_normal(len(HEALTH))
-        gains[:, :, i] += [pr.baseline * pr.sensors[g].gain * rng.standard_normal() for g in GAINS]
-        h_0[i] = pr.baseline * pr.h_offset * rng.standard_normal()
-        for name, size in s.items():
-            if name in HEALTH:
-                theta[1, HEALTH.index(name), i] += size
-            elif name == "loss":
-                loss[i] = size
-            else:
-                gains[1, GAINS.index(name.removeprefix("gain_")), i] += size
-        # demanded power: a level, a slow wander of 0.5 %, and a step of up to 5 % in half of them
-        level, dT = rng.uniform(200e3, 420e3), rng.uniform(-15.0, 15.0)
-        wander = np.empty(K)
-        value, keep = 0.0, math.exp(-DT / 1.0)
-        for k, xi in enumerate(rng.standard_normal(K)):
-            value = keep * value + math.sqrt(1 - keep**2) * xi
-            wander[k] = 0.005 * value
-        step = rng.uniform(-0.05, 0.05) * (rng.random() < 0.5)
-        at = rng.integers(0, K)
-        load[i] = level * (1 + wander + step * (np.arange(K) >= at))
-        white[:, i, :] = rng.standard_normal((7, K))
-        point = trim_gas_generator(
-            gg, {"N": N_ref, "PW": load[i, 0]},
-            theta=dict(zip(HEALTH, theta[0, :, i], strict=True)),
-            limits=Limits(T4_max=math.inf), dT_isa=dT,
-        )  # fmt: skip
-        u0[:, i], z0[:, i] = point.u, point.z
-    engine = _engine(gg, backend_in_use())
-    i_Wf, i_PW = gg.U.index("Wf"), gg.U.index("PW")
-    N, I, z, u = x0.copy(), u0[i_Wf].copy(), z0, u0.copy()
-    reading = np.empty((7, n, K))
-    worst = 0.0
-
-    def rates(N: np.ndarray, I: np.ndarray, th: np.ndarray) -> tuple[np.ndarray, ...]:
-        nonlocal z, worst
-        e = (N_ref - N[0]) / N_ref
-        u[i_Wf] = np.clip(gov.Kp * e + I, gov.Wf_min, gov.Wf_max)
-        ode, y, z, check = engine(z, N, u, th)
-        worst = max(worst, float(np.nan_to_num(check, nan=np.inf).max()))
-        return ode, gov.Ki * e + (u[i_Wf] - gov.Kp * e - I) / gov.T_aw, y
-
-    h = DT / SUBSTEPS
-    for k in range(K):
+    drawn = [_draw(label, seed, protocol, gg) for label, seed in zip(labels, seeds, strict=True)]
+    onset, load = (np.array([getattr(d, n) for d in drawn]) for n in ("onset", "load"))
+    # last axis: windows
+    theta, gains = (np.stack([getattr(d, n) for d in drawn], -1) for n in ("theta", "gains"))
+    loss, h_0 = (np.array([getattr(d, n) for d in drawn]) for n in ("loss", "h_0"))
+    u, z = (np.stack([getattr(d.start, n) for d in drawn], -1) for n in ("u", "z"))
+    ambient = u[gg.U.indices(AMBIENT)]
+    run = _Course(gg, GovernorParameters() if governor is None else governor, u, z)
+    true = np.empty((len(READINGS), len(drawn), protocol.size))
+    for k in range(protocol.size):
         faulty = k >= onset
-        th = np.where(faulty, theta[1], theta[0])
-        g = np.where(faulty, gains[1], gains[0])
         lost = np.where(faulty, loss, 0.0)
-        u[i_PW] = load[:, k] + P_RATED * lost
-        for m in range(SUBSTEPS):
-            dN, dI, y = rates(N, I, th)
-            if m == 0:
-                exact = [N[0], *y, h_0 + severity_of_loss() * lost, u[i_Wf], load[:, k]]
-                for r, (name, v) in enumerate(zip((*OUTPUTS, "Wf", "PW"), exact, strict=True)):
-                    if name == "h":
-                        reading[r, :, k] = v + pr.noise * pr.h_noise * white[r, :, k]
-                        continue
-                    sigma = pr.noise * pr.sensors[name].noise
-                    gain = g[GAINS.index(name)] if name in GAINS else 0.0
-                    reading[r, :, k] = v * (1 + gain + sigma * white[r, :, k])
-            dN2, dI2, _ = rates(N + h * dN, I + h * dI, th)
-            N, I = N + h / 2 * (dN + dN2), I + h / 2 * (dI + dI2)
-    if not worst <= RESIDUAL_TOL:
-        raise EstimationError(f"isolation study: the engine's residual is {worst:.1e}")
-    if not pr.electrical:
-        reading[OUTPUTS.index("h")] = np.nan
-    ambient = u0[gg.U.indices(AMBIENT)]
-    return Windows(np.asarray(labels, int), sizes, onset, reading, ambient)
+        h = h_0 + severity_of_loss() * lost
+        seen = run.step(load[:, k] + P_RATED * lost, np.where(faulty, theta[1], theta[0]))
+        true[:, :, k] = [*seen[:-1], h, seen[-1], load[:, k]]
+    if not run.worst <= RESIDUAL_TOL:
+        raise EstimationError(f"isolation study: the engine's residual is {run.worst:.1e}")
+    later = np.arange(protocol.size) >= onset[:, None]
+    reading = np.empty(true.shape)
+    for r, (name, v) in enumerate(zip(READINGS, true, strict=True)):
+        sigma = protocol.h_noise if name == "h" else protocol.sensors.sigma(name, v)
+        g = gains[:, GAINS.index(name), :, None] if name in GAINS else np.zeros((2, 1, 1))
+        white = np.array([d.white[r] for d in drawn])
+        reading[r] = measure(v, protocol.noise * sigma, white, gain=np.where(later, g[1], g[0]))
+    if not protocol.electrical:
+        reading[READINGS.index("h")] = np.nan
+    return Windows(np.asarray(labels, int), [d.sizes for d in drawn], onset, reading, ambient)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What is random in one window.
+
+    Args:
+        sizes: of the faults, by name.
+        onset: sample.
+        theta, gains: health factors and gain errors before and after, (2, n).
+        loss, h_0: loss by a short circuit, and offset of h.
+        load: demanded power, W, (K,).
+        white: normalised errors of the readings, (7, K).
+        start: the steady point that the window begins with.
+    """
+
+    sizes: dict[str, float]
+    onset: int
+    theta: np.ndarray
+    gains: np.ndarray
+    loss: float
+    h_0: float
+    load: np.ndarray
+    white: np.ndarray
+    start: OperatingPoint
+
+
+def _draw(label: int, seed: int, pr: Protocol, gg: GasGenerator) -> _Drawn:
+    rng = np.random.default_rng([5, int(seed), int(label)])
+    K, sizes = pr.size, CLASSES[label].draw(rng)
+    onset = int(rng.integers(pr.first, pr.last + 1))
+    theta = np.ones((2, len(HEALTH))) + pr.baseline * pr.wear * rng.standard_normal(len(HEALTH))
+    gains = pr.baseline * np.array([list(pr.sensors.draw_gains(rng, GAINS).values())] * 2)
+    h_0 = pr.baseline * pr.h_offset * rng.standard_normal()
+    for name, size in sizes.items():
+        if name in HEALTH:
+            theta[1, HEALTH.index(name)] += size
+        elif name != "loss":
+            gains[1, GAINS.index(name.removeprefix("gain_"))] += size
+    # demanded power: a level, a slow wander of 0.5 %, and a step of up to 5 % in half of them
+    level, dT = rng.uniform(200e3, 420e3), rng.uniform(-15.0, 15.0)
+    wander = np.empty(K)
+    value, keep = 0.0, math.exp(-DT / 1.0)
+    for k, xi in enumerate(rng.standard_normal(K)):
+        value = keep * value + math.sqrt(1 - keep**2) * xi
+        wander[k] = 0.005 * value
+    step = rng.uniform(-0.05, 0.05) * (rng.random() < 0.5)
+    load = level * (1 + wander + step * (np.arange(K) >= rng.integers(0, K)))
+    white = rng.standard_normal((len(READINGS), K))
+    start = trim_gas_generator(
+        gg,
+        {"N": gg.parameters.N, "PW": load[0]},
+        theta=dict(zip(HEALTH, theta[0], strict=True)),
+        limits=Limits(T4_max=math.inf),
+        dT_isa=dT,
+    )
+    return _Drawn(sizes, onset, theta, gains, sizes.get("loss", 0.0), h_0, load, white, start)
+
+
+class _Course:
+    """The governed engines of all windows, by Heun's rule with ``SUBSTEPS`` steps in a sample.
+
+    Args:
+        gg, gov: engine and governor.
+        u, z: inputs and unknowns at the start, one column for each window.
+    """
+
+    def __init__(self, gg: GasGenerator, gov: Governor, u: np.ndarray, z: np.ndarray) -> None:
+        self.gg, self.gov = gg, gov
+        self.engine = _engine(gg, backend_in_use())
+        self.u, self.z = u, z
+        self.i_Wf, self.i_PW = gg.U.index("Wf"), gg.U.index("PW")
+        self.N = np.full((1, u.shape[1]), gg.parameters.N)
+        start = gov.start(u[self.i_Wf])
+        self.I = np.array([np.broadcast_to(x, u.shape[1]) for x in start])  # governor's states
+        self.worst = 0.0  # residual
+
+    def _rates(
+        self, N: np.ndarray, I: np.ndarray, theta: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self.u[self.i_Wf], moves = self.gov.law(N[0], self.gg.parameters.N, [*I])
+        ode, y, self.z, check = self.engine(self.z, N, self.u, theta)
+        self.worst = max(self.worst, float(np.nan_to_num(check, nan=np.inf).max()))
+        return ode, np.array(moves), y
+
+    def step(self, PW: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
+        """Return N, P3, T3, T5 and Wf at a sample, and go on to the next."""
+        self.u[self.i_PW] = PW
+        h = DT / SUBSTEPS
+        seen: list[np.ndarray] = []
+        for _ in range(SUBSTEPS):
+            dN, dI, y = self._rates(self.N, self.I, theta)
+            seen = seen or [self.N[0], *y, self.u[self.i_Wf].copy()]
+            dN2, dI2, _ = self._rates(self.N + h * dN, self.I + h * dI, theta)
+            self.N, self.I = self.N + h / 2 * (dN + dN2), self.I + h / 2 * (dI + dI2)
+        return seen
 
 
 def windows_of_engines(
@@ -183,9 +230,8 @@ def windows_of_engines(
         i = np.flatnonzero(seeds % len(truth) == k)
         if i.size:
             part = simulate_windows(labels[i].tolist(), seeds[i].tolist(), protocol, gg)
-            out.onset[i], out.reading[:, i], out.ambient[:, i] = (
-                part.onset, part.reading, part.ambient
-            )  # fmt: skip
+            out.onset[i], out.reading[:, i] = part.onset, part.reading
+            out.ambient[:, i] = part.ambient
             for j, sizes in zip(i, part.sizes, strict=True):
                 out.sizes[j] = sizes
     return out

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import casadi as ca
-import numpy as np
 
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from estimators.apu.gaspath import gas_path_model
+from estimators.apu.gaspathmodel import gas_path_model
 from estimators.apu.isolation.problem import (
     FAULTS,
     GAINS,
@@ -34,23 +33,23 @@ JUMPS = (*(Jump("state", n) for n in FAULTS[:-1]), Jump("state", "size_1"))
 def jump_model(gg: GasGenerator) -> FilterModel:
     """The gas-path filter's model with two jumps of any direction, and the severity as an output.
 
-    States beside those of :func:`~estimators.apu.gaspath.gas_path_model`: ``size_1``,
+    States beside those of :func:`~estimators.apu.gaspathmodel.gas_path_model`: ``size_1``,
     ``size_2``, and the offset ``h_0``.  Inputs beside its own: the directions ``first_<fault>`` and
     ``second_<fault>``, so that one compiled filter serves all hypotheses.
     """
     base = gas_path_model(gg, gains=GAINS)
-    extra = Signals([
-        Signal("size_1", "1", "size of the first jump", default=0.0, nominal=0.01),
-        Signal("size_2", "1", "size of the second jump", default=0.0, nominal=0.01),
-        Signal("h_0", "1", "offset of the measured severity", default=0.0, nominal=1e-4),
-    ])  # fmt: skip
-    directions = Signals([
-        Signal(f"{_JUMP[k]}_{n}", "1", f"share of {n} in the {_JUMP[k]} jump", default=0.0)
-        for k in (0, 1) for n in FAULTS
-    ])  # fmt: skip
-    X, U = base.x + extra, base.u + directions
-    Yf = base.y + Signals([Signal("h", "1", "TTSC severity, by the electrical filter",
-                                  nominal=1e-4)])  # fmt: skip
+    sizes = [
+        Signal(f"size_{k}", "1", f"size of the {n} jump", default=0.0, nominal=0.01)
+        for k, n in enumerate(_JUMP, 1)
+    ]
+    offset = Signal("h_0", "1", "offset of the measured severity", default=0.0, nominal=1e-4)
+    directions = [
+        Signal(f"{k}_{n}", "1", f"share of {n} in the {k} jump", default=0.0)
+        for k in _JUMP
+        for n in FAULTS
+    ]
+    h = Signal("h", "1", "TTSC severity, by the electrical filter", nominal=1e-4)
+    X, U = base.x + Signals([*sizes, offset]), base.u + Signals(directions)
     nx, nu, q = len(base.x), len(base.u), len(FAULTS)
     x, u, w = ca.MX.sym("x", len(X)), ca.MX.sym("u", len(U)), ca.MX.sym("w", len(base.w))
     p, dt = ca.MX.sym("p", 0), ca.MX.sym("dt")
@@ -65,15 +64,13 @@ def jump_model(gg: GasGenerator) -> FilterModel:
     N = base.x.index("N")
     after = ca.vertcat(*(x1[i] if i == N else x[i] for i in range(len(X))))
     reading = ca.vertcat(y, x[nx + 2] + severity_of_loss() * jump[q - 1])
-    free = np.full(len(X), np.inf)
-    return FilterModel(
-        "isolation", X, U, base.p, base.w, Yf,
-        transition=ca.Function("isolation_f", [x, u, p, w, dt], [after, check],
-                               ["x", "u", "p", "w", "dt"], ["x1", "check"]),
-        output=ca.Function("isolation_g", [x, u, p, w], [reading, check_y],
-                           ["x", "u", "p", "w"], ["y", "check"]),
-        walk=np.zeros(len(X)), lower=-free, upper=free,
-    )  # fmt: skip
+    return FilterModel.of(
+        "isolation",
+        (X, U, base.p, base.w, base.y + Signals([h])),
+        (x, u, p, w, dt),
+        (after, check),
+        (reading, check_y),
+    )
 
 
 @kept

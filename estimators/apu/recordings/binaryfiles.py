@@ -30,8 +30,9 @@ def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
 
     dtype = getattr(raw, "dtype", None)
     if type(dtype).__name__ == "CategoricalDtype":
-        raw = raw.astype(raw.cat.categories.dtype if raw.cat.categories.dtype.kind in "ifuM"
-                         else object)  # fmt: skip
+        raw = raw.astype(
+            raw.cat.categories.dtype if raw.cat.categories.dtype.kind in "ifuM" else object
+        )
         dtype = raw.dtype
     if type(dtype).__name__ == "DatetimeTZDtype":
         raw = raw.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -41,8 +42,11 @@ def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
             raw = raw.to_numpy(dtype=float, na_value=np.nan) if raw.isna().any() else raw.to_numpy()
         else:
             raw = raw.to_numpy()
-    a = np.ma.filled(raw.astype(float), np.nan) if isinstance(raw, np.ma.MaskedArray) else (
-        np.asarray(raw))  # fmt: skip
+    a = (
+        np.ma.filled(raw.astype(float), np.nan)
+        if isinstance(raw, np.ma.MaskedArray)
+        else (np.asarray(raw))
+    )
     if a.dtype.kind in "iuf":
         values = a.astype(float)
         if np.isinf(values).any():
@@ -90,8 +94,12 @@ def parquet_columns(path: Path, tell: Tell) -> list[Column]:
         if type(frame.index).__name__ == "RangeIndex" and name is None:
             continue
         if name is None:
-            name = "time" if getattr(values.dtype, "kind", "") in "mM" or (
-                type(values.dtype).__name__ == "DatetimeTZDtype") else f"index_{level}"  # fmt: skip
+            name = (
+                "time"
+                if getattr(values.dtype, "kind", "") in "mM"
+                or (type(values.dtype).__name__ == "DatetimeTZDtype")
+                else f"index_{level}"
+            )
         if name not in frame.columns:
             columns.append(typed(path, *header(str(name)), values.to_series(), tell))
     for i, label in enumerate(frame.columns):

@@ -137,8 +137,11 @@ def text_columns(
     lines = text.splitlines()
     first = re.fullmatch(r"\s*sep=(.)\s*", lines[0], re.IGNORECASE) if lines else None
     comments = [(i + 1, x) for i, x in enumerate(lines) if x.startswith("#")]
-    kept = [(i + 1, x) for i, x in enumerate(lines)
-            if x.strip() and not x.startswith("#") and not (first and i == 0)]  # fmt: skip
+    kept = [
+        (i + 1, x)
+        for i, x in enumerate(lines)
+        if x.strip() and not x.startswith("#") and not (first and i == 0)
+    ]
     if not kept:
         raise DataError(f"{path}: empty")
     delimiter = first[1] if first else _delimiter([x for _, x in kept[:200]])
@@ -289,8 +292,9 @@ def _head(
     if len(above) > 1:
         tell(f"{path}: lines {above[0][0]} to {above[-2][0]}, above the column names, are left out")
     pairs = [header(h) for h in names]
-    named = [(n, u or (units[i] or None if i < len(units) else None))
-             for i, (n, u) in enumerate(pairs)]  # fmt: skip
+    named = [
+        (n, u or (units[i] or None if i < len(units) else None)) for i, (n, u) in enumerate(pairs)
+    ]
     return line, [n for n, _ in named], [u for _, u in named], body
 
 
@@ -411,14 +415,17 @@ def parsed(
             return Column(name, unit, values, _whole(cells, values))
         return Column(name, unit, values, values)
     if wrong and (good > len(wrong) or (good and good == len(wrong))):
-        raise DataError(f"{place(wrong[0])}: {cut(cells[wrong[0]])} is no number (an empty cell is "
-                        "a gap)")  # fmt: skip
+        raise DataError(
+            f"{place(wrong[0])}: {cut(cells[wrong[0]])} is no number (an empty cell is a gap)"
+        )
     if wrong or not good:
         k = (wrong or words)[0]
         problem = f"{place(k)}: {cut(cells[k])} is no number"
         return Column(name, unit, values * np.nan, raw, problem)
-    tell(f"{place(words[0])}: {cut(cells[words[0]])} is taken as a gap, as are {len(words)} cells "
-         "of this column in all")  # fmt: skip
+    tell(
+        f"{place(words[0])}: {cut(cells[words[0]])} is taken as a gap, as are {len(words)} cells "
+        "of this column in all"
+    )
     return Column(name, unit, values, values)
 
 

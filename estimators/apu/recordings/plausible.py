@@ -8,6 +8,7 @@ at all (a sentinel, a missing unit, a zero of a dead channel), not to judge an e
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,37 +16,48 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
-from apu_casadi.gaspath.conditions import RANGES
+from apu_casadi.gaspath.conditions import RANGES as CONDITIONS
 from estimators.apu.recordings.units import UNITS
+from estimators.apu.sensors import RANGES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 __all__ = ["PLAUSIBLE", "Limits", "parse_limits"]
 
-_COLD, _HOT = (150.0, 420.0), (300.0, 1200.0)
+_COLD, _HOT, _BURNT = (150.0, 420.0), (300.0, 1200.0), (400.0, 1900.0)
 _AMBIENT_P, _HIGH_P = (5e3, 2.5e5), (4e4, 2e6)
-_FLOW = (0.1, 10.0)
-#: Quantity -> (lowest, highest), SI.
-PLAUSIBLE: dict[str, tuple[float, float]] = {
-    "N": (1500.0, 4600.0),  # 40 to 122 %
-    **dict.fromkeys(("T0", "T1", "T2"), _COLD),
-    "T3": (300.0, 800.0),
-    **dict.fromkeys(("T4", "T41"), (400.0, 1900.0)),
-    **dict.fromkeys(("T50", "T5", "T8"), _HOT),
-    "P0": (5e3, 1.15e5),
-    **dict.fromkeys(("P1", "P2", "P5", "P8"), _AMBIENT_P),
-    **dict.fromkeys(("P3", "Ps3", "P4"), _HIGH_P),
-    **dict.fromkeys(("W2", "W3", "W31", "W4", "W41", "W5", "W8"), _FLOW),
-    "Wf": (5e-4, 0.12),
-    "PW": (-2e4, 9e5),
-    "PR_c": (1.0, 20.0), "PR_t": (1.0, 20.0), "eta_c": (0.2, 1.0), "eta_t": (0.2, 1.0),
-    "SM": (-0.5, 2.0), "Mach8": (0.0, 1.0), "V8": (0.0, 700.0),
-    **RANGES,  # of the ambient conditions: what the engine takes
-}  # fmt: skip
+_FLOW, _RATIO, _EFFICIENCY = (0.1, 10.0), (1.0, 20.0), (0.2, 1.0)
+_OF = (
+    ("T0 T1 T2", _COLD),
+    ("T4", _BURNT),
+    ("T50 T8", _HOT),
+    ("P0", (5e3, 1.15e5)),
+    ("P1 P2 P8", _AMBIENT_P),
+    ("Ps3 P4", _HIGH_P),
+    ("W3 W31 W4 W41 W5 W8", _FLOW),
+    ("PR_c PR_t", _RATIO),
+    ("eta_c eta_t", _EFFICIENCY),
+    ("SM", (-0.5, 2.0)),
+    ("Mach8", (0.0, 1.0)),
+    ("V8", (0.0, 700.0)),
+)
+#: Quantity -> (lowest, highest), SI: what sensors read, the other outputs, and the ambient
+#: conditions, of which the engine takes what is here.
+PLAUSIBLE: Mapping[str, tuple[float, float]] = ChainMap(
+    RANGES, {n: span for names, span in _OF for n in names.split()}, dict(CONDITIONS)
+)
 #: Quantities whose range holds zero: without a unit, a largest reading below this is not in SI.
 _SMALL = {"PW": 2e3}
-_TEMPERATURES = ("degC", "degF", "degR")
+#: What a quantity is read in, beside SI.
+_USUAL = {
+    "K": ("degC", "degF", "degR"),
+    "Pa": ("kPa", "bar", "psi", "hPa", "MPa"),
+    "rad/s": ("rpm",),
+    "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"),
+    "W": ("kW", "hp", "MW"),
+    "m": ("ft", "km"),
+}
 #: What loggers write for "no reading", where a range would let it pass.
 _SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
 
@@ -152,11 +164,8 @@ class Limits:
 
 def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
     """Return the units in which all the readings would be plausible."""
-    order = {"K": _TEMPERATURES, "Pa": ("kPa", "bar", "psi", "hPa", "MPa"), "rad/s": ("rpm",),
-             "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"), "W": ("kW", "hp", "MW"),
-             "m": ("ft", "km")}.get(si, ())  # fmt: skip
     found = []
-    for unit in order:
+    for unit in _USUAL.get(si, ()):
         _, factor, offset = UNITS[unit]
         v = raw * factor + offset
         if ((v >= low) & (v <= high)).all():

@@ -26,14 +26,14 @@ from estimators.apu.recordings.columns import Column, text_columns
 from estimators.apu.recordings.plausible import PLAUSIBLE, Limits
 from estimators.apu.recordings.timestamps import TIMES, is_time_name, looks_like_time, to_seconds
 from estimators.apu.recordings.units import UNITS, convert, split_unit, unit_of
+from estimators.apu.sensors import KNOWN
 
 __all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_mapping", "read_table"]
 
-_QUANTITIES = frozenset({*PLAUSIBLE, *GasGenerator.Y.names})
-
 
 def _known(name: str) -> bool:
-    return name in _QUANTITIES or is_time_name(name)
+    known = name in PLAUSIBLE or name in KNOWN or name in GasGenerator.Y.names
+    return known or is_time_name(name)
 
 
 @dataclass(frozen=True)
@@ -155,15 +155,17 @@ class Table:
             values = raw / 100 * design
         else:
             values = convert(raw, unit, si, what, difference=difference)
-        return self.reading.limits.apply(
-            name, si, values, raw, unit, lambda k: self.place(c.name, k), self._tell,
-            mixed=self._units_elsewhere(c.name),
-        )  # fmt: skip
+        where, mixed = (lambda k: self.place(c.name, k)), self._units_elsewhere(c.name)
+        limits = self.reading.limits
+        return limits.apply(name, si, values, raw, unit, where, self._tell, mixed=mixed)
 
     def _units_elsewhere(self, name: str) -> bool:
         """Whether most of the other columns with numbers name a unit."""
-        others = [c for n, c in self.columns.items() if n != name and c.problem is None
-                  and not is_time_name(n)]  # fmt: skip
+        others = [
+            c
+            for n, c in self.columns.items()
+            if n != name and c.problem is None and not is_time_name(n)
+        ]
         named = sum(isinstance(c.unit, str) for c in others)
         return 2 * named > len(others)
 
@@ -212,8 +214,10 @@ class Table:
             if cells and set(cells) <= {"true", "false", "good", "bad", "ok", "valid", "invalid"}:
                 bad = sum(x in ("false", "bad", "invalid") for x in cells)
                 if bad:
-                    out.append(f"{self.source}, column {n} is not heeded: {bad} of {len(cells)} "
-                               "rows that it calls bad are used")  # fmt: skip
+                    out.append(
+                        f"{self.source}, column {n} is not heeded: {bad} of {len(cells)} "
+                        "rows that it calls bad are used"
+                    )
         return out
 
     def time(self, name: str | None = None) -> np.ndarray | None:
@@ -232,9 +236,13 @@ class Table:
         c, unit = self._find(found)
         what = f"{self.source}, column {c.name}"
         t = to_seconds(
-            c.values if c.raw is None else c.raw, unit, what, self._tell,
-            form=self.reading.time_format, zone=self.reading.time_zone,
-        )  # fmt: skip
+            c.values if c.raw is None else c.raw,
+            unit,
+            what,
+            self._tell,
+            form=self.reading.time_format,
+            zone=self.reading.time_zone,
+        )
         if not np.isfinite(t).all():
             k = int(np.argmax(~np.isfinite(t)))
             raise DataError(f"{self.source}: column {found} has a gap in data row {k + 1}")
@@ -250,8 +258,10 @@ class Table:
 
 def _told(notes: list[str] | None, what: str) -> None:
     if notes is None:
-        raise DataError(f"{what}: refused, since nobody would be told; read_table(..., notes=[]) "
-                        "reads it, and `apu fit` does")  # fmt: skip
+        raise DataError(
+            f"{what}: refused, since nobody would be told; read_table(..., notes=[]) "
+            "reads it, and `apu fit` does"
+        )
     if what not in notes:
         notes.append(what)
 
@@ -340,6 +350,7 @@ def read_table(
 
 
 _KINDS = {
-    ".csv": "text", ".txt": "text", ".tsv": "text", ".dat": "text", ".asc": "text",
-    ".parquet": "parquet", ".pq": "parquet", ".nc": "netcdf", ".cdf": "netcdf",
-}  # fmt: skip
+    **dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".asc"), "text"),
+    **dict.fromkeys((".parquet", ".pq"), "parquet"),
+    **dict.fromkeys((".nc", ".cdf"), "netcdf"),
+}

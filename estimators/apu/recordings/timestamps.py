@@ -20,13 +20,13 @@ from estimators.apu.recordings.units import UNITS, convert, unit_of
 __all__ = ["TIMES", "is_time_name", "looks_like_time", "to_seconds"]
 
 #: Names of time columns, in lower case and without blanks, underscores and hyphens.
-_NAMES = (
-    "time", "t", "timestamp", "datetime", "dateandtime", "timestamps", "datestamp", "timeutc",
-    "utc", "utctime", "utcdatetime", "datetimeutc", "timestamputc", "localtime", "systemtime",
-    "unixtime", "epoch", "epochtime", "posixtime", "ts", "elapsed", "elapsedtime", "timeelapsed",
-    "reltime", "relativetime", "testtime", "runtime", "recordtime", "seconds", "secs", "sec",
-    "zeit", "zeitstempel", "datum", "date", "temps", "tiempo", "datumzeit", "timeofday",
-)  # fmt: skip
+_NAMED = """
+time t timestamp datetime dateandtime timestamps datestamp timeutc utc utctime utcdatetime
+datetimeutc timestamputc localtime systemtime unixtime epoch epochtime posixtime ts elapsed
+elapsedtime timeelapsed reltime relativetime testtime runtime recordtime seconds secs sec zeit
+zeitstempel datum date temps tiempo datumzeit timeofday
+"""
+_NAMES = tuple(_NAMED.split())
 #: Spellings that were always known, tried first.
 TIMES = ("time", "Time", "t", "timestamp")
 
@@ -56,8 +56,9 @@ def looks_like_time(raw: Any) -> bool:
     if a.dtype.kind in "mM":
         return True
     cells = [c.strip() for c in a[:20] if isinstance(c, str) and c.strip()]
-    return bool(cells) and all((_ISO.fullmatch(c) and "-" in c) or _CLOCK.fullmatch(c) or
-                               _DATE.match(c) for c in cells)  # fmt: skip
+    return bool(cells) and all(
+        (_ISO.fullmatch(c) and "-" in c) or _CLOCK.fullmatch(c) or _DATE.match(c) for c in cells
+    )
 
 
 def to_seconds(
@@ -123,8 +124,9 @@ def _narrowed(a: np.ndarray) -> np.ndarray:
 
     pd: Any = import_module("pandas")
 
-    there = [c for c in a if c is not None and not (isinstance(c, float) and np.isnan(c))
-             and c is not pd.NaT and c is not pd.NA]  # fmt: skip
+    gaps = (None, pd.NaT, pd.NA)
+    there = [c for c in a if not any(c is g for g in gaps)]
+    there = [c for c in there if not (isinstance(c, float) and np.isnan(c))]
     if there and all(isinstance(c, datetime.timedelta | np.timedelta64) for c in there):
         return np.asarray(pd.to_timedelta(list(a)).to_numpy())
     if there and all(isinstance(c, datetime.datetime | np.datetime64) for c in there):
@@ -165,11 +167,13 @@ def _plain(a: np.ndarray, what: str, tell: Tell) -> np.ndarray:
         for scale, name in ((1e9, "ns"), (1e6, "us"), (1e3, "ms"), (1.0, "s")):
             low, high = (y * scale for y in _YEARS)
             if low <= there.min() and there.max() <= high:
-                tell(f"{what}: {there[0]:.0f} is a Unix time in {name}; taken in seconds since "
-                     "the first")  # fmt: skip
+                tell(
+                    f"{what}: {there[0]:.0f} is a Unix time in {name}; taken in seconds since "
+                    "the first"
+                )
                 # two steps, so that no digit of the nanoseconds is lost
                 start = a[np.isfinite(v)][0]
-                return (a - start).astype(float) / scale
+                return np.asarray((a - start).astype(float) / scale)
         if there.max() > _YEARS[1]:
             raise DataError(
                 f"{what}: unit missing? {there.max():.6g} s are {there.max() / 3.156e7:.3g} years: "
@@ -213,10 +217,13 @@ def _from_text(
 ) -> np.ndarray:
     pd: Any = import_module("pandas")
 
-    text = [str(c).strip() if c is not None and c is not pd.NaT and c is not pd.NA else ""
-            for c in cells]  # fmt: skip
-    text = ["" if c.lower() in ("", "nan", "nat", "none", "null", "na", "n/a", "-") else c
-            for c in text]  # fmt: skip
+    text = [
+        str(c).strip() if c is not None and c is not pd.NaT and c is not pd.NA else ""
+        for c in cells
+    ]
+    text = [
+        "" if c.lower() in ("", "nan", "nat", "none", "null", "na", "n/a", "-") else c for c in text
+    ]
     # the year first leaves no question
     text = [_YEAR_FIRST.sub(lambda m: f"{m[1]}-{int(m[2]):02d}-{int(m[3]):02d}", c) for c in text]
     there = [c for c in text if c]
@@ -228,8 +235,8 @@ def _from_text(
     if all(_NUMBER.fullmatch(c) for c in there):
         tell(f"{what}: text that holds numbers is read as numbers")
         whole = all(re.fullmatch(r"[+-]?\d+", c) for c in text)
-        return _plain(np.array([int(c) for c in text]) if whole else
-                      np.array([float(c) if c else np.nan for c in text]), what, tell)  # fmt: skip
+        read = int if whole else (lambda c: float(c) if c else np.nan)
+        return _plain(np.array([read(c) for c in text]), what, tell)
     if all(_CLOCK.fullmatch(c) for c in there):
         tell(f"{what}: hours:minutes:seconds, {there[0]!r}, are taken in seconds")
         return _from_spans(pd.to_timedelta([c.replace(",", ".") or None for c in text]).to_numpy())

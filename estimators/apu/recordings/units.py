@@ -10,23 +10,22 @@ from apu_casadi.core.errors import DataError, nearest
 
 __all__ = ["UNITS", "convert", "split_unit", "unit_of"]
 
+_PSI, _LB = 6894.757293168, 0.45359237  # Pa, kg
 #: By SI unit: what one of each unit is in it.
 _SCALES: dict[str, dict[str, float]] = {
     "K": {"K": 1.0, "degR": 5 / 9},
-    "Pa": {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5,
-           "psi": 6894.757293168},
-    "rad/s": {"rad/s": 1.0, "rpm": np.pi / 30, "r/min": np.pi / 30, "1/min": np.pi / 30},
+    "Pa": {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": _PSI},
+    "rad/s": {"rad/s": 1.0} | dict.fromkeys(("rpm", "r/min", "1/min"), np.pi / 30),
     "W": {"W": 1.0, "kW": 1e3, "MW": 1e6, "hp": 745.6998715823},
-    "kg/s": {"kg/s": 1.0, "g/s": 1e-3, "kg/min": 1 / 60, "kg/h": 1 / 3600,
-             "lb/h": 0.45359237 / 3600, "lb/s": 0.45359237},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0,
-          "d": 86400.0},
+    "kg/s": {"kg/s": 1.0, "g/s": 1e-3, "kg/min": 1 / 60, "kg/h": 1 / 3600}
+    | {"lb/h": _LB / 3600, "lb/s": _LB},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
     "m": {"m": 1.0, "km": 1e3, "ft": 0.3048},
     "m/s": {"m/s": 1.0},
     "kg/J": {"kg/J": 1.0},
     "kg/kg": {"kg/kg": 1.0, "g/kg": 1e-3},
     "1": {"1": 1.0, "-": 1.0, "%": 1e-2},
-}  # fmt: skip
+}
 #: Unit -> (SI unit, factor, offset): SI value = factor * value + offset.
 UNITS: dict[str, tuple[str, float, float]] = {
     **{unit: (si, scale, 0.0) for si, all_of in _SCALES.items() for unit, scale in all_of.items()},
@@ -34,27 +33,40 @@ UNITS: dict[str, tuple[str, float, float]] = {
     **dict.fromkeys(("degF", "°F"), ("K", 5 / 9, 459.67 * 5 / 9)),
 }
 #: Other spellings, in lower case and without blanks, dots and underscores, that mean one thing.
+_SPELLED = """
+degC: degc celsius degreecelsius degreescelsius degreesc ºc ℃ °c
+degF: degf fahrenheit degreesfahrenheit ºf °f
+degR: degr rankine °r
+K: kelvin degk
+Pa: pascal
+psi: psia psi(a)
+bar: bara bar(a)
+kPa: kpaa
+rpm: rev/min min-1 min^-1 1/min r/min rpm
+rad/s: rads-1 rad/sec rads^-1
+kg/s: kgs-1 kg/sec kgs^-1
+kg/h: kgh-1 kg/hr kgph kg/hour kgh^-1
+lb/h: lbm/h lbm/hr lb/hr pph lbs/h lbs/hr
+lb/s: lbm/s
+W: watt watts
+kW: kilowatt kw
+hp: bhp shp
+s: sec secs second seconds
+ms: msec millisecond milliseconds
+us: usec µs μs microseconds
+ns: nsec nanoseconds
+min: minute minutes
+h: hour hours hr hrs
+d: day days
+%: percent pct
+m: metre meter metres meters
+ft: feet
+"""
 _SPELLINGS = {
-    "degc": "degC", "celsius": "degC", "degreecelsius": "degC", "degreescelsius": "degC",
-    "degreesc": "degC", "ºc": "degC", "℃": "degC", "°c": "degC",
-    "degf": "degF", "fahrenheit": "degF", "degreesfahrenheit": "degF", "ºf": "degF", "°f": "degF",
-    "degr": "degR", "rankine": "degR", "°r": "degR",
-    "kelvin": "K", "degk": "K", "pascal": "Pa",
-    "psia": "psi", "bara": "bar", "kpaa": "kPa", "bar(a)": "bar", "psi(a)": "psi",
-    "rev/min": "rpm", "min-1": "rpm", "min^-1": "rpm", "1/min": "rpm", "r/min": "rpm",
-    "rpm": "rpm", "rads-1": "rad/s", "rad/sec": "rad/s", "rads^-1": "rad/s",
-    "kgs-1": "kg/s", "kg/sec": "kg/s", "kgh-1": "kg/h", "kg/hr": "kg/h", "kgph": "kg/h",
-    "kg/hour": "kg/h", "kgs^-1": "kg/s", "kgh^-1": "kg/h",
-    "lbm/h": "lb/h", "lbm/hr": "lb/h", "lb/hr": "lb/h", "pph": "lb/h", "lbs/h": "lb/h",
-    "lbs/hr": "lb/h", "lbm/s": "lb/s",
-    "watt": "W", "watts": "W", "kilowatt": "kW", "kw": "kW", "bhp": "hp", "shp": "hp",
-    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millisecond": "ms",
-    "milliseconds": "ms", "usec": "us", "µs": "us", "μs": "us", "microseconds": "us",
-    "nsec": "ns", "nanoseconds": "ns", "minute": "min", "minutes": "min", "hour": "h",
-    "hours": "h", "hr": "h", "hrs": "h", "day": "d", "days": "d",
-    "percent": "%", "pct": "%", "metre": "m", "meter": "m",
-    "metres": "m", "meters": "m", "feet": "ft",
-}  # fmt: skip
+    word: unit
+    for unit, _, words in (line.partition(": ") for line in _SPELLED.strip().splitlines())
+    for word in words.split()
+}
 
 
 def unit_of(text: str) -> str | None:

@@ -14,10 +14,9 @@ tuned on the seeds below ``SEED0``.
 :mod:`scenarios.studies.electrical.truth`        noise-free courses, what sensors read
 :mod:`scenarios.studies.electrical.scores`       NEES, bands, statistics, alarms
 :mod:`scenarios.studies.electrical.efficiency`   h against its bound, consistency
-:mod:`scenarios.studies.electrical.detection`    delay, and the right phase
-:mod:`scenarios.studies.electrical.false_alarms` load steps, gas faults, long operation
+:mod:`scenarios.studies.electrical.delays`    delay, and the right phase
+:mod:`scenarios.studies.electrical.alarms` load steps, gas faults, long operation
 :mod:`scenarios.studies.electrical.leaky`        faults with kappa > mu, a wrong kappa
-:mod:`scenarios.studies.electrical.speed`        time of a step of EKF and UKF
-:mod:`scenarios.studies.electrical.parts`          all of them by name
+:mod:`scenarios.studies.electrical.steptime`        time of a step of EKF and UKF
 ========================================================= ========================================
 """

@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import FLUXES
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES
+from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import FLUX_WALK, H_WALK, START_SIGMA
 from estimators.batch.relinearised import relinearised_filter
 from estimators.filters.belief import Belief
 from estimators.information.bounds import posterior_bound
+from estimators.information.consistency import in_band, nees, rms_interval
 from scenarios.studies.electrical.protocol import (
     CONSTANT,
     DETECT,
@@ -33,7 +36,6 @@ from scenarios.studies.electrical.protocol import (
     SHARE_IN_BAND,
     TWICE,
 )
-from scenarios.studies.electrical.scores import in_band, nees, rmse_interval
 from scenarios.studies.electrical.truth import (
     Truth,
     chances,
@@ -44,19 +46,25 @@ from scenarios.studies.electrical.truth import (
 
 __all__ = ["efficiency"]
 
+_KINDS = {"gains": "estimate", TWICE: "estimate", "gains considered": "consider"}
 
-def _scored(
-    filt: ElectricalFilter,
-    truths: Callable[[int, np.random.Generator], tuple[Truth, dict[str, float] | None]],
-    prior_of: Callable[[Truth, dict[str, np.ndarray], np.random.Generator], Belief],
-    bound: np.ndarray,
-    n_seeds: int,
-    seed0: int,
-    checks: np.ndarray,
-    full_nees: bool,
-    passes: int = 1,
-) -> dict[str, Any]:
+
+@dataclass(frozen=True)
+class _Case:
+    """A case of the study: its filter, its truths, where the filter starts, and the bound."""
+
+    filt: ElectricalFilter
+    truth: Callable[[np.random.Generator], tuple[Truth, dict[str, float] | None]]
+    prior: Callable[[Truth, dict[str, np.ndarray], np.random.Generator], Belief]
+    bound: np.ndarray
+    goal: float
+    full_nees: bool = False
+    passes: int = 1
+
+
+def _scored(case: _Case, n_seeds: int, seed0: int, checks: np.ndarray) -> dict[str, Any]:
     """Run the filter over all seeds and compare with the bound, NEES and NIS at checkpoints."""
+    filt, bound, full_nees = case.filt, case.bound, case.full_nees
     i_h = filt.model.x.indices([f"h_{k}" for k in PHASES])
     nx, c = len(filt.model.x), checks.size
     err2, nees_h, nees_x, nis = np.zeros((3, c)), np.zeros(c), np.zeros(c), np.zeros(c)
@@ -64,10 +72,10 @@ def _scored(
     of_seed: dict[str, list[float]] = {"nees_h": [], "nees": [], "nis": []}
     for s in range(seed0, seed0 + n_seeds):
         rng = np.random.default_rng(s)
-        truth, gains = truths(s, rng)
+        truth, gains = case.truth(rng)
         samples = samples_of(truth, rng, gains=gains, sensors=filt.sensors)
-        prior, data = prior_of(truth, samples, rng), filt.recording(samples)
-        r = relinearised_filter(filt.model, prior, data, passes=passes, full=True)
+        prior, data = case.prior(truth, samples, rng), filt.recording(samples)
+        r = relinearised_filter(filt.model, prior, data, passes=case.passes, full=True)
         assert r.cov is not None
         known = {f"gain_{n}": g for n, g in (gains or {}).items()}
         error = (r.mean - truth.state(filt, **known))[:, checks]
@@ -96,7 +104,7 @@ def _scored(
         "bound_h": {k: sigma[j].tolist() for j, k in enumerate(PHASES)},
         "bias_h": {k: (mean[j] / n_seeds).tolist() for j, k in enumerate(PHASES)},
         "ratio_end": end,
-        "ratio_end_interval": rmse_interval(end, 3 * n_seeds),
+        "ratio_end_interval": rms_interval(end, 3 * n_seeds),
         "ratio_worst": pooled,
         "nees_h": in_band(nees_h / n_seeds, n_seeds, 3),
         "nis": in_band(nis / n_seeds, n_seeds, len(MEASURED)),
@@ -108,6 +116,51 @@ def _scored(
             # of the mean over all checkpoints, which are correlated: from seed to seed
             out[name]["mean_error"] = float(np.std(values, ddof=1)) / math.sqrt(n_seeds)
     return out
+
+
+def _matched() -> _Case:
+    """Fluxes and severities walk, and start, as the filter believes."""
+    filt, base = electrical_filter(), generator_truth(FULL, EFFICIENCY["duration"])
+    sigma = dict.fromkeys([f"h_{k}" for k in PHASES], H_PRIOR) | START_SIGMA
+    K = round(EFFICIENCY["duration"] / DT) + 1
+
+    def truth(rng: np.random.Generator) -> tuple[Truth, None]:
+        walk = H_WALK * math.sqrt(DT) * rng.standard_normal((3, K))
+        walk[:, 0] = H_PRIOR * rng.standard_normal(3)
+        flux = {n: START_SIGMA[n] for n in FLUXES.names}
+        h = np.cumsum(walk, axis=1)
+        return chances(base, rng, h=h, flux_sigma=flux, flux_walk=FLUX_WALK), None
+
+    def prior(truth: Truth, samples: dict[str, np.ndarray], rng: np.random.Generator) -> Belief:
+        mean = dict(zip(filt.model.x.names, base.state(filt)[:, 0], strict=True))
+        mean["theta_e"] += START_SIGMA["theta_e"] * float(rng.standard_normal())
+        return Belief.of(filt.model.x, mean, sigma)
+
+    start, clean = prior(base, {}, np.random.default_rng(0)), samples_of(base, None)
+    bound = posterior_bound(filt.model, start, filt.recording(clean), base.state(filt))
+    return _Case(filt, truth, prior, bound, RATIO_MATCHED, full_nees=True)
+
+
+def _simulated(case: str) -> _Case:
+    """A short circuit and an unbalanced load, simulated, from the first period on."""
+    walks = CONSTANT if case == "constant" else {}
+    filt = electrical_filter(gains=_KINDS.get(case, "none"), **walks)
+    fault = Ttsc(0.05, 0.05 / DETECT["mismatched"][0] - 0.95, phase="b")
+    before = ((-0.25, FULL_UNBALANCED), (-0.25, fault))
+    base = generator_truth(FULL, EFFICIENCY["duration"], before, start=0.3)
+    base = base.change(h_b=np.full(base.t.size, fault.h))
+
+    def truth(rng: np.random.Generator) -> tuple[Truth, dict[str, float] | None]:
+        return base, None if case in ("fault", "constant") else drawn_gains(rng)
+
+    def prior(truth: Truth, samples: dict[str, np.ndarray], rng: np.random.Generator) -> Belief:
+        return filt.prior(samples)
+
+    clean = samples_of(base, None)
+    data = filt.recording(clean)
+    bound = posterior_bound(filt.model, filt.prior(clean), data, base.state(filt))
+    passes = 2 if case == TWICE else 1
+    return _Case(filt, truth, prior, bound, RATIO_MISMATCHED, passes=passes)
 
 
 def efficiency(
@@ -134,85 +187,18 @@ def efficiency(
 
     The bound of a case is that of the model its filter uses.
     """
-    kinds = {"gains": "estimate", TWICE: "estimate", "gains considered": "consider"}
-    known = ("matched", "fault", "constant", *kinds, "gains ignored")
-    K = round(EFFICIENCY["duration"] / DT) + 1
     checks = np.arange(1, round(EFFICIENCY["duration"] / EFFICIENCY["every"]) + 1) * round(
         EFFICIENCY["every"] / DT
     )
+    known = ("matched", "fault", "constant", *_KINDS, "gains ignored")
     out: dict[str, Any] = {}
     for case in known if cases is None else cases:
         if case not in known:
             raise ParameterError(f"case {case!r} {nearest(case, known)}")
         begun = time.perf_counter()
-        if case == "matched":
-            filt = electrical_filter()
-            base = generator_truth(FULL, EFFICIENCY["duration"])
-            sigma = dict.fromkeys([f"h_{k}" for k in PHASES], H_PRIOR) | START_SIGMA
-
-            def matched(
-                seed: int, rng: np.random.Generator, base: Truth = base
-            ) -> tuple[Truth, None]:
-                walk = H_WALK * math.sqrt(DT) * rng.standard_normal((3, K))
-                walk[:, 0] = H_PRIOR * rng.standard_normal(3)
-                flux = {n: START_SIGMA[n] for n in FLUXES.names}
-                return chances(
-                    base, rng, h=np.cumsum(walk, axis=1), flux_sigma=flux, flux_walk=FLUX_WALK
-                ), None
-
-            def known_prior(
-                truth: Truth,
-                samples: dict[str, np.ndarray],
-                rng: np.random.Generator,
-                base: Truth = base,
-                filt: ElectricalFilter = filt,
-                sigma: dict[str, float] = sigma,
-            ) -> Belief:
-                mean = dict(zip(filt.model.x.names, base.state(filt)[:, 0], strict=True))
-                mean["theta_e"] += START_SIGMA["theta_e"] * float(rng.standard_normal())
-                return Belief.of(filt.model.x, mean, sigma)
-
-            rng = np.random.default_rng(0)
-            bound = posterior_bound(
-                filt.model,
-                known_prior(base, {}, rng),
-                filt.recording(samples_of(base, None)),
-                base.state(filt),
-            )
-            r = _scored(filt, matched, known_prior, bound, n_seeds, seed0, checks, True)
-            r["goal"] = RATIO_MATCHED
-        else:
-            walks = CONSTANT if case == "constant" else {}
-            filt = electrical_filter(gains=kinds.get(case, "none"), **walks)
-            h = DETECT["mismatched"][0]
-            fault = Ttsc(0.05, 0.05 / h - 0.95, phase="b")
-            base = generator_truth(
-                FULL, EFFICIENCY["duration"], ((-0.25, FULL_UNBALANCED), (-0.25, fault)), start=0.3
-            )
-            base = base.change(h_b=np.full(base.t.size, fault.h))
-
-            def simulated(
-                seed: int, rng: np.random.Generator, base: Truth = base, case: str = case
-            ) -> tuple[Truth, dict[str, float] | None]:
-                return base, None if case in ("fault", "constant") else drawn_gains(rng)
-
-            def started(
-                truth: Truth,
-                samples: dict[str, np.ndarray],
-                rng: np.random.Generator,
-                filt: ElectricalFilter = filt,
-            ) -> Belief:
-                return filt.prior(samples)
-
-            clean = samples_of(base, None)
-            bound = posterior_bound(
-                filt.model, filt.prior(clean), filt.recording(clean), base.state(filt)
-            )
-            r = _scored(
-                filt, simulated, started, bound, n_seeds, seed0, checks, False,
-                passes=2 if case == TWICE else 1,
-            )  # fmt: skip
-            r["goal"] = RATIO_MISMATCHED
+        made = _matched() if case == "matched" else _simulated(case)
+        r = _scored(made, n_seeds, seed0, checks)
+        r["goal"] = made.goal
         r["passed"] = bool(r["ratio_worst"] <= r["goal"])
         judged = ("nees_h",) if case == "gains considered" else ("nees_h", "nis")
         r["consistent"] = bool(min(r[k]["share"] for k in judged) >= SHARE_IN_BAND)

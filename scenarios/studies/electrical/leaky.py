@@ -9,10 +9,10 @@ import numpy as np
 
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import shunt_parameters
 from estimators.apu.electrical.electricalfilter import electrical_filter
 from estimators.apu.electrical.faults import leaky_fault, shunt_of
-from estimators.apu.electrical.terminalsignals import PHASES
 from estimators.filters.ekf import extended_kalman_filter
 from scenarios.studies.electrical.protocol import FULL, KAPPAS, LEAKY, SEED0
 from scenarios.studies.electrical.truth import generator_truth, samples_of
@@ -39,10 +39,9 @@ def shunt_information(
     if kappa <= mu:
         return {"sigma_mu": None, "sigma_k_rf": None, "singular_ratio": 0.0}
     e = 1e-6
-    J = np.column_stack([
-        (admittance(mu * (1 + e), k_rf) - admittance(mu * (1 - e), k_rf)) / (2 * e * mu),
-        (admittance(mu, k_rf + e) - admittance(mu, k_rf - e)) / (2 * e),
-    ])  # fmt: skip
+    by_mu = (admittance(mu * (1 + e), k_rf) - admittance(mu * (1 - e), k_rf)) / (2 * e * mu)
+    by_k_rf = (admittance(mu, k_rf + e) - admittance(mu, k_rf - e)) / (2 * e)
+    J = np.column_stack([by_mu, by_k_rf])
     C = sigma_h**2 * np.linalg.inv(J.T @ J)
     # in relative terms, so that the two parameters can be compared
     s = np.linalg.svd(J * np.array([mu, 1 + k_rf]), compute_uv=False)
@@ -77,21 +76,19 @@ def leaky(n_seeds: int = 20, seed0: int = SEED0) -> dict[str, Any]:
             assert r is not None
             e = np.array(est)
             claimed = found.sigma.tolist()
-            rows.append({
-                "mu": mu, "k_rf": k_rf, "kappa": kappa, "h": fault.h,
-                "mean": e.mean(axis=0).tolist(),
-                "rmse": np.sqrt(((e - [mu, k_rf]) ** 2).mean(axis=0)).tolist(),
-                "claimed": claimed,
-                "admittance": shunt_information(mu, k_rf, kappa, float(r["g_shunt"][1][-1])),
-                "identified": bool(claimed[1] < 0.3 * (1 + k_rf)),
-                "nis": float(np.mean(nis)),
-            })  # fmt: skip
+            row: dict[str, Any] = {"mu": mu, "k_rf": k_rf, "kappa": kappa, "h": fault.h}
+            row["mean"] = e.mean(axis=0).tolist()
+            row["rmse"] = np.sqrt(((e - [mu, k_rf]) ** 2).mean(axis=0)).tolist()
+            row["claimed"] = claimed
+            sigma_h = float(r["g_shunt"][1][-1])
+            row["admittance"] = shunt_information(mu, k_rf, kappa, sigma_h)
+            row["identified"] = bool(claimed[1] < 0.3 * (1 + k_rf))
+            rows.append(row | {"nis": float(np.mean(nis))})
     wrong = []
     for mu, k_rf in LEAKY:
         truth = generator_truth(FULL, 0.3, ((-0.2, Ttsc(mu, k_rf, kappa=1.0)),), start=0.25)
         samples = samples_of(truth, np.random.default_rng(seed0))
-        row: dict[str, Any] = {"mu": mu, "k_rf": k_rf, "kappa": 1.0,
-                               "h": Ttsc(mu, k_rf, kappa=1.0).h}  # fmt: skip
+        row = {"mu": mu, "k_rf": k_rf, "kappa": 1.0, "h": Ttsc(mu, k_rf, kappa=1.0).h}
         half = electrical_filter(kappa=0.5, phase="a")
         r = extended_kalman_filter(half.model, half.prior(samples), half.recording(samples))
         p = half.machine
@@ -111,5 +108,5 @@ def leaky(n_seeds: int = 20, seed0: int = SEED0) -> dict[str, Any]:
             "nis": float(r.nis[500:].mean()),
         }
         wrong.append(row)
-    return {"n_seeds": n_seeds, "seeds": [seed0, seed0 + n_seeds - 1], "known": rows,
-            "wrong": wrong}  # fmt: skip
+    about = {"n_seeds": n_seeds, "seeds": [seed0, seed0 + n_seeds - 1]}
+    return {**about, "known": rows, "wrong": wrong}

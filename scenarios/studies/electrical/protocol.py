@@ -2,34 +2,11 @@
 
 from __future__ import annotations
 
-from apu_casadi.machine.loads.series import SeriesLoad
+import casadi as ca
 
-__all__ = [
-    "ATOL",
-    "CONSTANT",
-    "DETECT",
-    "DT",
-    "EFFICIENCY",
-    "FULL",
-    "FULL_UNBALANCED",
-    "H_PRIOR",
-    "KAPPAS",
-    "LEAKY",
-    "N_SEEDS",
-    "PART",
-    "PART_UNBALANCED",
-    "PERIOD",
-    "RATIO_MATCHED",
-    "RATIO_MISMATCHED",
-    "RTOL",
-    "SEED0",
-    "SHARE_IN_BAND",
-    "TAIL_FROM",
-    "TWICE",
-    "UNBALANCE",
-    "UNIT_STEP",
-    "WAIT",
-]
+from apu_casadi.machine.loads.series import SeriesLoad
+from estimators.apu.electrical import electricalfilter
+from estimators.filters.ekf import ekf_step
 
 DT = 1e-4  # s, 10 kHz
 PERIOD = 2.5e-3  # s, 400 Hz
@@ -59,3 +36,9 @@ UNIT_STEP = 2e-3
 TAIL_FROM = 2.5
 LEAKY = ((0.002, 1.0), (0.01, 1.0), (0.05, 1.0), (0.01, 10.0))  # (mu, k_rf)
 KAPPAS = (1.0, 0.5, 0.2)
+
+
+def filters() -> list[ca.Function]:
+    """Return the functions of the filters that the studies try."""
+    kinds = (electricalfilter.electrical_filter(gains=g) for g in electricalfilter.GAINS)
+    return [ekf_step(filt.model).function for filt in kinds]

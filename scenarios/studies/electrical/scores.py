@@ -1,60 +1,15 @@
-"""What is judged: normalised errors, their bands, one-phase statistics along a run, alarms."""
+"""What is judged: one-phase statistics along a run, alarms."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import scipy.stats
 
-from estimators.apu.electrical.terminalsignals import PHASES
+from apu_casadi.machine.park import PHASES
 from estimators.filters.filtering import FilterResult
 
-__all__ = ["alarm_times", "h_covariance", "in_band", "nees", "rmse_interval", "statistics_of"]
-
-
-def _band(n: int, dof: float, level: float = 0.95) -> tuple[float, float]:
-    """Two-sided band of the mean of n chi-squared values with ``dof`` degrees of freedom."""
-    a = (1 - level) / 2
-    return (
-        float(scipy.stats.chi2.ppf(a, n * dof) / n),
-        float(scipy.stats.chi2.ppf(1 - a, n * dof) / n),
-    )
-
-
-def in_band(values: np.ndarray, n: int, dof: float) -> dict[str, Any]:
-    """Return the share of checkpoints whose mean over n seeds lies in its band, and the extremes.
-
-    Args:
-        values: means over the seeds, one for each checkpoint.
-        n: seeds.
-        dof: degrees of freedom of one value.
-    """
-    low, high = _band(n, dof)
-    v = np.asarray(values)
-    return {
-        "dof": dof,
-        "band": [low, high],
-        "mean": float(v.mean()),
-        "range": [float(v.min()), float(v.max())],
-        "share": float(((v >= low) & (v <= high)).mean()),
-        "course": v.tolist(),
-    }
-
-
-def nees(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """Return the normalised estimation errors squared, (c,); error (c, n), cov (c, n, n)."""
-    s = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-    scaled = cov / (s[:, :, None] * s[:, None, :])
-    e = error / s
-    return np.einsum("ci,ci->c", e, np.linalg.solve(scaled, e[..., None])[..., 0])
-
-
-def rmse_interval(ratio: float, n: int) -> list[float]:
-    """Return the 95 % interval of a root mean square of n Gaussian values, found as ``ratio``."""
-    a, b = scipy.stats.chi2.ppf([0.025, 0.975], n)
-    return [ratio * math.sqrt(n / b), ratio * math.sqrt(n / a)]
+__all__ = ["alarm_times", "h_covariance", "statistics_of"]
 
 
 def h_covariance(result: FilterResult) -> np.ndarray:

@@ -13,12 +13,12 @@ import scipy.linalg
 from apu_casadi.core.sharing import last, once
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.load import Load
-from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc
+from apu_casadi.machine.park import PHASES, Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.terminals import FLUXES
 from apu_casadi.machine.wrsg import Windings, currents, flux_rates
 from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.machinemodel import held
-from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED, PHASES, VOLTAGES
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED, VOLTAGES
 from estimators.apu.sensors import ELECTRICAL, SensorSet
 from scenarios.studies.electrical.protocol import ATOL, DT, FULL, RTOL, UNIT_STEP
 
@@ -128,6 +128,7 @@ def unit_truth(duration: float, events: tuple[Any, ...], *, load: Load = FULL) -
         dt=UNIT_STEP,
         exchange="corrected",
         waveform_dt=DT,
+        solver="cvodes",
         rtol=RTOL,
         atol=ATOL,
     )
@@ -156,20 +157,13 @@ def samples_of(
         sensors: 1-sigma table.
         gains: relative gain error by sensor.
     """
-    out = {"t": truth.t}
-    for n in _SAMPLED:
-        v = truth.values[n] * (1.0 + (gains or {}).get(n, 0.0))
-        if rng is not None:
-            s = sensors[n]
-            noise = s.noise * np.abs(v) if s.relative else s.noise
-            v = v + noise * rng.standard_normal(v.shape)
-        out[n] = v
-    return out
+    true = {n: truth.values[n] for n in _SAMPLED}
+    return {"t": truth.t} | sensors.measure(true, rng, gains=gains)
 
 
 def drawn_gains(rng: np.random.Generator, sensors: SensorSet = ELECTRICAL) -> dict[str, float]:
     """Draw the constant gain errors of all sensors, Gaussian, from their table."""
-    return {n: sensors[n].gain * float(rng.standard_normal()) for n in GAIN_SENSORS}
+    return sensors.draw_gains(rng, GAIN_SENSORS)
 
 
 def chances(
@@ -227,7 +221,7 @@ def _flux_matrix(w_r: float) -> np.ndarray:
     none = Qd0(0.0, 0.0, 0.0)
     for e in np.eye(6):
         lam = Windings(*e)
-        r = flux_rates(p, lam=lam, i=currents(p, lam), v=none, V_fd=0.0, w_r=w_r, w1=none,
-                       w2=(0.0, 0.0, 0.0))  # fmt: skip
+        still: dict[str, Any] = {"v": none, "V_fd": 0.0, "w1": none, "w2": (0.0, 0.0, 0.0)}
+        r = flux_rates(p, lam=lam, i=currents(p, lam), w_r=w_r, **still)
         columns.append([float(x) for x in r])
     return np.array(columns).T

@@ -21,19 +21,19 @@ pyCycle needs NumPy below 2.3, hence a Python of its own, named by the variable
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from typing import Any
 
+from apu_casadi.gaspath.designdata import RPM
 from apu_casadi.gaspath.gas import T_REF
-from apu_casadi.gaspath.gasgenerator import RPM, GasGenerator
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from scenarios.validation.comparison import Row, SkippedError, relative, section
+from scenarios.validation.comparison import Row, SkippedError, compared, relative, section, timing
 from scenarios.validation.peers.process import end_all, run_script
 
 VARIABLE = "APU_PYCYCLE_PYTHON"
@@ -56,9 +56,8 @@ DESIGN_TOLERANCE = {
     "Wf": (1e-3, _DISSOCIATION),
     "SFC": (4e-4, "as Wf, less what the given-back heat adds to the power"),
 }
-LINE_TOLERANCE = (
-    6e-4, "splines of two kinds through one table: 2e-4 of eta halfway between lines; dissociation"
-)  # fmt: skip
+_SPLINES = "splines of two kinds through one table: 2e-4 of eta halfway between lines"
+LINE_TOLERANCE = (6e-4, f"{_SPLINES}; dissociation")
 LINEAR_TOLERANCE = (3e-3, "linear against smooth between table lines: 0.12 % of eta_t at 80 %")
 
 
@@ -96,9 +95,9 @@ def pycycle_case(gg: GasGenerator, interpolation: str) -> dict[str, Any]:
     p, d = gg.parameters, gg.design.values
     beta, table = gg.turbine_map.beta_des, gg.turbine_map.table
     low, high = float(table.PR.min()), float(table.PR.max())
-    names = ("altitude", "Mach", "dT_isa", "dp_inlet", "dp_burner", "dp_exhaust", "W2", "PR_c",
-             "eta_c", "eta_t", "T4", "NPR", "x_HC", "LHV")  # fmt: skip
-    design = {n: getattr(p, n) for n in names}
+    air = ("altitude", "Mach", "dT_isa", "dp_inlet", "dp_burner", "dp_exhaust")
+    cycle = ("W2", "PR_c", "eta_c", "eta_t", "T4", "NPR", "x_HC", "LHV")
+    design = {n: getattr(p, n) for n in (*air, *cycle)}
     design |= {
         "N_rpm": p.N / RPM,
         "bleed_overboard": p.bleed_overboard,
@@ -163,24 +162,26 @@ def explained(gg: GasGenerator, peer: dict[str, float]) -> list[Row]:
         frozen = c.h
         c.equilibrate("TP")
         predicted = d["W4"] * (c.h - frozen) / (gg.parameters.LHV - h4)
-        rows.append(
-            Row("design: more fuel in pyCycle, by Cantera's equilibrium", "kg/s", more, predicted,
-                relative(predicted, more), 0.05, "first order in the fuel; NASA-7 in Cantera",
-                "check")
-        )  # fmt: skip
+        what, why = (
+            "design: more fuel in pyCycle, by Cantera's equilibrium",
+            "first order in the fuel",
+        )
+        why += "; NASA-7 in Cantera"
+        rows.append(compared(what, "kg/s", more, predicted, 0.05, why, "check"))
     FAR5 = d["Wf"] / (0.99 * gg.parameters.W2)
     cp5, h5 = float(gas.cp(d["T5"], FAR5)), float(gas.h(d["T5"], FAR5))
     heat = more * (gg.parameters.LHV - h5)
     used = peer["P_shaft"] - d["P_shaft"] + d["W5"] * cp5 * (peer["T5"] - d["T5"])
-    rows.append(
-        Row("design: heat of that fuel, in power and exhaust", "W", heat, used,
-            relative(used, heat), 0.05, "first order in the differences: nothing else differs",
-            "check")
-    )  # fmt: skip
-    return rows
+    what = "design: heat of that fuel, in power and exhaust"
+    why = "first order in the differences: nothing else differs"
+    return [*rows, compared(what, "W", heat, used, 0.05, why, "check")]
 
 
-@section("pycycle", "Gas generator against pyCycle: design, off-design line, altitude, as ratios")
+@section(
+    "pycycle",
+    "Gas generator against pyCycle: design, off-design line, altitude, as ratios",
+    order=60,
+)
 def pycycle() -> list[Row]:
     """Compare T3, P3, T4, T5, W2, Wf and SFC; ``error`` is the ratio less one.
 
@@ -197,31 +198,24 @@ def pycycle() -> list[Row]:
             if extra and reason.startswith("given"):  # nothing new to see
                 continue
             why = f"{reason}; data of 1993, not of 2002" if extra else reason
-            rows.append(
-                Row(f"{label}: {k}", COMPARED[k], peer[k], values[k], relative(values[k], peer[k]),
-                    tolerance + extra, why, "check")
-            )  # fmt: skip
+            pair = (peer[k], values[k])
+            tol = tolerance + extra
+            rows.append(compared(f"{label}: {k}", COMPARED[k], *pair, tol, why, "check"))
     rows += explained(gg, smooth["design"])
     points = trimmed(gg)
     for (label, PW, _), mine, peer in zip(POINTS, points, smooth["points"], strict=True):
         theirs = peer | {"SFC": peer["Wf"] / (PW + gg.parameters.P_acc)}
         rows += [
-            Row(f"{label}: {k}", unit, theirs[k], mine[k], relative(mine[k], theirs[k]),
-                *LINE_TOLERANCE, "check")
+            compared(f"{label}: {k}", unit, theirs[k], mine[k], *LINE_TOLERANCE, "check")
             for k, unit in COMPARED.items()
-        ]  # fmt: skip
+        ]
     for (label, _, _), mine, peer in zip(POINTS, points, linear["points"], strict=True):
         same = [k for k in COMPARED if k in peer]  # SFC goes with Wf
         k = max(same, key=lambda k: abs(relative(mine[k], peer[k])))
-        rows.append(
-            Row(f"{label}, linear maps, the worst: {k}", COMPARED[k], peer[k], mine[k],
-                relative(mine[k], peer[k]), *LINEAR_TOLERANCE, "check")
-        )  # fmt: skip
+        what = f"{label}, linear maps, the worst: {k}"
+        rows.append(compared(what, COMPARED[k], peer[k], mine[k], *LINEAR_TOLERANCE, "check"))
     s = smooth["seconds"]
     what = f"pyCycle {smooth['versions']['om-pycycle']}, wall time"
     for k, label in (("first", "design and first point"), ("all", "all points")):
-        rows.append(
-            Row(f"{what}, {label}", "s", math.nan, s[k], 0.0, math.inf, "a timing is no test",
-                "check")
-        )  # fmt: skip
+        rows.append(timing(f"{what}, {label}", "s", s[k]))
     return rows

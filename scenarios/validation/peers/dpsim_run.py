@@ -26,6 +26,9 @@ import numpy as np
 OPEN = 1e9  # ohm, an open switch
 NO_WINDING = 1e6  # per unit, leakage of the second q damper
 CONSTANT_SPEED = 1e12  # s, inertia constant
+WINDINGS = {"Rs": "r_s", "Rfd": "r_fd", "Rkd": "r_kd", "Rkq1": "r_kq", "Ll": "L_ls", "Lmd": "L_md"}
+WINDINGS |= {"Lmq": "L_mq", "Llfd": "L_lfd", "Llkd": "L_lkd", "Llkq1": "L_lkq"}
+"""Resistances and inductances by dpsim's names."""
 
 
 def network(case: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
@@ -33,15 +36,13 @@ def network(case: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
     emt = dpsimpy.emt
     p = case["machine_pu"]
     generator = emt.ph3.SynchronGeneratorDQODE("generator", dpsimpy.LogLevel.off)
-    generator.set_parameters_fundamental_per_unit(
-        nom_power=case["S"], nom_volt=case["V_line"], nom_freq=case["f"],
-        pole_number=case["poles"], nom_field_cur=1.0,
-        Rs=p["r_s"], Ll=p["L_ls"], Lmd=p["L_md"], Lmq=p["L_mq"], Rfd=p["r_fd"], Llfd=p["L_lfd"],
-        Rkd=p["r_kd"], Llkd=p["L_lkd"], Rkq1=p["r_kq"], Llkq1=p["L_lkq"], Rkq2=1.0,
-        Llkq2=NO_WINDING, inertia=CONSTANT_SPEED, init_active_power=case["P"],
-        init_reactive_power=0.0, init_terminal_volt=case["V_peak"], init_volt_angle=0.0,
-        init_mech_power=case["P"],
-    )  # fmt: skip
+    rated = {"nom_power": case["S"], "nom_volt": case["V_line"], "nom_freq": case["f"]}
+    rated |= {"pole_number": case["poles"], "nom_field_cur": 1.0, "inertia": CONSTANT_SPEED}
+    windings = {theirs: p[ours] for theirs, ours in WINDINGS.items()}
+    windings |= {"Rkq2": 1.0, "Llkq2": NO_WINDING}
+    start = {"init_active_power": case["P"], "init_mech_power": case["P"]}
+    start |= {"init_reactive_power": 0.0, "init_terminal_volt": case["V_peak"]}
+    generator.set_parameters_fundamental_per_unit(**rated, **windings, **start, init_volt_angle=0.0)
     ground, terminal = emt.SimNode.gnd, emt.SimNode("terminal", dpsimpy.PhaseType.ABC)
     load = emt.ph3.Resistor("load")
     load.set_parameters(np.diag(case["R_load"]))
@@ -60,9 +61,7 @@ def network(case: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
         coil.connect([ground, behind])
         nodes.append(behind)
         components.append(coil)
-    return (
-        dpsimpy.SystemTopology(case["f"], nodes, components), generator, terminal, switch
-    )  # fmt: skip
+    return dpsimpy.SystemTopology(case["f"], nodes, components), generator, terminal, switch
 
 
 def run(case: dict[str, Any], dt: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.gaspath.gas import DATA_SETS, DRY_AIR, M_C, M_H, P_STD, T_REF, Gas, species
-from scenarios.validation.comparison import Row, SkippedError, section
+from scenarios.validation.comparison import Row, SkippedError, check, section
 
 TEMPERATURES = np.arange(200.0, 2201.0, 50.0)
 FUEL_AIR = (0.0, 0.01, 0.02, 0.03, 0.04)
@@ -62,8 +62,8 @@ def solution(names: tuple[str, ...], data: str = "nasa7") -> Any:
                 continue
             # zones: their number, then T_low, T_high and nine coefficients of each
             zones = [2.0]
-            for limits, c in zip(((200.0, 1000.0), (1000.0, 6000.0)), species(data)[n][1],
-                                 strict=True):  # fmt: skip
+            ranges = ((200.0, 1000.0), (1000.0, 6000.0))
+            for limits, c in zip(ranges, species(data)[n][1], strict=True):
                 zones += [*limits, *c]
             # the pressure of airNASA9.yaml; it cancels from entropy differences of one mixture
             found[n].thermo = ct.Nasa9PolyMultiTempRegion(200.0, 6000.0, P_STD, zones)
@@ -111,7 +111,9 @@ def equilibrium_errors(data: str) -> dict[float, float]:
     return worst
 
 
-@section("cantera", "Gas properties against Cantera: frozen and in equilibrium, 200-2200 K")
+@section(
+    "cantera", "Gas properties against Cantera: frozen and in equilibrium, 200-2200 K", order=40
+)
 def cantera() -> list[Row]:
     """Compare both data sets over fuel-air ratios 0-0.04.
 
@@ -125,11 +127,11 @@ def cantera() -> list[Row]:
     for data in DATA_SETS:
         for k, e in frozen_errors(data).items():
             over = {"h": " over cp T", "s0": " over cp"}.get(k, "")
-            rows.append(Row(f"{data}, frozen, {k}{over}", "1", 0.0, e, e, 3e-5, reason, "check"))
+            rows.append(check(f"{data}, frozen, {k}{over}", e, 3e-5, reason))
     for data in DATA_SETS:
         low = TEMPERATURES[0]
         for high, e in equilibrium_errors(data).items():
             what = f"{data}, h over cp T against equilibrium, {low:.0f}-{high:.0f} K"
-            rows.append(Row(what, "1", 0.0, e, e, *BANDS[high], "check"))
+            rows.append(check(what, e, *BANDS[high]))
             low = high
     return rows

@@ -100,10 +100,8 @@ def corrected_flow() -> om.ExecComp:
 
 def scaled_loss(at_design: float) -> om.ExecComp:
     """Return a relative pressure loss that grows with the square of the corrected flow."""
-    return om.ExecComp(
-        f"dPqP = {at_design!r} * (W / P / flow_des) ** 2 * T", flow_des={"val": 1e-4},
-        dPqP={"val": at_design}, **_STATION,
-    )  # fmt: skip
+    equation = f"dPqP = {at_design!r} * (W / P / flow_des) ** 2 * T"
+    return om.ExecComp(equation, flow_des={"val": 1e-4}, dPqP={"val": at_design}, **_STATION)
 
 
 class Turboshaft(pyc.Cycle):
@@ -183,10 +181,9 @@ class Turboshaft(pyc.Cycle):
             self.connect("balance.W", "inlet.Fl_I:stat:W")
             self.connect("nozz.Throat:stat:area", "balance.lhs:W")
 
-        newton = self.nonlinear_solver = om.NewtonSolver(
-            atol=1e-9, rtol=1e-12, maxiter=60, solve_subsystems=True, max_sub_solves=100,
-            reraise_child_analysiserror=False, err_on_non_converge=True,
-        )  # fmt: skip
+        options = {"atol": 1e-9, "rtol": 1e-12, "maxiter": 60, "max_sub_solves": 100}
+        options |= {"reraise_child_analysiserror": False, "err_on_non_converge": True}
+        newton = self.nonlinear_solver = om.NewtonSolver(solve_subsystems=True, **options)
         newton.options["iprint"] = -1
         newton.linesearch = om.ArmijoGoldsteinLS(maxiter=3, rho=0.75, iprint=-1)
         self.linear_solver = om.DirectSolver()
@@ -246,9 +243,8 @@ def read(prob: om.Problem, pt: str) -> dict[str, float]:
     def get(name: str, units: str | None = None) -> float:
         return float(np.ravel(prob.get_val(f"{pt}.{name}", units=units))[0])
 
-    out = {}
-    for station, port in (("2", "inlet"), ("3", "comp"), ("4", "burner"), ("41", "mix"),
-                          ("5", "turb"), ("8", "nozz")):  # fmt: skip
+    out, ports = {}, {"2": "inlet", "3": "comp", "4": "burner", "41": "mix", "5": "turb"}
+    for station, port in (ports | {"8": "nozz"}).items():
         out[f"T{station}"] = get(f"{port}.Fl_O:tot:T", "K")
         out[f"P{station}"] = get(f"{port}.Fl_O:tot:P", "Pa")
     out["P0"] = get("fc.Fl_O:stat:P", "Pa")

@@ -1,0 +1,364 @@
+"""What integrates a generator over an exchange step, from the fastest to what always can.
+
+An integrator is made for one *phase*, a load and a fault, and asked for steps.  One that cannot
+take a step raises :class:`~apu_casadi.core.errors.NotApplicable` with the reason, and the next
+one is asked.  Exact propagation holds for a linear load, a speed that is held, a whole exchange
+step, and not right after a switch, when the windings settle within microseconds; CVODES and IDAS
+always can.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Generic, NamedTuple, TypeVar
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.errors import NotApplicable, SimulationError
+from apu_casadi.core.runloop import SAME_INSTANT
+from apu_casadi.core.sharing import kept
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.simulation import stepper
+from apu_casadi.core.statespace import StateSpace
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.generatormodel import GeneratorModel
+from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.machine.propagation import Propagator
+from apu_casadi.machine.transition import SPEED_RANGE
+from apu_casadi.unit.exchange import PAPER, Exchange
+from apu_casadi.unit.stepmeans import StepMeans
+
+if TYPE_CHECKING:
+    from apu_casadi.machine.faults.fault import Fault
+    from apu_casadi.machine.loads.load import Load
+
+SOLVERS = ("auto", "cvodes", "idas", "propagator")
+"""``"auto"``, also called ``"propagator"``: exact propagation where it holds, else CVODES."""
+WAVEFORMS = tuple(
+    ["v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_total"]
+)
+
+#: Samples in an exchange step of exact propagation when no waveforms are kept and a
+#: :class:`MeanStep` does not hold, by "is healthy".
+SUMMARY_SAMPLES = {True: 160, False: 200}
+FINE_SAMPLE = 50e-6  # s; what stored waveforms are computed with, at most
+SETTLED = 5e-3  # s; so long after a switch CVODES goes on, in the middle of a step if need be
+_NO_TIMES, _NO_WAVES = np.empty(0), np.empty((0, 0))
+_LOG = logging.getLogger("apu_casadi")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the generators of a run are integrated.
+
+    Args:
+        way: how speed and fuel pass between the models.
+        dt: length of a whole exchange step, s.
+        waveform_dt: sampling of the waveforms, s; None: none are wanted.
+        solver, rtol, atol: one of ``SOLVERS``, and its tolerances.
+        noisy: whether the voltages have process noise.
+    """
+
+    way: Exchange = PAPER
+    dt: float = 0.02
+    waveform_dt: float | None = None
+    solver: str = "auto"
+    rtol: float = 1e-8
+    atol: float = 1e-10
+    noisy: bool = False
+
+    @property
+    def fast(self) -> bool:
+        """Whether what is fast may be used, and compiled for it."""
+        return self.solver in ("auto", "propagator")
+
+    @property
+    def exact(self) -> bool:
+        """Whether exact propagation may be used at all."""
+        return self.fast and self.way == PAPER and not self.noisy
+
+    def n_out(self, h: float) -> int:
+        """Samples stored in a step of length h, s."""
+        return 1 if self.waveform_dt is None else max(1, round(h / self.waveform_dt))
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """A load and a fault of a generator, with the model and its parameters.
+
+    Args:
+        u: inputs; the speed among them does not matter.
+        symmetric: whether the phases differ by rotation only.
+    """
+
+    gen: Generator
+    load: Load
+    fault: Fault | None
+    ss: GeneratorModel
+    u: np.ndarray
+    theta: np.ndarray
+    symmetric: bool
+
+
+class Step(NamedTuple):
+    """A step that is asked for.
+
+    Args:
+        x, u: state at the start, and inputs.
+        w_r, slope: electrical speed, rad/s, and its slope, rad/s2.
+        h, t0: length and start, s.
+        since: time since the last switch, s.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    w_r: float
+    slope: float
+    h: float
+    t0: float
+    since: float
+
+
+class Integrated(NamedTuple):
+    """What an integrator gave.
+
+    Args:
+        x: state at the end.
+        quad, means: names of what was averaged over the step, and values.
+        t, w: instants of the samples, s, and waveforms, shape (``WAVEFORMS``, samples).
+        nsteps: steps of the solver.
+        exact: whether all of it was propagated exactly.
+    """
+
+    x: np.ndarray
+    quad: tuple[str, ...]
+    means: np.ndarray
+    t: np.ndarray = _NO_TIMES
+    w: np.ndarray = _NO_WAVES
+    nsteps: int = 0
+    exact: bool = True
+
+
+Integrator = Callable[[Step], Integrated]
+
+
+def integrators(phase: Phase, settings: Settings, means: StepMeans) -> list[Integrator]:
+    """Return the integrators of a phase, in the order in which they are to be asked."""
+    always = Stepwise(phase, settings, means)
+    if not settings.exact:
+        return [always]
+    sampled: list[Integrator] = [Samples(phase, settings, means, fine=f) for f in (False, True)]
+    if settings.waveform_dt is not None:
+        return [*sampled, always]
+    whole, rest = (Means(phase, settings, means, after=a) for a in (0.0, SETTLED))
+    return [whole, *sampled, Follow(always, rest, settings), always]
+
+
+F = TypeVar("F", MeanStep, Propagator)
+
+
+class _Exact(Generic[F]):
+    """Exact propagation, prepared when it is first asked for."""
+
+    otherwise: ClassVar[str]
+
+    def __init__(self, phase: Phase, settings: Settings, means: StepMeans) -> None:
+        self.phase, self.settings = phase, settings
+        turn = (1 - SPEED_RANGE) * phase.gen.machine.w_rated * settings.dt
+        self.quad = means.quad(short=turn < 2 * math.pi, symmetric=phase.symmetric)
+        self._made: F | None = None
+        self._refused = ""
+
+    def _prepare(self) -> F:
+        raise NotImplementedError
+
+    def fast(self) -> F:
+        """Return what propagates.
+
+        Raises:
+            NotApplicable: there is nothing for this load, fault and step.
+        """
+        if self._refused:
+            raise NotApplicable(self._refused)
+        if self._made is None:
+            try:
+                self._made = self._prepare()
+            except SimulationError as error:
+                _LOG.info("%s: %s", self.otherwise, error)
+                self._refused = str(error)
+                raise NotApplicable(self._refused) from None
+        return self._made
+
+    def ready(self, step: Step) -> F:
+        """Return what propagates, for a step that it is made for."""
+        if abs(step.h - self.settings.dt) >= SAME_INSTANT:
+            raise NotApplicable(f"{step.h:g} s are not a whole exchange step")
+        if step.since < SETTLED - SAME_INSTANT:
+            raise NotApplicable(f"{step.since:g} s after a switch the windings have not settled")
+        return self.fast()
+
+
+class Means(_Exact[MeanStep]):
+    """Steps of which only means are wanted; the part of each that lies ``after`` a time, s."""
+
+    otherwise = "samples are needed also for means"
+
+    def __init__(
+        self, phase: Phase, settings: Settings, means: StepMeans, *, after: float = 0.0
+    ) -> None:
+        super().__init__(phase, settings, means)
+        self.after = after
+
+    def _prepare(self) -> MeanStep:
+        p, dt = self.phase, self.settings.dt
+        first = 1 - (dt - self.after) / dt
+        within = first, 1 - first
+        return MeanStep(
+            p.gen, p.ss, p.u, p.theta, dt=dt - self.after, quad=self.quad, within=within
+        )
+
+    def __call__(self, step: Step) -> Integrated:
+        """Advance over a whole exchange step."""
+        x, means = self.ready(step)(step.x, step.u, t0=step.t0)
+        return Integrated(_wrapped(self.phase.ss, x), self.quad, means.ravel())
+
+
+class Samples(_Exact[Propagator]):
+    """Steps with samples, for waveforms or where means alone are not enough.
+
+    Coarse waveforms are every k-th of samples fine enough for 1e-5 of peak.
+    """
+
+    otherwise = "exact propagation not used, CVODES instead"
+
+    def __init__(
+        self, phase: Phase, settings: Settings, means: StepMeans, *, fine: bool = False
+    ) -> None:
+        super().__init__(phase, settings, means)
+        self.fine = fine
+        least, wanted = SUMMARY_SAMPLES[phase.fault is None], settings.n_out(settings.dt)
+        if settings.waveform_dt is not None:
+            least = max(least, round(settings.dt / FINE_SAMPLE))
+        every = 1 if settings.waveform_dt is None else -(-least // wanted)
+        self.n = least if settings.waveform_dt is None else every * wanted
+        self.stored = slice(every - 1, None, every)
+
+    def _prepare(self) -> Propagator:
+        p, outputs = self.phase, () if self.settings.waveform_dt is None else WAVEFORMS
+        return Propagator(
+            p.gen,
+            p.ss,
+            p.u,
+            p.theta,
+            n_out=self.n,
+            dt=self.settings.dt,
+            outputs=outputs,
+            quad=self.quad,
+            fine=self.fine,
+        )
+
+    def __call__(self, step: Step) -> Integrated:
+        """Advance over a whole exchange step."""
+        fast = self.ready(step)
+        x, w, means = fast(step.x, step.u, t0=step.t0)
+        t = fast.times(step.t0)[self.stored]
+        return Integrated(
+            _wrapped(self.phase.ss, x), self.quad, means.ravel(), t, w[:, self.stored]
+        )
+
+
+class Stepwise:
+    """CVODES or IDAS, over any step."""
+
+    def __init__(self, phase: Phase, settings: Settings, means: StepMeans) -> None:
+        self.phase, self.settings, self.means = phase, settings, means
+        self.model = ramped(phase.ss) if settings.way.ramp else phase.ss
+        self._rows = phase.ss.y.indices(WAVEFORMS)
+        self._at = phase.ss.u.index("w_r")
+        self._solver = "idas" if settings.solver == "idas" else "cvodes"
+
+    def __call__(self, step: Step) -> Integrated:
+        """Integrate over any step."""
+        short = step.h * step.w_r < 2 * math.pi
+        made = self.over(step, self.means.quad(short=short, symmetric=self.phase.symmetric))
+        return made._replace(x=_wrapped(self.phase.ss, made.x))
+
+    def over(self, step: Step, quad: tuple[str, ...], share: float = 1.0) -> Integrated:
+        """Integrate over a step, which is the first ``share`` of a longer one."""
+        s, fine = self.settings, self.phase.load.fineness
+        run = stepper(
+            self.model,
+            s.n_out(step.h),
+            quad=quad,
+            solver=self._solver,
+            rtol=fine * s.rtol,
+            atol=fine * s.atol,
+        )
+        x, u = step.x, step.u
+        if s.way.ramp:
+            x, u = np.append(x, step.w_r), u.copy()
+            u[self._at] = step.slope
+        r = run(x, u, self.phase.theta, step.h, t0=step.t0, within=(0.0, share))
+        x_end, nsteps = r.x_end[: len(self.phase.ss.x)], int(r.stats.get("nsteps", 0))
+        means = np.array([r.mean[k] for k in quad])
+        return Integrated(x_end, quad, means, r.t, r.y[self._rows], nsteps, exact=False)
+
+
+class Follow:
+    """A step right after a switch: integrated until the windings have settled, then propagated."""
+
+    def __init__(self, first: Stepwise, rest: Means, settings: Settings) -> None:
+        self.first, self.rest, self.settings = first, rest, settings
+
+    def __call__(self, step: Step) -> Integrated:
+        """Advance over the first exchange step after a switch."""
+        dt = self.settings.dt
+        if abs(step.h - dt) >= SAME_INSTANT or dt < 2 * SETTLED:
+            raise NotApplicable(f"a step of {step.h:g} s is not parted")
+        if step.since >= SETTLED - SAME_INSTANT:
+            raise NotApplicable("the last switch is long ago")
+        rest = self.rest.fast()
+        if not rest.valid(step.w_r):
+            raise NotApplicable(f"w_r = {step.w_r:.6g} rad/s is outside the tables")
+        share = SETTLED / dt
+        a = self.first.over(step._replace(h=SETTLED), self.rest.quad, share)
+        x, then = rest(a.x, step.u, t0=step.t0 + SETTLED)
+        means = share * a.means + (1 - share) * then.ravel()
+        return a._replace(x=_wrapped(self.rest.phase.ss, x), means=means)
+
+
+def _wrapped(ss: StateSpace, x: np.ndarray) -> np.ndarray:
+    """Keep the rotor angle small, so that its cosine stays accurate over hours; a copy."""
+    x, at = x.copy(), ss.x.index("theta_e")
+    x[at] = math.remainder(x[at], 2 * math.pi)
+    return x
+
+
+@kept
+def ramped(ss: StateSpace) -> StateSpace:
+    """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input."""
+    X = Signals([*ss.x, dataclasses.replace(ss.u["w_r"], name="w_r", default=None)])
+    slope = Signal("w_r_dot", "rad/s^2", "slope of the electrical speed", nominal=1e3)
+    U = Signals([slope if s.name == "w_r" else s for s in ss.u])
+    at = ss.u.index("w_r")
+    x, z, u, theta = (
+        ca.SX.sym(label, len(s))
+        for label, s in (("x", X), ("z", ss.z), ("u", U), ("theta", ss.theta))
+    )
+    x_sg, rate = x[: len(ss.x)], u[at]
+    u_sg = ca.vertcat(u[:at], x[len(ss.x)], u[at + 1 :])
+    ode, alg = ss.residual(x_sg, z, u_sg, theta)
+    return StateSpace.of(
+        f"{ss.name}_ramped",
+        (X, ss.z, U, ss.theta, ss.y),
+        (x, z, u, theta),
+        dae=(ca.vertcat(ode, rate), alg),
+        f=ca.vertcat(ss.f(x_sg, u_sg, theta), rate),
+        g=ss.g(x_sg, u_sg, theta),
+        z=ss.z_of(x_sg, u_sg, theta),
+    )

@@ -1,0 +1,132 @@
+"""Means over the steps of a joint run: what is averaged, and what is kept of it.
+
+A step gives plain means of powers and torque, and what rms values and phasors are made of
+(:mod:`apu_casadi.core.means`).  Many steps are settled at once, since one costs as much as a
+hundred.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from apu_casadi.core.means import PARTS, PHASES, PHASORS, RMS, as_dict, settled, wanted
+from apu_casadi.core.signals import Signal
+from apu_casadi.machine.generator import Generator, GeneratorPoint
+
+MEANS = ("P_total", "P_e", "P_loss_fault")
+#: Power of the torques over that of eq. (8), shares of the rated power, that is warned of.
+EXCESS = 0.01
+
+
+class RawMeans(NamedTuple):
+    """Means of one or more steps as they were averaged; :meth:`StepMeans.settle` goes on.
+
+    Args:
+        quad, symmetric: names of the means, and whether the phases differ by rotation only.
+        values: shape (means, steps); ``MEANS`` come first.
+        turn, w_r: electrical periods in each step, and electrical speed, rad/s.
+        t: end of each step, s; one instant or (steps,).
+    """
+
+    quad: tuple[str, ...]
+    symmetric: bool
+    values: np.ndarray
+    turn: float
+    w_r: float
+    t: Any
+
+    @classmethod
+    def of(cls, quad: tuple[str, ...], symmetric: bool, means: np.ndarray, h: float, w_r: float,
+           t: Any) -> RawMeans:  # fmt: skip
+        """Copy the means of steps of length h that end at t, s."""
+        values = means.reshape(len(quad), -1).copy()
+        return cls(quad, symmetric, values, h * w_r / (2 * math.pi), w_r, t)
+
+
+class StepMeans:
+    """What is averaged over the steps of one generator, and kept.
+
+    Args:
+        gen: the generator.
+        phasors: whether phasors are wanted too.
+    """
+
+    def __init__(self, gen: Generator, phasors: bool) -> None:
+        self.gen, self.phasors = gen, phasors
+        self.kept = (*MEANS, *RMS, *(PARTS if phasors else ()))
+        # largest power of the torques over eq. (8), both, and the instant
+        self.excess: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+
+    def quad(self, *, short: bool, symmetric: bool) -> tuple[str, ...]:
+        """What is averaged; ``short``: a step may be shorter than an electrical period."""
+        means = wanted(phasors=self.phasors, short=short, symmetric=symmetric)
+        return (*MEANS, *means, "T_e")
+
+    def at_rest(self, point: GeneratorPoint) -> np.ndarray:
+        """What a step's means would be in the steady state of a balanced load."""
+        y = point.y
+        means = [*(y[n] for n in MEANS), *rms_at_rest(point).values()]
+        if self.phasors:
+            for q in "vi":
+                for p, ahead, behind in ("acb", "bac", "cba"):
+                    # at rotor angle zero, where a steady state starts: v_a = a cos + b sin, and
+                    # the other phases are a third of a turn before and behind it
+                    b = (y[f"{q}_{ahead}"] - y[f"{q}_{behind}"]) / math.sqrt(3.0)
+                    means += [y[f"{q}_{p}"] / math.sqrt(2.0), -b / math.sqrt(2.0)]
+        return np.array(means)
+
+    def settle(self, raw: Sequence[RawMeans]) -> np.ndarray:
+        """Return what is kept of the means of steps, as ``kept``, shape (kept, steps).
+
+        All have the same ``quad`` and ``symmetric``.  Notes where the torque takes more than
+        eq. (8) says.
+        """
+        values = np.concatenate([r.values for r in raw], axis=1)
+        steps = [r.values.shape[1] for r in raw]
+        turn, w_r = (np.repeat(x, steps) for x in ([r.turn for r in raw], [r.w_r for r in raw]))
+        t = np.concatenate([np.atleast_1d(r.t) for r in raw])
+        by_name = as_dict(raw[0].quad, values)
+        more = settled(by_name, turn=turn, symmetric=raw[0].symmetric, phasors=self.phasors)
+        torque = 2.0 * by_name["T_e"] * w_r / self.gen.machine.n_pp
+        excess = torque - by_name["P_total"]
+        k = int(np.argmax(excess))
+        if excess[k] > self.excess[0]:
+            at = (excess[k], torque[k], by_name["P_total"][k], t[k])
+            self.excess = tuple(map(float, at))
+        return np.concatenate([values[: len(MEANS)], more])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What must be known of the steps settled so far."""
+        more, torque, power, t = self.excess
+        if more <= EXCESS * 2.0 * self.gen.machine.P_rated:
+            return []
+        return [
+            f"eq. (8) gives too little: in the step that ends at t = {t:.6g} s the torque of "
+            f"the two generators takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
+            f"the gas generator is loaded, {power / 1e3:.4g} kW; {more / 1e3:.3g} kW are more "
+            f"than {100 * EXCESS:g} % of the rated power. Eq. (8) holds output and extra loss "
+            "of the fault only: near a short circuit the machine's own loss is missing"
+        ]
+
+
+def rms_at_rest(point: GeneratorPoint) -> dict[str, float]:
+    """Rms values in the steady state of a balanced load, by name."""
+    I = math.sqrt(sum(point.y[f"i_{p}"] ** 2 for p in PHASES) / 3)
+    return {name: point.y["V_t"] if name[0] == "V" else I for name in RMS}
+
+
+def phasor_signals() -> list[Signal]:
+    """Name, unit and meaning of the phasors of a step."""
+    kinds = {"V": ("V", "voltage"), "I": ("A", "current")}
+    parts = {"re": "along the rotor angle's cosine", "im": "ahead of it by a quarter turn"}
+    return [
+        Signal(f"{name}_{part}", unit, f"phase {name[2]} {what}, fundamental, rms, {where}")
+        for name in PHASORS
+        for unit, what in (kinds[name[0]],)
+        for part, where in parts.items()
+    ]

@@ -1,0 +1,152 @@
+"""Jumps of the health: found by the innovations, and followed by a filter that goes back to them.
+
+A health factor walks slowly.  A fault is a jump, which no slow walk follows: so the belief is
+opened for it where the innovations say so (:func:`track_jumps`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core.errors import EstimationError
+from estimators.apu.gaspath import JUMP, GasPathFilter
+from estimators.apu.gaspathmodel import DT
+from estimators.filters.belief import Belief
+from estimators.filters.filtering import FilterResult, StepMaker
+from estimators.information.consistency import exceeded
+from estimators.models.recording import Recording
+
+__all__ = ["JumpTest", "Tracked", "track_jumps", "whitened"]
+
+
+@dataclass(frozen=True)
+class JumpTest:
+    """When the innovations say that the health has jumped.
+
+    Whitened innovations are summed over windows of several lengths; the squared norm of each sum
+    over its length is chi-squared as long as the model holds, and grows with the window's length
+    under a lasting shift.
+
+    Args:
+        windows: lengths in samples.
+        rate: accepted false alarms in an hour; the threshold follows by Bonferroni's bound over all
+            samples and windows, so that the true rate is lower.
+        margin: factor on the threshold for what the model does not hold.
+        hold: samples after a jump, or after the start, in which no new alarm is raised.
+    """
+
+    windows: tuple[int, ...] = (1, 3, 10, 30)
+    rate: float = 1.0
+    margin: float = 1.25
+    hold: int = 25
+
+    def threshold(self, ny: int, dt: float = DT) -> float:
+        """Threshold of the statistic for ``ny`` outputs."""
+        tests = 3600.0 / dt * len(self.windows)
+        return float(self.margin * exceeded(self.rate / tests, ny))
+
+    def first(self, result: FilterResult, start: int) -> tuple[int, int] | None:
+        """Return the first alarm at or after sample ``start``: (alarm, onset), or None."""
+        e = whitened(result)
+        total = np.concatenate([np.zeros((1, e.shape[1])), np.cumsum(e, axis=0)])
+        K = e.shape[0]
+        best = np.zeros(K)
+        for n in self.windows:
+            at = np.arange(max(start, 0) + n - 1, K)
+            stat = np.sum((total[at + 1] - total[at + 1 - n]) ** 2, axis=1) / n
+            best[at] = np.maximum(best[at], stat)
+        over = np.flatnonzero(best > self.threshold(e.shape[1]))
+        if not over.size:
+            return None
+        k = int(over[0])
+        # the onset: the start of the best window of any length that ends at the alarm
+        lengths = np.arange(1, min(max(self.windows), k + 1 - max(start, 0)) + 1)
+        stat = np.sum((total[k + 1] - total[k + 1 - lengths]) ** 2, axis=1) / lengths
+        return k, k + 1 - int(lengths[int(stat.argmax())])
+
+
+def whitened(result: FilterResult) -> np.ndarray:
+    """Innovations made uncorrelated and of unit variance, shape (K, ny); 0 where not measured.
+
+    Raises:
+        EstimationError: the filter did not keep the innovations' covariances.
+    """
+    if result.innovation_cov is None:
+        raise EstimationError("whitened innovations need a filter run with full=True")
+    nu = np.nan_to_num(result.innovation.T)
+    L = np.linalg.cholesky(result.innovation_cov)
+    return np.asarray(np.linalg.solve(L, nu[..., None])[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A filter's result with jumps found on the way.
+
+    Args:
+        result: every sample's belief is what was known then: before an alarm from the run without
+            that jump.
+        alarms, onsets: samples of the alarms, and the last samples before the jumps they report.
+    """
+
+    result: FilterResult
+    alarms: tuple[int, ...]
+    onsets: tuple[int, ...]
+
+
+def track_jumps(
+    filt: GasPathFilter,
+    data: Recording,
+    *,
+    test: JumpTest | None = None,
+    prior: Belief | None = None,
+    step: StepMaker | None = None,
+    backend: str | None = None,
+    most: int = 8,
+) -> Tracked:
+    """Filter a recording; where the innovations demand it, go back and let the health jump.
+
+    Causal: an alarm at sample k changes beliefs from k on only, although the filter is run again
+    from the onset, as it could be at the time.
+
+    Args:
+        filt, data: filter and recording.
+        test: the test; :class:`JumpTest`'s defaults.
+        prior, step, backend: as for :meth:`GasPathFilter.run`.
+        most: largest number of jumps; further alarms are not acted on.
+    """
+    test = JumpTest() if test is None else test
+    result = filt.run(data, prior=prior, step=step, backend=backend)
+    alarms: list[int] = []
+    onsets: list[int] = []
+    row = filt.model.u.index("jump")
+    start = test.hold
+    while len(alarms) < most:
+        found = test.first(result, start)
+        if found is None:
+            break
+        k, onset = found
+        alarms.append(k)
+        onsets.append(onset - 1)
+        u = data.u.copy()
+        u[row, onset - 1] = JUMP  # acts in the step that ends at the onset
+        data = Recording(data.t, u, data.y, data.variance, data.p)
+        result = _spliced(result, filt.run(data, prior=prior, step=step, backend=backend), k)
+        start = k + test.hold
+    return Tracked(result, tuple(alarms), tuple(onsets))
+
+
+def _spliced(before: FilterResult, after: FilterResult, k: int) -> FilterResult:
+    """Take ``before`` up to sample k, ``after`` from there on."""
+
+    def joined(a: Any, b: Any, axis: int) -> Any:
+        return np.concatenate([np.split(a, [k], axis)[0], np.split(b, [k], axis)[1]], axis)
+
+    columns = {"mean", "variance", "innovation", "innovation_variance", "nis", "measured"}
+    rows = {"cov", "cov_pred", "cross", "innovation_cov"}
+    axes = dict.fromkeys(columns | {"mean_pred"}, -1) | dict.fromkeys(rows, 0)
+    parts = {n: joined(getattr(before, n), getattr(after, n), axis) for n, axis in axes.items()}
+    return dataclasses.replace(after, **parts)

@@ -1,0 +1,97 @@
+"""Errors of the multi-rate exchange over its step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenarios.figures.figstyle import (
+    DASHED,
+    INK,
+    LINE_INK,
+    MARKS,
+    MUTED,
+    above,
+    caption,
+    drawing,
+    margins,
+    new_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def figure_exchange_error(
+    curves: Mapping[tuple[str, str], tuple[np.ndarray, Mapping[str, np.ndarray]]],
+    quantities: Mapping[str, str],
+    *,
+    mark: float = 0.020,
+) -> Figure:
+    """Draw errors over the exchange step, one logarithmic panel for each quantity.
+
+    Args:
+        curves: by (case, exchange), steps [s] and errors by quantity, arrays of one shape (n,).
+        quantities: panels, by name with their title; four at most.
+        mark: step [s] that is marked: the paper's.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import FixedLocator, NullLocator
+
+    cases = list(dict.fromkeys(case for case, _ in curves))
+    exchanges = list(dict.fromkeys(ex for _, ex in curves))
+    dash = dict(zip(exchanges, ("-", DASHED, (0, (1, 1.5))), strict=False))
+    steps = np.unique(np.concatenate([dt for dt, _ in curves.values()]))
+    with drawing():
+        fig = new_figure(7.4)
+        place = {"left": 0.085, "right": 0.985, "hspace": 0.3, "wspace": 0.2}
+        grid = fig.add_gridspec(2, 2, **place, **margins(fig, top=0.65, bottom=0.85))
+        for k, (q, head) in enumerate(quantities.items()):
+            ax = fig.add_subplot(grid[k // 2, k % 2])
+            for (case, ex), (dt, errors) in curves.items():
+                c = cases.index(case)
+                inside = LINE_INK[c] if ex == exchanges[0] else "white"
+                look = {"color": LINE_INK[c], "marker": MARKS[c], "mfc": inside}
+                ax.loglog(1e3 * dt, errors[q], ls=dash[ex], ms=4.5, lw=1.5, **look)
+            every = np.concatenate([errors[q] for _, errors in curves.values()])
+            _slopes(ax, steps, every)
+            ax.axvline(1e3 * mark, color=MUTED, lw=0.9, zorder=0.5)
+            ax.xaxis.set_major_locator(FixedLocator(list(1e3 * steps)))
+            ax.xaxis.set_minor_locator(NullLocator())
+            ax.set_xticklabels([f"{1e3 * s:g}" for s in steps])
+            ax.set_xlim(1e3 * steps[0] / 1.25, 1e3 * steps[-1] * 1.25)
+            ax.set_ylim(every.min() / 2, every.max() * 2)
+            above(ax, head[0].upper() + head[1:], INK)
+            if k % 2 == 0:
+                ax.set_ylabel("Largest relative error")
+            if k >= len(quantities) - 2:
+                ax.set_xlabel("Exchange step [ms]")
+        handles = []
+        for c, case in enumerate(cases):
+            look = {"color": LINE_INK[c], "marker": MARKS[c], "label": case}
+            handles.append(Line2D([], [], ms=4.5, lw=1.5, **look))
+        for ex in exchanges:
+            inside = INK if ex == exchanges[0] else "white"
+            look = {"color": INK, "marker": "o", "mfc": inside, "label": f"exchange “{ex}”"}
+            handles.append(Line2D([], [], ms=4.5, lw=1.5, ls=dash[ex], **look))
+        where = {"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), "ncols": len(handles)}
+        space = {"columnspacing": 1.2, "handlelength": 2.4}
+        fig.legend(handles=handles, frameon=False, fontsize=8.8, **where, **space)
+        text = (
+            "Error of the multi-rate exchange against the unit as one model with one solver. "
+            "Grey: slopes 1 and 2. Vertical line: the paper's 20 ms."
+        )
+        caption(fig, text)
+    return fig
+
+
+def _slopes(ax: Axes, steps: np.ndarray, errors: np.ndarray) -> None:
+    """Draw guides of first and second order through the upper right corner's reach."""
+    x = np.array([steps[0], steps[-1]])
+    top = float(errors.max())
+    for order, factor in ((1, 1.7), (2, 0.12)):
+        y = factor * top * (x / x[-1]) ** order
+        ax.plot(1e3 * x, y, color="#b8c0cc", lw=3.2, zorder=0.8, solid_capstyle="butt")

@@ -1,0 +1,241 @@
+"""Figures 20 to 23 of the paper: phases of a joint run, speed and power, T3 and P3, T4 and SM."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apu_casadi.core.results import RPM, phases
+from scenarios.figures.figstyle import (
+    LINE_INK,
+    WIDTH,
+    above,
+    bands,
+    change,
+    drawing,
+    fit,
+    margins,
+    need,
+    new_figure,
+    phase_colours,
+    roomy,
+)
+from scenarios.figures.runwords import SEVERITY, caption_of, scenario_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+HOT = "#b91c1c"
+FACTORS = {"f_eta_c": "$η_c$", "f_W_c": "$W_c$", "f_eta_t": "$η_t$", "f_W_t": "$W_t$"}
+HEALTHY, HURT = ("#d8efe3", "#14532d"), ("#f8cfc8", "#7f1d1d")  # ground and ink
+LOADS = (("#bfd7ee", "#0b3c66"), ("#dbe8f5", "#0b3c66"))
+Lane = list[tuple[float, float, str, tuple[str, str]]]
+"""Stretches of a lane: start, end, words, ground and ink."""
+
+
+def _quietest(rows: Sequence[dict[str, Any]], t: np.ndarray, y: np.ndarray) -> int | None:
+    """Return the phase whose beginning moves ``y`` least, but visibly: it wants an enlargement."""
+    best, least = None, np.inf
+    whole = float(np.ptp(y))
+    for k, p in enumerate(rows[1:], 1):
+        inside = y[(t >= p["start"] - 0.1) & (t <= min(p["end"], p["start"] + 2.5))]
+        move = float(np.ptp(inside)) if inside.size else 0.0
+        if max(1e-3 * whole, 1e-5 * float(np.abs(y).max())) < move < least:
+            best, least = k, move
+    return best
+
+
+def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str]]) -> Figure:
+    """Draw quantities (name, label, scale, colour) over time, each with an enlargement."""
+    need(ds, [c[0] for c in curves])
+    rows = phases(ds)
+    t = ds["time"].values
+    with drawing():
+        fig = new_figure(6.3)
+        data = [ds[name].values * scale for name, _, scale, _ in curves]
+        enlarged = [_quietest(rows, t, y) for y in data]
+        two = any(k is not None for k in enlarged)
+        widths = [3.1, 1.0] if two else [1.0]
+        place = {"left": 0.085, "right": 0.985, "hspace": 0.27, "wspace": 0.2}
+        place |= margins(fig, top=0.55, bottom=0.9)
+        grid = fig.add_gridspec(len(curves), len(widths), width_ratios=widths, **place)
+        for r, (y, k, (_, label, _, colour)) in enumerate(zip(data, enlarged, curves, strict=True)):
+            last = r == len(curves) - 1
+            ax = fig.add_subplot(grid[r, 0])
+            bands(ax, rows, names=r == 0)
+            ax.plot(t, y, color=colour, lw=1.7, solid_joinstyle="round")
+            ax.set_ylabel(label)
+            roomy(ax, y, 0.08)
+            ax.tick_params(labelbottom=last)
+            if last:
+                ax.set_xlabel("Time [s]")
+            if k is None:
+                continue
+            side = fig.add_subplot(grid[r, 1])
+            p = rows[k]
+            lo, hi = p["start"] - 0.25, min(p["end"], p["start"] + 2.5)
+            inside = (t >= lo) & (t <= hi)
+            change(side, lo, p["start"], hi, k - 1)
+            side.plot(t[inside], y[inside], color=colour, lw=1.7)
+            side.set_xlim(lo, hi)
+            roomy(side, y[inside], 0.1)
+            above(side, fit(f"enlarged: {p['name']}", 30), phase_colours(k)[1])
+            if last:
+                side.set_xlabel("Time [s]")
+        caption_of(fig, ds, key)
+    return fig
+
+
+def figure_21(ds: xr.Dataset) -> Figure:
+    """Draw shaft speed [r/min] and shaft power [kW]; DataError if a variable is missing."""
+    speed = ("N", "Shaft speed [r/min]", RPM, LINE_INK[0])
+    power = ("PW", "Shaft power [kW]", 1e-3, LINE_INK[1])
+    return _trend(ds, "fig21_speed_power", [speed, power])
+
+
+def figure_22(ds: xr.Dataset) -> Figure:
+    """Draw T3 [K] and P3 [kPa]; DataError if a variable is missing."""
+    T3, P3 = ("T3", "$T_3$ [K]", 1.0, HOT), ("P3", "$P_3$ [kPa]", 1e-3, LINE_INK[0])
+    return _trend(ds, "fig22_compressor_outlet", [T3, P3])
+
+
+def figure_23(ds: xr.Dataset) -> Figure:
+    """Draw T4 [K] and the surge margin [%]; DataError if a variable is missing."""
+    T4, SM = ("T4", "$T_4$ [K]", 1.0, HOT), ("SM", "Surge margin [%]", 100.0, LINE_INK[2])
+    return _trend(ds, "fig23_T4_surge_margin", [T4, SM])
+
+
+def _segments(
+    t: np.ndarray, table: np.ndarray, rows: Sequence[dict[str, Any]]
+) -> list[tuple[float, float, int]]:
+    """Return (start, end, index) of the stretches over which the rows of ``table`` are constant.
+
+    A change one sample off the beginning of a phase is drawn there.
+    """
+    same = np.all((table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1])), axis=1)
+    cuts = [0, *(np.flatnonzero(~same) + 1).tolist()]
+    ends = [*cuts[1:], t.size - 1]
+    starts = np.array([p["start"] for p in rows])
+    slack = 1.5 * float(np.median(np.diff(t)))
+
+    def instant(i: int) -> float:
+        near = starts[int(np.argmin(np.abs(starts - t[i])))]
+        return float(near if abs(near - t[i]) <= slack else t[i])
+
+    return [(instant(a), instant(b), a) for a, b in zip(cuts, ends, strict=True) if b > a]
+
+
+def _load_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> list[tuple[float, float, str]]:
+    """Return (start, end, words) of the loads, from the scenario or else from the mean power."""
+    table = scenario_of(ds)
+    steps = [(p.get("start"), p.get("load")) for p in table.get("phase", ())]
+    steps += [(e.get("time"), e.get("load")) for e in table.get("event", ())]
+    loads = sorted(((float(s), x) for s, x in steps if isinstance(x, dict)), key=lambda s: s[0])
+    t_end = rows[-1]["end"]
+    loads = [x for x in loads if x[0] < t_end]
+    if loads:
+        ends = [s for s, _ in loads[1:]] + [t_end]
+        return [(s, e, _load_words(x)) for (s, x), e in zip(loads, ends, strict=True)]
+    t, P = ds["time"].values, ds["P_e"].values
+    lane = []
+    for p in rows:
+        tail = (t > p["end"] - 0.25 * (p["end"] - p["start"])) & (t <= p["end"])
+        lane.append((p["start"], p["end"], f"{np.mean(P[tail]) / 1e3:.0f} kW electric"))
+    return lane
+
+
+def _load_words(x: dict[str, Any]) -> str:
+    kind = x.get("kind", "")
+    words = {
+        "R": "resistive",
+        "RL": f"R-L, pf {x.get('power_factor', 0.85):g}",
+        "series": "series R-L",
+        "constant_power": "constant power",
+        "open": "open circuit",
+    }.get(kind, str(kind))
+    if x.get("unbalance") and len(set(x["unbalance"])) > 1:
+        words += ", unbalanced"
+    return f"2\u00a0×\u00a0{x['power_kW']:g}\u00a0kW\n{words}" if "power_kW" in x else words
+
+
+def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
+    """Return the stretches of constant gas-path health."""
+    t, lane = ds["time"].values, []
+    gas = np.column_stack([ds[f].values for f in FACTORS])
+    for a, b, i in _segments(t, gas, rows):
+        factors = zip(FACTORS.values(), gas[i], strict=True)
+        off = [f"{s} {100 * (v - 1):+.3g} %" for s, v in factors if v != 1.0]
+        off = [x.replace(" -", " −").replace(" ", "\u00a0") for x in off]
+        words = ", ".join(off[:2]) + "\n" + ", ".join(off[2:]) if off else "healthy"
+        lane.append((a, b, words.strip(), HURT if off else HEALTHY))
+    return lane
+
+
+def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
+    """Return the stretches of a constant stator fault."""
+    t, lane = ds["time"].values, []
+    stator = np.column_stack([ds[f].values for f in SEVERITY])
+    for a, b, i in _segments(t, stator, rows):
+        m, r, c = stator[i]
+        kappa = "κ = µ" if abs(c - m) < 1e-12 else f"κ = {c:g}"
+        words = "healthy"
+        if m > 0:
+            parts = f"µ = {100 * m:g} %", f"$k_{{rf}}$ = {r:g}", kappa
+            first, second, third = (x.replace(" ", "\u00a0") for x in parts)
+            words = f"TTSC {first}\n{second}, {third}"
+        lane.append((a, b, words, HURT if m > 0 else HEALTHY))
+    return lane
+
+
+def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> None:
+    """Write into a stretch of a lane, smaller or not at all where there is no room."""
+    text = "\n".join(
+        line
+        for part in words.split("\n")
+        for line in textwrap.wrap(part, letters + 2 * part.count("$"))
+    )
+    lines = text.split("\n")
+    longest = max(len(line) - 5 * (line.count("$") // 2) for line in lines)
+    size = 8.8 if len(lines) < 4 and longest <= letters else 7.0
+    if longest <= 1.3 * letters and len(lines) < 6:
+        look: dict[str, Any] = {"ha": "center", "va": "center", "linespacing": 1.25}
+        ax.text(x, y, text, color=ink, fontsize=size, **look)
+
+
+def figure_20(ds: xr.Dataset) -> Figure:
+    """Draw the phases of the run: load, health of the gas path and state of the stator over time.
+
+    Raises:
+        DataError: a variable is missing.
+    """
+    need(ds, [*FACTORS, *SEVERITY, "P_e"])
+    rows = phases(ds)
+    loads = [(a, b, w, LOADS[i % 2]) for i, (a, b, w) in enumerate(_load_lane(ds, rows))]
+    gas, stator = _gas_lane(ds, rows), _stator_lane(ds, rows)
+    lanes = {"Electrical load": loads, "Gas path": gas, "Stator": stator}
+    with drawing():
+        fig = new_figure(3.7)
+        m = margins(fig, top=0.45, bottom=0.8)
+        ax = fig.add_axes((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
+        bands(ax, rows, names=True)
+        span = rows[-1]["end"] - rows[0]["start"]
+        per_letter = 0.075 * span / (0.86 * WIDTH)
+        for y, items in enumerate(lanes.values()):
+            for a, b, words, (ground, ink) in items:
+                box: dict[str, Any] = {"height": 0.7, "edgecolor": "white", "lw": 1.6, "zorder": 2}
+                ax.barh(y, b - a, left=a, color=ground, **box)
+                letters = max(int((b - a) / per_letter) - 1, 1)
+                _write(ax, (a + b) / 2, y, words, ink, letters)
+        ax.set_yticks(range(len(lanes)), list(lanes), fontsize=9.5)
+        ax.set_ylim(len(lanes) - 0.5, -0.5)
+        ax.grid(False)
+        ax.tick_params(axis="y", length=0)
+        ax.spines["left"].set_visible(False)
+        ax.set_xlabel("Time [s]")
+        caption_of(fig, ds, "fig20_phases", "Load of each of the two generators at rated voltage.")
+    return fig

@@ -1,0 +1,169 @@
+"""The JSON schema of a scenario file, made of the classes that read it; editors complete by it.
+
+``apu list --schema > scenario.schema.json`` writes it, with the parts of ``--with`` too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from apu_casadi.core.register import Key
+from apu_casadi.gaspath.conditions import CONDITIONS
+from apu_casadi.gaspath.health import HEALTH_FACTORS
+from apu_casadi.machine.faults.fault import FAULTS
+from apu_casadi.machine.loads.load import LOADS
+from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO
+from scenarios.reading import DEFAULT_FAULT, names_of
+from scenarios.schema import EXCHANGES, FILE_KEYS, Change, Phase, Scenario
+
+Table = dict[str, Any]
+_NONE = {"const": "none", "description": "healthy again"}
+
+
+def file_schema() -> Table:
+    """Return the schema (JSON Schema, draft 7) of a scenario file."""
+    definitions = {"load": _load(), "fault": _fault(), "health": _health()}
+    table = _object(_scenario(), ("name", "duration", "phase"))
+    head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "apu-casadi scenario"}
+    return head | table | {"definitions": definitions}
+
+
+def docs_of(cls: type) -> dict[str, str]:
+    """Return what the section ``Args:`` of a docstring says of each name, in one line."""
+    text = inspect.cleandoc(cls.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
+    found = re.findall(r"(?m)^    (\w[\w, ]*): (.*(?:\n {8}.*)*)", text)
+    return {
+        n.strip(): " ".join(doc.split()).rstrip(".")
+        for names, doc in found
+        for n in names.split(",")
+    }
+
+
+def _object(properties: Table, required: Sequence[str] = (), **more: Any) -> Table:
+    table: Table = {"type": "object", "properties": properties, "additionalProperties": False}
+    return table | ({"required": list(required)} if required else {}) | more
+
+
+def _number(
+    lo: float = -float("inf"),
+    hi: float = float("inf"),
+    *,
+    open_lo: bool = False,
+    unit: str = "",
+    doc: str = "",
+) -> Table:
+    table: Table = {"type": "number"}
+    if lo > -float("inf"):
+        table["exclusiveMinimum" if open_lo else "minimum"] = lo
+    if hi < float("inf"):
+        table["maximum"] = hi
+    words = f"{doc} [{unit}]" if unit not in ("", "1") else doc
+    return table | ({"description": words} if words else {})
+
+
+def _key(key: Key) -> Table:
+    if key.choices:
+        return {"enum": list(key.choices), "description": key.doc}
+    one = _number(key.lo, key.hi, open_lo=key.open_lo, unit=key.unit, doc=key.doc)
+    if not key.phases:
+        return one
+    three = {"type": "array", "items": one, "minItems": 3, "maxItems": 3}
+    return {"anyOf": [one, three], "description": f"{key.doc}: one for all phases, or a, b, c"}
+
+
+def _part(kind: str, keys: Sequence[Key], cls: type, *, optional: bool = False) -> Table:
+    needed = [k.name for k in keys if k.default is ...]
+    required = needed if optional else ["kind", *needed]
+    table = {"kind": {"const": kind}, **{k.name: _key(k) for k in keys}}
+    return _object(table, required, description=(cls.__doc__ or kind).split("\n")[0])
+
+
+def _load() -> Table:
+    each = ((kind, LOADS[kind]) for kind in LOADS)
+    return {"oneOf": [_part(kind, cls.tables[kind], cls) for kind, cls in each]}
+
+
+def _fault() -> Table:
+    each = ((kind, FAULTS[kind]) for kind in FAULTS)
+    kinds = [_part(k, cls.keys, cls, optional=k == DEFAULT_FAULT) for k, cls in each]
+    return {"oneOf": [*kinds, _NONE]}
+
+
+def _health() -> Table:
+    limits: Table = {"lo": HEALTH_LO, "hi": HEALTH_HI, "open_lo": True}
+    factors = {n: _number(**limits, doc=f.doc) for n, f in HEALTH_FACTORS.items()}
+    return {"oneOf": [_object(factors), _NONE]}
+
+
+def _numbers(cls: type) -> Table:
+    """Return the fields of a class that are numbers in a range."""
+    docs = docs_of(cls)
+    made = {}
+    for f in dataclasses.fields(cls):
+        if "unit" in f.metadata:
+            made[f.name] = _number(**f.metadata, doc=docs.get(f.name, ""))
+    return made
+
+
+def _row(cls: type) -> Table:
+    """Return phases or events."""
+    own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]
+    text = {n: {"type": "string", "minLength": 1} for n in own if n == "name"}
+    changes = {n: {"$ref": f"#/definitions/{n}"} for n in ("load", "health", "fault")}
+    item = _object(text | _numbers(cls) | changes, own)
+    return {"type": "array", "items": item, "description": (cls.__doc__ or "").split("\n")[0]}
+
+
+def _noise() -> Table:
+    from apu_casadi.machine.measurement import MeasurementNoise
+    from apu_casadi.unit.noise import Noise
+
+    def deviations(cls: type, names: Sequence[str]) -> Table:
+        docs = docs_of(cls)
+        return {n: _number(0.0, doc=docs.get(n, "")) for n in names}
+
+    plain = [n for n in names_of(Noise) if n not in ("gas", "terminal")]
+    table = deviations(Noise, plain)
+    table["gas"] = {"type": "object", "additionalProperties": _number(0.0)}
+    table["terminal"] = _object(deviations(MeasurementNoise, names_of(MeasurementNoise)))
+    return _object(table)
+
+
+def _parameters() -> Table:
+    """Return the parameters, as dotted names and as nested tables."""
+    from apu_casadi.unit.apu import Apu
+
+    table: Table = {}
+    for name, value in Apu().parameters().items():
+        one = {"type": "string" if isinstance(value, str) else "number", "default": value}
+        part, _, last = name.partition(".")
+        table[name] = one
+        table.setdefault(part, _object({}))["properties"][last] = one
+    return _object(table)
+
+
+def _scenario() -> Table:
+    docs = docs_of(Scenario)
+    texts = {"type": "array", "items": {"type": "string"}}
+    ambient = {n: _number(c.lo, c.hi, unit=c.unit, doc=c.doc) for n, c in CONDITIONS.items()}
+    table = _numbers(Scenario) | {
+        "name": {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9_-]*$", "maxLength": 100},
+        "title": {"type": "string"},
+        "doc": {"type": "string"},
+        "ambient": _object(ambient),
+        "phase": _row(Phase) | {"minItems": 1},
+        "event": _row(Change),
+        "exchange": {"enum": list(EXCHANGES)},
+        "noise": _noise(),
+        "seed": {"type": "integer", "minimum": 0},
+        "parameters": _parameters(),
+        "engine": {"type": "string"},
+        "extensions": texts,
+    }
+    step = table["waveform_dt"]
+    table["waveform_dt"] = {"anyOf": [step, {"const": 0}], "description": docs["waveform_dt"]}
+    return {k: {"description": docs.get(k, "")} | table[k] for k in FILE_KEYS}

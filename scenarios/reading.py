@@ -1,0 +1,162 @@
+"""How the tables of a scenario file are read: checks that know their place, and the model's parts.
+
+What a load or a fault may say in a file is told by its class (``tables``, ``keys``); nothing here
+knows one by name.  An error begins with the place, as in ``phase[2].load.power_kW``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from apu_casadi.core.checked import bounded
+from apu_casadi.core.errors import ApuError, ScenarioError, nearest
+from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table
+from apu_casadi.machine.loads.load import LOADS, Load, load_from_table
+
+if TYPE_CHECKING:
+    from apu_casadi.unit.noise import Noise
+
+DEFAULT_FAULT = "ttsc"
+"""Kind of a fault whose table names none."""
+
+
+class PlacedError(ScenarioError):
+    """A scenario error that knows its place, so that the callers can prefix theirs."""
+
+    def __init__(self, place: str, message: str, note: str = "") -> None:
+        super().__init__(f"{place}: {message}{note}")
+        self.place, self.message, self.note = place, message, note
+
+
+@contextmanager
+def inside(part: str, note: str = "") -> Iterator[None]:
+    """Prefix the place of an error raised inside the block."""
+    try:
+        yield
+    except PlacedError as e:
+        raise PlacedError(f"{part}.{e.place}", e.message, e.note or note) from None
+    except ScenarioError as e:  # "place: message", from the model's own checks
+        place, _, message = str(e).partition(": ")
+        raise PlacedError(f"{part}.{place}", message, note) from None
+    except ApuError as e:
+        raise PlacedError(part, str(e), note) from None
+
+
+def require(ok: bool, place: str, message: str, note: str = "") -> None:
+    """Raise :class:`PlacedError` unless ``ok``."""
+    if not ok:
+        raise PlacedError(place, message, note)
+
+
+def text_of(value: Any, place: str, *, empty: bool = False) -> str:
+    """Return a text that is not empty, unless it may be."""
+    require(isinstance(value, str), place, f"a text is expected, got {value!r}")
+    require(empty or bool(value.strip()), place, "must not be empty")
+    return str(value)
+
+
+def table_of(value: Any, place: str, keys: Sequence[str]) -> dict[str, Any]:
+    """Return a table whose keys are all in ``keys``."""
+    require(isinstance(value, Mapping), place, f"a table is expected, got {value!r}")
+    for k in value:
+        if k not in keys:
+            hint = nearest(str(k), keys) if keys else ""
+            raise PlacedError(f"{place}.{k}" if place else str(k), f"unknown key {hint}")
+    return dict(value)
+
+
+def limits(**how: Any) -> dict[str, Any]:
+    """Return the metadata of a field that is a number, from the limits of :func:`bounded`."""
+    return {"unit": "", **how}
+
+
+def check_numbers(checked: Any) -> None:
+    """Check the fields that have :func:`limits`; one whose type says so may be None."""
+    for f in dataclasses.fields(checked):
+        value = getattr(checked, f.name)
+        if "unit" in f.metadata and not (value is None and "None" in f.type):
+            object.__setattr__(checked, f.name, bounded(value, f.name, **f.metadata))
+
+
+def names_of(cls: Any) -> tuple[str, ...]:
+    """Return the fields of a dataclass by name."""
+    return tuple(f.name for f in dataclasses.fields(cls))
+
+
+def read_load(data: Any, place: str = "load") -> Load:
+    """Return the load that a table describes by ``kind`` and the keys of that kind.
+
+    Raises:
+        ScenarioError: an unknown kind, a key that it does not take or lacks, a wrong value.
+    """
+    if isinstance(data, Load):
+        return data
+    with inside(place):
+        require(isinstance(data, Mapping), "kind", f"missing: a table is expected: {data!r}")
+        kind = _kind(data, LOADS)
+        every = {k.name for c in LOADS.classes for keys in c.tables.values() for k in keys}
+        takes = ("kind", *(k.name for k in LOADS[kind].tables[kind]))
+        for k in data:
+            require(k in every or k in takes, str(k), f"unknown key {nearest(str(k), takes)}")
+        return load_from_table(data)
+
+
+def read_fault(data: Any, place: str = "fault") -> Fault:
+    """Return the fault that a table describes; without ``kind`` it is a turn-to-turn short circuit.
+
+    Raises:
+        ScenarioError: an unknown kind, a key that it does not take or lacks, a wrong value.
+    """
+    if isinstance(data, Fault):
+        return data
+    if not isinstance(data, Mapping):
+        names = ", ".join(k.name for k in FAULTS[DEFAULT_FAULT].keys)
+        text = f'a table with {names}, or "none", is expected, got {data!r}'
+        raise PlacedError(place, text)
+    with inside(place):
+        keys = FAULTS[_kind(data, FAULTS, DEFAULT_FAULT)].keys
+        for k in data:
+            takes = ("kind", *(key.name for key in keys))
+            require(k in takes, str(k), f"unknown key {nearest(str(k), takes)}")
+        needed = [k.name for k in keys if k.default is ...]
+        for n in needed:
+            both = f"{' and '.join(needed)} are both needed for a severity"
+            require(n in data, n, f"missing: {both if len(needed) == 2 else 'needed'}")
+        return fault_from_table(data, DEFAULT_FAULT)
+
+
+def _kind(data: Mapping[str, Any], known: Mapping[str, Any], default: str | None = None) -> str:
+    if default is None:
+        require("kind" in data, "kind", f"missing: one of {', '.join(known)}")
+    kind = text_of(data.get("kind", default), "kind")
+    require(kind in known, "kind", f"unknown {kind!r} {nearest(kind, known)}")
+    return kind
+
+
+def read_noise(data: Any) -> Noise:
+    """Return the noise that a table describes, standard deviations in SI units.
+
+    Raises:
+        ScenarioError: an unknown name, or a value that is negative or not finite.
+    """
+    from apu_casadi.machine.measurement import MeasurementNoise
+    from apu_casadi.unit.noise import Noise
+
+    if isinstance(data, Noise):
+        return data
+    table = table_of(data, "noise", names_of(Noise))
+    with inside("noise"):
+        parts = {k: table.pop(k) for k in ("gas", "terminal") if table.get(k) is not None}
+        made: dict[str, Any] = {k: bounded(v, k, lo=0.0) for k, v in table.items() if v is not None}
+        for k, part in parts.items():
+            if isinstance(part, MeasurementNoise):
+                part = dataclasses.asdict(part)
+            known = names_of(MeasurementNoise) if k == "terminal" else tuple(part)
+            checked = table_of(part, k, known).items()
+            made[k] = {n: bounded(v, f"{k}.{n}", lo=0.0) for n, v in checked}
+        if "terminal" in made:
+            made["terminal"] = MeasurementNoise(**made["terminal"])
+        return Noise(**made)

@@ -1,0 +1,106 @@
+"""The JSON schema of a scenario file: what is read passes it, and mistakes do not."""
+
+import json
+import tomllib
+from importlib.resources import files
+
+import pytest
+
+from scenarios.cli import main
+from scenarios.fileschema import docs_of, file_schema
+from scenarios.schema import FILE_KEYS, Scenario
+
+jsonschema = pytest.importorskip("jsonschema")
+
+GOOD = """
+name = "mine"
+duration = 4.0
+waveform_dt = 0
+exchange = "predicted"
+seed = 3
+[ambient]
+altitude = 8000.0
+[parameters]
+"machine.r_s" = 0.005
+governor.Kp = 0.4
+[noise]
+N = 0.1
+gas = { T3 = 1.0 }
+terminal = { sigma_v = 0.5 }
+[[phase]]
+name = "start"
+start = 0.0
+load = { kind = "RL", power_kW = 225.0, unbalance = [1.1, 1.0, 0.9] }
+[[phase]]
+name = "fault"
+start = 2.0
+fault = { mu = 0.05, k_rf = 20.0, phase = "b" }
+health = { f_eta_c = 0.99 }
+[[event]]
+time = 3.0
+fault = "none"
+"""
+
+
+@pytest.fixture(scope="module")
+def validator():
+    schema = file_schema()
+    jsonschema.Draft7Validator.check_schema(schema)
+    return jsonschema.Draft7Validator(schema)
+
+
+def test_everything_that_is_read_passes(validator):
+    """The library, a file with every key, and what a scenario writes of itself."""
+    texts = [p.read_text() for p in files("scenarios").joinpath("library").iterdir()]
+    for text in [*texts, GOOD]:
+        data = tomllib.loads(text)
+        validator.validate(data)
+        validator.validate(json.loads(Scenario.from_dict(data).to_json()))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('name = "mine"', 'nam = "mine"'), ('"mine"', '"../mine"'), ("duration = 4.0", ""),
+        ("duration = 4.0", "duration = 9999"), ("duration = 4.0", 'duration = "4"'),
+        ('"RL"', '"Rl"'), ("power_kW", "power_kw"), ("power_kW = 225.0", "power_kW = -1"),
+        ("power_kW = 225.0,", ""), ("[1.1, 1.0, 0.9]", "[1.1, 1.0]"), ("mu = 0.05", "mu = 5"),
+        ("mu = 0.05,", ""), ('"b"', '"d"'), ("f_eta_c", "f_eta_C"), ("0.99", "0.5"),
+        ("start = 2.0", "begin = 2.0"), ('"predicted"', '"half"'), ("seed = 3", "seed = -3"),
+        ("altitude = 8000.0", "altitude = 80000.0"), ("machine.r_s", "machine.rs"),
+        ("sigma_v", "sigma_V"), ("time = 3.0", "time = 0.0"), ('fault = "none"', 'fault = "nil"'),
+    ],
+)  # fmt: skip
+def test_mistakes_do_not(validator, old, new):
+    """Each is one that the program refuses as well (parameters when the unit is made)."""
+    assert old in GOOD
+    assert not validator.is_valid(tomllib.loads(GOOD.replace(old, new, 1)))
+
+
+def test_it_is_made_of_the_classes_and_documented(validator, capsys):
+    """Every key is there, with words and units for who writes a file."""
+    assert main(["list", "--schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert schema == json.loads(json.dumps(validator.schema))
+    assert tuple(schema["properties"]) == FILE_KEYS
+    assert all(p["description"] for p in schema["properties"].values())
+    power = schema["definitions"]["load"]["oneOf"][0]["properties"].get("power_kW")
+    assert power is None or power["description"].endswith("[kW]")
+    start = schema["properties"]["phase"]["items"]["properties"]["start"]
+    assert start["description"] == "instant at which it begins and its changes take effect [s]"
+
+
+def test_words_come_from_docstrings():
+    class Thing:
+        """A thing.
+
+        Args:
+            a, b: two
+                words.
+            c: one.
+
+        Raises:
+            Error: never.
+        """
+
+    assert docs_of(Thing) == {"a": "two words", "b": "two words", "c": "one"}

@@ -1,0 +1,197 @@
+"""Sensors: tables, readings, a lag against its step response, and the filter that carries it."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from apu_casadi import Apu, LoadChange, SeriesLoad, simulate_joint
+from apu_casadi.core.errors import DataError, ParameterError
+from apu_casadi.core.measuring import measure
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from estimators.apu.fitting import EngineData, fit_engine
+from estimators.apu.gaspath import gas_path_filter, samples
+from estimators.apu.recordings.plausible import PLAUSIBLE
+from estimators.apu.sensors import (
+    ELECTRICAL,
+    GAS_PATH,
+    KNOWN,
+    THERMOCOUPLE,
+    Sensor,
+    gas_path_table,
+    load_sensors,
+    register,
+    respond,
+)
+from estimators.information.consistency import band
+
+GG = GasGenerator()
+WITH_TC = GAS_PATH.add("T41_tc")
+
+
+@pytest.fixture(scope="module")
+def drop():
+    """A joint run with a load drop at 1 s."""
+    return simulate_joint(
+        Apu(),
+        duration=4.0,
+        load=SeriesLoad.from_power(200e3),
+        events=[LoadChange(t=1.0, load=SeriesLoad.from_power(80e3))],
+        waveform_dt=None,
+        solver="propagator",
+    )
+
+
+def test_the_response_to_a_step_is_exponential():
+    """Held input: 1 - exp(-t/tau), whatever the steps; a ramp is followed tau late."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.01, 0.3, 40))
+    held = np.full(t.size, 900.0)
+    assert np.array_equal(respond(t, held, 0.5), held)  # at rest in the beginning
+    x = respond(np.append(t[0] - 1e-9, t), np.append(600.0, held), 0.5)[1:]
+    assert x == pytest.approx(900.0 - 300.0 * np.exp(-(t - t[0]) / 0.5), rel=1e-8)
+    ramp = respond(t, 7.0 * t, 0.5)
+    late = 7.0 * (t - 0.5) + 3.5 * np.exp(-(t - t[0]) / 0.5)
+    assert ramp == pytest.approx(late, abs=1e-12)
+
+
+def test_the_filter_carries_the_lag_exactly():
+    """At a steady point the state goes to T41 by the exponential, for any step."""
+    filt = gas_path_filter(GG, WITH_TC, gains=False, inertia=None)
+    model = filt.model
+    assert model.x.names[-1] == model.y.names[-1] == "T41_tc"
+    assert [s.name for s in filt.lagging] == ["T41_tc"]
+    at = trim_gas_generator(GG, {"N": GG.parameters.N, "PW": 400e3})
+    x = model.x.pack({"N": at["N"], **dict.fromkeys(GG.THETA.names, 1.0), "T41_tc": 700.0})
+    u = model.u.pack({"Wf": at["Wf"], "PW": at["PW"], "sigma_Wf": 0.0, "sigma_PW": 0.0})
+    w = np.zeros(len(model.w))
+    for dt in (0.0, 0.02, 0.5, 30.0):
+        x1, check = model.transition(x, u, [], w, dt)
+        assert float(check) < 1e-9
+        expected = at["T41"] + (700.0 - at["T41"]) * math.exp(-dt / THERMOCOUPLE.tau)
+        assert float(x1[-1]) == pytest.approx(expected, rel=1e-9)
+    assert float(model.output(x, u, [], w)[0][-1]) == 700.0
+
+
+def test_a_lagging_sensor_is_followed_through_a_load_drop(drop):
+    """The filter is consistent; one that takes the thermocouple for instantaneous is not."""
+    late, instant = ([], [])
+    quick = dataclasses.replace(THERMOCOUPLE, tau=0.0)
+    plain = GAS_PATH.add(quick)
+    filters = [gas_path_filter(GG, s, gains=False, inertia=None) for s in (WITH_TC, plain)]
+    for seed in range(8):
+        data = filters[0].recording(drop, seed)
+        r = filters[0].run(data)
+        late.append(r.nis[25:].mean())
+        believed = filters[1].recording(drop, seed)
+        i = believed.y.shape[0] - 1
+        believed.y[i] = data.y[i]
+        instant.append(filters[1].run(believed).nis[25:].mean())
+    t, rows = samples(drop)
+    true = respond(drop["time"].values, drop["T41"].values, THERMOCOUPLE.tau)[rows]
+    mean, sigma = r["T41_tc"]
+    assert np.sqrt(np.mean(((mean - true) / sigma)[25:] ** 2)) < 1.3
+    low, high = band(8 * (t.size - 25), 5, 0.999)
+    assert low < np.mean(late) < high
+    assert np.mean(instant) > 1.5 * high
+    # tau dx/dt = v - x, summed: the area between gas and thermocouple is tau times the fall
+    area = np.trapezoid(drop["T41"].values[rows] - true, t)
+    assert area == pytest.approx(THERMOCOUPLE.tau * (true[-1] - true[0]), rel=1e-3)
+    assert true[-1] - true[0] < -150.0
+
+
+def test_another_sensor_tells_more(drop):
+    """P5 and the thermocouple each leave less uncertainty of the health than the table alone."""
+
+    def spread(sensors):
+        f = gas_path_filter(GG, sensors, gains=False, inertia=None)
+        r = f.run(f.recording(drop, 1))
+        return sum(r[n][1][-1] ** 2 for n in GG.THETA.names)
+
+    base = spread(GAS_PATH)
+    assert spread(GAS_PATH.add("P5")) < 0.999 * base
+    assert spread(WITH_TC) < 0.99 * base
+
+
+def test_a_fit_takes_sensors_of_any_kind(drop):
+    """Through the load drop with the lag as a state, and at steady points, where it is over."""
+    t, rows = samples(drop)
+    k = slice(45, 105)
+    names = (*GAS_PATH.names, "T41")
+    there = {n: drop[n].values for n in names}
+    true = {n: v[rows][k] for n, v in WITH_TC.true(drop["time"].values, there).items()}
+    readings = WITH_TC.measure(true, np.random.default_rng(2))
+    transient = fit_engine([EngineData("drop", t[k], readings)], sensors=WITH_TC).result
+    assert transient.recordings[0].x.shape[0] == 2  # N and the lag
+    assert (np.abs(transient.estimate - 1) < 4 * transient.sigma).all()
+    assert transient.p_value > 1e-3
+    points = [trim_gas_generator(GG, {"N": GG.parameters.N, "PW": P}) for P in (2e5, 4e5)]
+    steady = {n: np.array([p[n] for p in points]) for n in names}
+    data = EngineData("steady", np.arange(2.0), steady | {"T41_tc": steady["T41"]})
+    found = fit_engine([data], steady=True, sensors=WITH_TC).result
+    assert found.estimate == pytest.approx(np.ones(4), abs=1e-5)
+
+
+def test_more_sensors_do_not_change_the_noise_of_the_others(drop):
+    """Each draws after those before it in the table."""
+    few, more = (
+        gas_path_filter(GG, s, gains=False, inertia=None).recording(drop, 3)
+        for s in (GAS_PATH, WITH_TC)
+    )
+    assert np.array_equal(few.y, more.y[: len(few.y)])
+    assert np.array_equal(few.u, more.u)
+
+
+def test_readings_have_gain_and_noise():
+    """(1 + gain) v + sigma e, in the order of the names; averaging divides the noise."""
+    true = {"P3": np.full(3, 8e5), "N": np.full(3, 3775.0)}
+    read = GAS_PATH.measure(true, np.random.default_rng(1), gains={"P3": 0.01}, averaged=4)
+    rng = np.random.default_rng(1)
+    assert read["P3"] == pytest.approx(8.08e5 * (1 + 0.0025 * rng.standard_normal(3)), rel=1e-14)
+    assert read["N"] == pytest.approx(3775.0 * (1 + 0.00125 * rng.standard_normal(3)), rel=1e-14)
+    of_true = GAS_PATH.measure(
+        true, np.random.default_rng(1), gains={"P3": 0.01}, averaged=4, noise_of="true"
+    )
+    assert of_true["P3"] - 8.08e5 == pytest.approx((read["P3"] - 8.08e5) / 1.01)
+    assert np.array_equal(GAS_PATH.measure(true, None)["N"], true["N"])
+    assert measure(2.0, 0.5, np.array(2.0), gain=0.5) == 4.0
+    assert set(ELECTRICAL.draw_gains(np.random.default_rng(0))) == set(ELECTRICAL.names)
+
+
+def test_impossible_sensors_are_refused(tmp_path):
+    """By name, with what to do."""
+    with pytest.raises(ParameterError, match="tau must be >= 0"):
+        Sensor("X", 0.01, True, 0.0, "K", "", tau=-1.0)
+    with pytest.raises(ParameterError, match="give value"):
+        Sensor("X", 0.01, True, 0.0, "Pa", "", reads=("P3", "P5"))
+    with pytest.raises(ParameterError, match="no range"):
+        Sensor("X", 0.01, True, 0.0, "Pa", "", (2.0, 1.0))
+    with pytest.raises(ParameterError, match=r"no output 'P33'.*P3"):
+        register(Sensor("X", 0.01, True, 0.0, "Pa", "", reads=("P33",)))
+    with pytest.raises(ParameterError, match="'P3' is known already"):
+        register(Sensor("P3", 0.01, True, 0.0, "Pa", ""))
+    with pytest.raises(ParameterError, match=r"unknown sensor 'T41_tcc'.*T41_tc"):
+        GAS_PATH.add("T41_tcc")
+    with pytest.raises(ParameterError, match="'P3' is in the set already"):
+        GAS_PATH.add("P3")
+    with pytest.raises(ParameterError, match="depends on the shaft power"):
+        gas_path_filter(GG, GAS_PATH.add(Sensor("SFC", 0.01, True, 0.0, "kg/J", "")))
+    with pytest.raises(ParameterError, match="takes PW as an input"):
+        gas_path_filter(GG, GAS_PATH.only(("N", "P3", "T3", "T5", "Wf")))
+    (tmp_path / "empty.py").write_text("x = 1\n")
+    with pytest.raises(DataError, match="registers no sensor"):
+        load_sensors(tmp_path / "empty.py")
+    (tmp_path / "broken.py").write_text("1/0\n")
+    with pytest.raises(DataError, match="ZeroDivisionError"):
+        load_sensors(tmp_path / "broken.py")
+    with pytest.raises(DataError, match=r"missing\.py"):
+        load_sensors(tmp_path / "missing.py")
+
+
+def test_one_table_feeds_all():
+    """Ranges of recorded files are those of the sensors."""
+    for s in KNOWN.values():
+        assert PLAUSIBLE[s.name] == s.plausible
+    assert gas_path_table().names[:6] == GAS_PATH.names
