@@ -16,6 +16,7 @@ from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.loads.load import LOADS
+from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO
 from scenarios.reading import DEFAULT_FAULT, names_of
 from scenarios.schema import EXCHANGES, FILE_KEYS, Change, Phase, Scenario
@@ -162,6 +163,7 @@ def _scenario() -> Table:
         "seed": {"type": "integer", "minimum": 0},
         "parameters": _parameters(),
         "engine": {"type": "string"},
+        "governor": {"enum": list(GOVERNORS)},
         "extensions": texts,
     }
     step = table["waveform_dt"]

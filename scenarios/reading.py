@@ -7,7 +7,7 @@ knows one by name.  An error begins with the place, as in ``phase[2].load.power_
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
 from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table
 from apu_casadi.machine.loads.load import LOADS, Load, load_from_table
+from scenarios import extensions
 
 if TYPE_CHECKING:
     from apu_casadi.unit.noise import Noise
@@ -84,6 +85,17 @@ def check_numbers(checked: Any) -> None:
 def names_of(cls: Any) -> tuple[str, ...]:
     """Return the fields of a dataclass by name."""
     return tuple(f.name for f in dataclasses.fields(cls))
+
+
+def load_parts(paths: Collection[str]) -> None:
+    """Run the Python files of a user, after the shipped parts: whose name is taken is told there.
+
+    Raises:
+        ScenarioError: no such file, or an error inside it, with its line.
+    """
+    if paths:
+        assert len(LOADS) and len(FAULTS)  # asking imports them
+        extensions.load(paths)
 
 
 def read_load(data: Any, place: str = "load") -> Load:

@@ -47,6 +47,7 @@ from apu_casadi.core.errors import DataError, ScenarioError, nearest
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
+from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import (
     Ambient,
     Event,
@@ -61,6 +62,7 @@ from scenarios.reading import (
     check_numbers,
     inside,
     limits,
+    load_parts,
     names_of,
     read_fault,
     read_load,
@@ -220,6 +222,7 @@ class Scenario(_Plain):
         seed: seed of the noise.
         parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
         engine: file of another engine than the paper's, seen from the scenario's file.
+        governor: name of another law than the PI law; its numbers are parameters ``governor.*``.
         extensions: Python files that register parts which the scenario names, seen from its file.
 
     Raises:
@@ -240,13 +243,14 @@ class Scenario(_Plain):
     seed: int | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
     engine: str | None = None
+    governor: str | None = None
     extensions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check every value and the order of what happens."""
         put = object.__setattr__
         put(self, "extensions", _paths(self.extensions))
-        extensions.load(self.extensions)  # before what follows may name their parts
+        load_parts(self.extensions)  # before what follows may name their parts
         text_of(self.name, "name")
         only = "only letters, digits, '_' and '-', beginning with a letter or digit"
         require(_NAME.fullmatch(self.name) is not None, "name", f"{only}: {self.name!r}")
@@ -276,7 +280,10 @@ class Scenario(_Plain):
         checked = {k: _parameter(k, v) for k, v in _flat(self.parameters)}
         put(self, "parameters", MappingProxyType(checked))
         if self.engine is not None:
-            put(self, "engine", text_of(self.engine, "engine"))
+            put(self, "engine", os.path.abspath(text_of(self.engine, "engine")))
+        if self.governor is not None:
+            hint = f"unknown {self.governor!r} {nearest(str(self.governor), GOVERNORS)}"
+            require(self.governor in GOVERNORS, "governor", hint)
         put(self, "phases", _each("phase", Phase, self.phases))
         put(self, "changes", _each("event", Change, self.changes))
         self._check_phases()
@@ -407,6 +414,7 @@ class Scenario(_Plain):
             "seed": self.seed,
             "parameters": dict(self.parameters),
             "engine": self.engine,
+            "governor": self.governor,
             "extensions": list(self.extensions),
         }
         return table | {k: v for k, v in more.items() if v not in (None, [], {})}
@@ -504,7 +512,7 @@ def _seen_from(folder: Path, made: dict[str, Any]) -> None:
             str(folder / v) if isinstance(v, str) and v else v for v in made["extensions"]
         ]
     if isinstance(made.get("engine"), str) and made["engine"]:
-        made["engine"] = os.path.abspath(folder / made["engine"])
+        made["engine"] = str(folder / made["engine"])
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

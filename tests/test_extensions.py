@@ -14,6 +14,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.loads.load import LOADS
+from apu_casadi.unit.control import GOVERNORS
 from scenarios import campaigns, extensions, registry
 from scenarios.cli import main
 from scenarios.schema import Scenario
@@ -91,8 +92,8 @@ def files(tmp_path, monkeypatch):
     parts.write_text(PARTS)
     run.write_text(RUN)
     monkeypatch.chdir(tmp_path / "work")
-    for register in (LOADS, FAULTS):  # what is entered in a test leaves with it
-        assert len(register) > 1
+    for register in (LOADS, FAULTS, GOVERNORS):  # what is entered in a test leaves with it
+        assert len(register)
         monkeypatch.setattr(register, "_added", dict(register._added))
     return parts, run
 
@@ -152,9 +153,10 @@ def test_commands_take_them(files, capsys):
     assert main(["linearise", *load, "--no-figures", "--model", "gas"]) == 0
     assert "load of each generator: 200 kW; healthy" in capsys.readouterr().out
     path.write_text(RUN.replace('extensions = ["parts/my_parts.py"]\n', ""))
-    quick = ["--solver", "propagator", "--no-figures", "--quiet"]
+    quick = ["--solver", "propagator", "--no-figures", "--quiet", "--governor", "PI"]
     assert main(["run", str(path), "--with", str(parts), *quick]) == 0
-    assert "100 kW" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "100 kW" in said and "\ngovernor PI\n" in said
     argv = ["campaign", "--base", str(path), "--with", str(parts), "--runs", "1", "--out", "c"]
     assert main([*argv, "--workers", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["counts"]["done"] == 1
@@ -206,6 +208,62 @@ def test_names_of_files_are_checked():
         Scenario.from_dict({**table, "engine": 3})
 
 
+GOVERNOR = """
+from dataclasses import dataclass
+from typing import ClassVar
+
+from apu_casadi.core.parameters import par
+from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.unit.control import GOVERNORS, Governor
+
+
+@GOVERNORS.add("PID")
+@dataclass(frozen=True)
+class Derivative(Governor):
+    X: ClassVar[Signals] = Signals([Signal("Wf_I", "kg/s", "integrator", nominal=0.05),
+                                    Signal("e_f", "1", "filtered error", nominal=0.01)])
+    Kp: float = par(0.38, unit="kg/s", source="test", doc="gain", lo=0.0)
+    Ki: float = par(0.76, unit="kg/s^2", source="test", doc="integral gain", lo=0.0)
+    Kd: float = par(0.0, unit="kg", source="test", doc="derivative gain", lo=0.0)
+    T_f: float = par(0.02, unit="s", source="test", doc="filter", lo=1e-3)
+    Wf_min: float = par(0.01, unit="kg/s", source="test", doc="limit", lo=1e-5)
+    Wf_max: float = par(0.06, unit="kg/s", source="test", doc="limit", lo=1e-5)
+
+    def demand(self, e, x):
+        return self.Kp * e + x[0] + self.Kd * (e - x[1]) / self.T_f
+
+    def rates(self, e, x, cut):
+        return (self.Ki * e + cut / 0.1, (e - x[1]) / self.T_f)
+"""
+
+
+def test_a_governor_of_ones_own(files, capsys):
+    """By its name in a scenario and on the command line; its numbers are parameters."""
+    parts, path = files
+    parts.write_text(GOVERNOR)
+    text = RUN.partition("[[phase]]")[0] + '[[phase]]\nname = "a"\nstart = 0.0\n'
+    text += 'load = { kind = "R", power_kW = 100 }\n[[event]]\ntime = 0.1\n'
+    text += 'load = { kind = "R", power_kW = 150 }\n'
+    own = text.replace(
+        "[[phase]]", 'governor = "PID"\nparameters.governor.Kd = 0.004\n[[phase]]', 1
+    )
+    lowest = {}
+    for name, toml in {"PI": text, "PID": own}.items():
+        path.write_text(toml)
+        s = registry.get(path)
+        assert Scenario.from_dict(s.to_dict()) == s
+        lowest[name] = float(registry.run(s)["N"].min())
+    assert lowest["PID"] > lowest["PI"] + 1.0  # the derivative catches the drop
+    path.write_text(own.replace('"PID"', '"PIDD"'))
+    with pytest.raises(ScenarioError, match=r"governor: unknown 'PIDD' \(did you mean 'PID'\?\)"):
+        registry.get(path)
+    argv = ["linearise", "--no-figures", "--json", "--with", str(parts), "--governor"]
+    assert main([*argv, "PID"]) == 0
+    assert "e_f" in json.loads(capsys.readouterr().out)["names"]["x"]
+    assert main([*argv, "PIDD"]) == 2
+    assert "unknown governor 'PIDD' (did you mean 'PID'?)" in capsys.readouterr().err
+
+
 # ------------------------------------------------------------------------------ another engine
 
 
@@ -225,7 +283,11 @@ def test_every_command_takes_another_engine(other_engine, capsys):
     fuel = trim_gas_generator(made, {"N": made.parameters.N, "PW": 2e5})["Wf"]
     assert fuel > 1.03 * trim_gas_generator(GasGenerator(), {"N": 3775.147, "PW": 2e5})["Wf"]
     assert main(["trim", "--engine", "engine.toml", "--power", "2e5", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["outputs"]["Wf"] == pytest.approx(fuel, rel=1e-9)
+    report = json.loads(capsys.readouterr().out)
+    assert report["outputs"]["Wf"] == pytest.approx(fuel, rel=1e-9)
+    assert report["engine"] == "engine.toml"
+    assert main(["trim", "--engine", "engine.toml", "--power", "2e5"]) == 0
+    assert "health: healthy; engine engine.toml; apu-casadi" in capsys.readouterr().out
     deck = ["deck", "--altitude", "0", "--mach", "0", "--power", "2e5", "--engine", "engine.toml"]
     assert main(deck) == 0
     assert float(results.load("deck.nc")["Wf"].values.item()) == pytest.approx(fuel, rel=1e-9)

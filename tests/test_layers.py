@@ -50,7 +50,7 @@ BELOW: dict[str, tuple[str, ...]] = {
     "scenarios.shell": SHELL,
     "scenarios.figures": UNIT,
     "scenarios.extensions": CORE,
-    "scenarios.reading": ESTIMATORS,
+    "scenarios.reading": (*ESTIMATORS, "scenarios.extensions"),
     "scenarios.schema": READING,
     "scenarios.fileschema": (*READING, "scenarios.schema"),
     "scenarios.registry": SCENARIO,

@@ -7,6 +7,7 @@ limits fuel; no temperature is limited, and a run that gets too hot says so
 
 Another law is another subclass of :class:`Governor`, with numbers, states, ``demand`` and
 ``rates``; ``Apu(governor=...)`` takes it, and runs, linear models and filters follow it.
+:data:`GOVERNORS` gives it a name for scenarios and commands.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.parameters import Parameters, par
+from apu_casadi.core.register import Register
 from apu_casadi.core.signals import Signal, Signals
 
 
@@ -102,6 +104,10 @@ class Governor(Parameters):
         return new
 
 
+GOVERNORS: Register[type[Governor]] = Register("governor")
+"""Laws by the name that a scenario and the commands use."""
+
+
 def _limited(value: Any, low: Any, high: Any) -> Any:
     if isinstance(value, float):
         return max(low, min(high, value))
@@ -110,6 +116,7 @@ def _limited(value: Any, low: Any, high: Any) -> Any:
     return ca.fmax(low, ca.fmin(high, value))
 
 
+@GOVERNORS.add("PI")
 @dataclass(frozen=True)
 class GovernorParameters(Governor):
     """The PI law, with limits and back-calculation.

@@ -30,7 +30,7 @@ OPTIONS = f"""
 --runs int =1000       | number of runs (default 1000)
 --seed int =0          | of the random numbers (default 0)
 --base SCENARIO =joint | scenario that is varied (joint)
-{given.UNIT}
+{given.WHOLE}
 --workers int          | processes (default: all cores)
 --out DIR =results/campaign | folder (results/campaign)
 --fresh                | do not take up what DIR already has

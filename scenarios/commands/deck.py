@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     t = time.perf_counter()
     deck = performance_deck(gg, **axes, outputs=keep, n_threads=args.threads)
     t = time.perf_counter() - t
-    deck.attrs["apu_casadi_version"] = installed()
+    deck.attrs |= {"apu_casadi_version": installed(), **given.own(args)}
     results.save(deck, args.out)
     status = deck["status"].values
     counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         f"speed {a['N'] * 30 / math.pi:.1f} r/min, {'healthy' if health else 'faulty'} engine, "
         f"war = {a['war']:g}, ISA deviation "
         + ", ".join(f"{v:g}" for v in axes["dT_isa"])
-        + f" K; {given.program()}"
+        + f" K; {given.program(args)}"
     )
     print(f"written: {args.out}")
     return 0

@@ -28,7 +28,7 @@ KEPT = "docs/estimation"
 _OUT = f"--out DIR ={KEPT} | where results are kept (default %(default)s)"
 _JOINT = f"""
 --scenario NAME|FILE =joint | what is true: of the library, .toml or .py (default %(default)s)
-{given.UNIT}
+{given.WHOLE}
 --seed int N =1             | of all errors (default 1)
 --out DIR                   | folder (default results/estimate_NAME)
 --figures =on               | draw truth, estimate and band (default)

@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     found["read_as"] = [*notes, *_unheeded(tables, times, args)]
     days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
     found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
-    found["apu_casadi_version"] = installed()
+    found |= {"apu_casadi_version": installed(), **given.own(args)}
     if args.json:
         jsontext.show(found)
         return 0
@@ -470,7 +470,8 @@ def text(found: Mapping[str, Any]) -> str:
         taken = ", ".join(f"{n} = {v:g}" for n, v in values.items())
         lines.append(f"ambient conditions as the run file says, {file}: {taken}")
     if "apu_casadi_version" in found:
-        lines.append(f"apu-casadi {found['apu_casadi_version']}")
+        engine = f"engine {found['engine']}; " if "engine" in found else ""
+        lines.append(f"{engine}apu-casadi {found['apu_casadi_version']}")
     if found["ignored_columns"]:
         lines.append(f"columns not used: {', '.join(found['ignored_columns'])}")
     return "\n".join(lines)

@@ -33,6 +33,11 @@ UNIT = f"""{PARTS.rstrip()}
 """
 
 
+WHOLE = f"""{UNIT.rstrip()}
+--governor NAME | another law of the speed governor, of --with (default: the scenario's, or PI)
+"""
+
+
 class Pair(NamedTuple):
     """What stands on both sides of ``NAME=VALUE``, and the whole as it was given."""
 
@@ -79,9 +84,10 @@ def ambient_line(given: Mapping[str, Any]) -> str:
 
 def parts(args: Namespace) -> None:
     """Load the files of ``--with``, whose parts can be named from then on."""
-    from scenarios import extensions
+    if args.extensions:
+        from scenarios.reading import load_parts
 
-    extensions.load(args.extensions)
+        load_parts(args.extensions)
 
 
 def engine(args: Namespace) -> GasGenerator:
@@ -93,11 +99,11 @@ def engine(args: Namespace) -> GasGenerator:
 
 
 def unit(args: Namespace) -> Apu:
-    """Return the whole unit with the engine of ``--engine``, else the paper's."""
+    """Return the whole unit with the engine and the governor of the options, else the paper's."""
     from scenarios import registry
 
     parts(args)
-    return registry.unit_of(engine=args.engine)
+    return registry.unit_of(engine=args.engine, governor=args.governor)
 
 
 def load(args: Namespace) -> Load:
@@ -116,19 +122,26 @@ def load_words(load: Load) -> str:
 
 
 def scenario(args: Namespace, name: str) -> Scenario:
-    """Return a scenario with the parts of ``--with`` and the engine of ``--engine``."""
+    """Return a scenario with the parts, the engine and the governor of the options."""
     from scenarios import registry
 
     parts(args)
     s = registry.get(name)
     if args.extensions:
         s = s.change(extensions=(*s.extensions, *args.extensions))
-    return s if args.engine is None else s.change(engine=args.engine)
+    return s.change(**own(args))
 
 
-def program() -> str:
-    """Return name and version of the program, for results."""
-    return f"apu-casadi {installed()}"
+def own(args: Namespace) -> dict[str, str]:
+    """Return engine and governor where the options name them, for results."""
+    named = {n: getattr(args, n, None) for n in ("engine", "governor")}
+    return {n: v for n, v in named.items() if v is not None}
+
+
+def program(args: Namespace | None = None) -> str:
+    """Return name and version of the program, for results, after engine and governor if named."""
+    words = [f"{n} {v}" for n, v in own(args).items()] if args is not None else []
+    return "; ".join([*words, f"apu-casadi {installed()}"])
 
 
 def names(text: str) -> list[str]:

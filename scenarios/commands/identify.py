@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.identify import Trials
     from estimators.apu.severity import Severity
+    from estimators.apu.trials import Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
@@ -132,6 +132,7 @@ class Found:
 def _found(args: argparse.Namespace) -> Found:
     from estimators.apu import identify as study
     from estimators.apu.severity import severity_study
+    from estimators.apu.trials import snapshot_trials
     from estimators.information.identifiability import identify
 
     first, prior = given.names(args.point)[0], args.prior / 100
@@ -147,7 +148,7 @@ def _found(args: argparse.Namespace) -> Found:
     if args.trials:
         progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
         for n in study.AIMS:
-            trials[n] = study.snapshot_trials(first, seeds=seeds, **options, **variants[n])
+            trials[n] = snapshot_trials(first, seeds=seeds, **options, **variants[n])
     ramp = None
     if args.transient:
         powers = {"without PW": False, "with PW": True}
@@ -185,6 +186,7 @@ def _report(
         "points": {n: _condition(n) for n in given.names(args.point)},
         "trial_seeds": [10_000, 10_000 + args.trials] if args.trials else None,
         "apu_casadi_version": installed(),
+        **given.own(args),
         "sentences": these.sentences(),
         "rank": these.rank,
         "rank_in_noise": these.rank_in_noise,
@@ -237,7 +239,8 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
         f"true speed and fuel flow unknown; efficiency behind PW known to {args.eta_bias:g} %; "
         "noise: estimators.apu.sensors.",
         *(f"{n}: {_condition_words(n)}; healthy engine" for n in given.names(args.point)),
-        given.program() + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
+        given.program(args)
+        + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
     ]
 
 

@@ -32,7 +32,7 @@ OPTIONS = f"""
 --load TABLE part    | another load, by the keys of a scenario:
                      | 'kind = "series", R_ohm = 1, L_mH = 1'
 {given.ambient_options()}
-{given.UNIT}
+{given.WHOLE}
 --json               | print JSON, with all matrices
 --out DIR =results/linearise | default %(default)s
 --no-figures         | draw no figure
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
         label = f"{_words(args, load)} each, {day_words(given.ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
-        note = f"Load {label}; healthy; {given.program()}."
+        note = f"Load {label}; healthy; {given.program(args)}."
         files.save_figure(plot_eigenvalues({label: model}, note), path)
     if args.json:
         told = {
@@ -61,13 +61,14 @@ def run(args: argparse.Namespace) -> int:
             "assumed": given.ambient_assumed(args),
             "load": args.load or _asked(args),
             "apu_casadi_version": installed(),
+            **given.own(args),
         }
         jsontext.show(report(model) | told)
         return 0
     print(table(model))
     if args.model != "generator":
         print(f"\n{given.ambient_line(given.ambient_given(args))}")
-    print(f"load of each generator: {_words(args, load)}; healthy; {given.program()}")
+    print(f"load of each generator: {_words(args, load)}; healthy; {given.program(args)}")
     if path is not None:
         print(f"\n{path}")
     return 0

@@ -19,7 +19,7 @@ NAME = "run"
 HELP = "run a scenario of the library or of a file"
 OPTIONS = f"""
 scenario SCENARIO      | a name, a .toml or a .py file
-{given.UNIT}
+{given.WHOLE}
 --out DIR              | folder for the files (default results/NAME)
 --json                 | print the summary as JSON only
 --no-figures           | draw no figures
@@ -115,6 +115,8 @@ def made_with(report: dict[str, Any]) -> list[str]:
             f"{'none' if report['seed'] is None else report['seed']}; apu-casadi "
             f"{report['apu_casadi_version']}"
         )
+    own = [f"{k} {report[k]}" for k in ("engine", "governor") if k in report]
+    lines += ["; ".join(own)] if own else []
     if error is not None:
         lines.append(exchange_words(error, report["exchange"], report["dt"]))
     left = ", ".join(

@@ -49,7 +49,7 @@ OPTIONS = f"""
 --max-power T4=K     | highest shaft power at a temperature (T4 or T5)
 --health NAME=VALUE ... | health factor, 1 is healthy: {", ".join(HEALTH)}
 --limit NAME=VALUE ...  | off_map (table spans), SM_min, T4_max, T5_max (K)
-{given.UNIT}
+{given.WHOLE}
 --all                | print every output
 --json               | print JSON
 """
@@ -163,6 +163,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
             "load": _asked(args),
             "limits": dataclasses.asdict(limits),
             "apu_casadi_version": installed(),
+            **given.own(args),
         }
         if point.second is not None:
             report["second"] = point.second.values
@@ -176,7 +177,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         print(_second(point.second))
     print(given.ambient_line(given.ambient_given(args)))
     ill = ", ".join(f"{n} = {v:g}" for n, v in health.items())
-    print(f"health: {ill or 'healthy'}; {_load_words(args)}{given.program()}")
+    print(f"health: {ill or 'healthy'}; {_load_words(args)}{given.program(args)}")
     return 0
 
 
@@ -198,11 +199,11 @@ def _generator(args: argparse.Namespace) -> int:
     values = {"V_t": point.V_t, "V_ref": point.V_ref, **_scalars(point.y)}
     if args.json:
         report = {"generator": values, "residual": point.residual, "load": _asked(args)}
-        jsontext.show(report | {"apu_casadi_version": installed()})
+        jsontext.show(report | {"apu_casadi_version": installed(), **given.own(args)})
         return 0
     print(_table(values, list(values)))
     print(f"\nresidual {point.residual:.1e} 1/s")
-    print(f"{_load_words(args)}{given.program()}")
+    print(f"{_load_words(args)}{given.program(args)}")
     return 0
 
 

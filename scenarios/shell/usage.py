@@ -90,9 +90,10 @@ def part(text: str) -> float | dict[str, Any]:
     if "=" not in text:
         return finite(text)
     try:
-        return tomllib.loads(f"part = {{ {text.strip().strip('{}')} }}")["part"]
+        table: dict[str, Any] = tomllib.loads(f"part = {{ {text.strip().strip('{}')} }}")["part"]
     except tomllib.TOMLDecodeError as e:
         raise argparse.ArgumentTypeError(f"'key = value, ...' is expected ({e})") from None
+    return table
 
 
 _TYPES: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "part": part}
