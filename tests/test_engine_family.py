@@ -1,17 +1,26 @@
 """Engines of one structure share their functions, and derivatives by every parameter are exact."""
 
 import dataclasses
+import gc
+import os
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
 from apu_casadi.core import backend
+from apu_casadi.core.errors import OperatingPointError, ParameterError
+from apu_casadi.gaspath.design import solve_design
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimbatch import trim_batch
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.gaspath.steady.trimsolver import solver_of
 from apu_casadi.gaspath.unitnumbers import GIVEN, NUMBERS
+from estimators.batch.fit import fit
+from estimators.models.filtermodel import measure, noisy_inputs
+from estimators.models.lifting import lift
+from estimators.models.recording import record
 
 POINT = {"altitude": 3000.0, "Mach": 0.3, "dT_isa": 12.0, "war": 0.005}
 SMOOTH = [i for i, n in enumerate(GasGenerator.Y.names) if n not in ("off_c", "off_t", "residual")]
@@ -133,12 +142,17 @@ def test_derived_numbers_by_function_are_those_of_the_unit(gg):
     assert len(NUMBERS) == gg.numbers.size
 
 
-def test_a_design_point_that_does_not_exist_is_told_by_the_residual(gg, state):
-    """T4 below T3 leaves no solution: the form by parameters must not call it solved."""
+@pytest.mark.parametrize(("T4", "PR_c"), [(620.0, 40.0), (850.0, 26.0)])
+def test_a_design_point_that_does_not_exist_is_told_by_the_residual(gg, state, T4, PR_c):
+    """T4 below T3 leaves no solution but one of negative fuel flow: it must not be called one."""
     x, u, theta, z = state
+    with pytest.raises(OperatingPointError, match="design point not solved"):
+        solve_design(gg.parameters.change(T4=T4, PR_c=PR_c, eta_c=0.7))
     given = gg.numbers[: len(GIVEN)].copy()
-    given[GIVEN.index("gas_generator.T4")] = 620.0
-    given[GIVEN.index("gas_generator.PR_c")] = 40.0
+    given[GIVEN.index("gas_generator.T4")] = T4
+    given[GIVEN.index("gas_generator.PR_c")] = PR_c
+    given[GIVEN.index("gas_generator.eta_c")] = 0.7
+    assert not float(gg.by_parameters.cycle.derivation(given)[1]) <= 1e-9
     y, _ = gg.by_parameters.g(x, u, np.concatenate([theta, given]), z)
     assert not float(y[gg.Y.index("residual")]) <= 1e-9
 
@@ -169,3 +183,60 @@ def test_a_state_space_takes_its_numbers_from_the_unit(gg, state):
     np.testing.assert_array_equal(full, gg.full(theta))
     assert ss.shared.theta.names == (*gg.THETA.names, *NUMBERS.names)
     np.testing.assert_allclose(flat(ss.shared.f(x, u, full)), flat(ss.f(x, u, theta)), rtol=1e-12)
+
+
+def test_parameters_are_unknowns_of_a_fit_like_health_factors():
+    """Burner efficiency and a map number of a replaced unit are found from its steady points.
+
+    1e-6: points without noise; IPOPT stops at 1e-10, trims at residuals of 1e-9.
+    """
+    gg = GasGenerator()
+    truth = {"gas_generator.eta_burner": 0.975, "compressor_map.a_W": 0.06, "f_eta_t": 0.985}
+    unit = changed(gg, "gas_generator.eta_burner", truth["gas_generator.eta_burner"])
+    unit = changed(unit, "compressor_map.a_W", truth["compressor_map.a_W"])
+    powers = (1e5, 2e5, 3e5, 4e5)
+    points = [
+        trim_gas_generator(unit, {"N": k * gg.parameters.N, "PW": P}, theta={"f_eta_t": 0.985})
+        for k, P in zip((0.97, 1.0, 0.98, 1.01), powers, strict=True)
+    ]
+    names = ["N", "P3", "T3", "T5"]
+    free = gg.with_free("gas_generator.eta_burner", "compressor_map.a_W")
+    lifted = lift(
+        free.state_space,
+        lambda m: noisy_inputs(measure(m, names), {"Wf": 3e-4, "PW": 2e3}),
+        equations=free.equations,
+        steady=True,
+    )
+    t = np.arange(4.0)
+    readings = {n: (t, np.array([p[n] for p in points])) for n in (*names, "Wf", "PW")}
+    rec = record(
+        lifted.model,
+        outputs={n: readings[n] for n in names},
+        sigma={"N": 5.0, "P3": 2e3, "T3": 2.0, "T5": 2.0},
+        inputs={n: readings[n] for n in ("Wf", "PW")},
+    )
+    got = fit(lifted, rec, list(truth), backend="vm")
+    np.testing.assert_allclose(got.estimate, list(truth.values()), atol=1e-6)
+    assert got.chi2 < 1e-8
+    with pytest.raises(ParameterError, match=r"'gas_generator.eta_burn' .*eta_burner"):
+        gg.with_free("gas_generator.eta_burn")
+
+
+def test_many_units_leave_the_memory_flat():
+    """400 engines, used and dropped: less than 2 MB more, 5 kB each."""
+    gg = GasGenerator()
+
+    def use(count, seed):
+        rng = np.random.default_rng(seed)
+        for _ in range(count):
+            par = gg.parameters.change(eta_c=0.85 - 0.02 * rng.uniform(), W2=3 + rng.uniform())
+            g = dataclasses.replace(gg, parameters=par)
+            p = trim_gas_generator(g, {"N": par.N, "PW": 2e5})
+            g.output(p.x, p.u, p.theta, z0=p.z)
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("memory of the process is read from /proc")
+    before = use(100, 0)
+    assert use(400, 1) - before < 2e6

@@ -26,7 +26,7 @@ from scenarios.figures.jointestimateplot import NAMES, plot_joint_estimate
 from scenarios.pages import estimation_page
 from scenarios.schema import Scenario
 from scenarios.shell.locking import locked
-from scenarios.studies import catalogue, fingerprint, jointrun
+from scenarios.studies import catalogue, estimation, fingerprint, jointrun
 from scenarios.studies.estimation import files, names
 from scenarios.studies.estimation.correctness import correctness
 from scenarios.studies.gaspath.course import FRESH
@@ -219,6 +219,20 @@ def test_other_constants_make_all_parts_pending(toy, tmp_path, monkeypatch):
     assert catalogue.pending(study, tmp_path, 40) == []
     monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: {"Q": 2.0})
     assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
+    monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: {})
+    assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
+
+
+def test_a_constant_that_moved_makes_nothing_pending(toy, tmp_path, monkeypatch):
+    """A name that came or went is code, which the fingerprint compares; a value is a constant."""
+    study, *_ = toy
+    catalogue.run("correctness", tmp_path, n_seeds=40)
+    values = fingerprint.constants("estimators.apu.electrical")
+    values["NEW"], gone = 1.0, values.pop("H_WALK")
+    monkeypatch.setattr("scenarios.studies.registration.constants", lambda m: values)
+    assert catalogue.pending(study, tmp_path, 40) == []
+    values["H_WALK"] = 2 * gone
+    assert catalogue.pending(study, tmp_path, 40) == ["a", "b", "c"]
 
 
 def test_other_seeds_make_a_part_pending_and_are_printed_as_they_were(toy, tmp_path, monkeypatch):
@@ -345,6 +359,61 @@ def test_two_processes_do_not_run_a_study_twice(toy, tmp_path, caplog):
 def test_names_on_the_command_line_are_the_studies():
     assert set(catalogue.STUDIES) == set(names())
     assert [n.replace("-", "_") for n in names()] == files()  # a study is the file of its name
+
+
+ONE_FILE = """
+from estimators.filters.ekf import ekf_step
+from scenarios.studies.estimation.correctness import linear_model
+from scenarios.studies.registration import Study
+
+STUDY = Study(
+    "coin-toss", title="A coin", goal="Heads in half of the tosses.",
+    filters=lambda: [ekf_step(linear_model()).function],
+    text='''
+@intro
+A coin is tossed.
+
+@fair
+joint | share of heads | 40 to 60 % | {share:.1%} | of {n} tosses | {first} | by chance
+
+@said
+Heads fell in {share:.0%} of {n} tosses.
+''',
+)
+
+
+@STUDY.part("tosses", start=0.1)
+def tosses(n, seed0, tell):
+    return {"share": 0.5, "n": n, "first": seed0}
+
+
+@STUDY.claims
+def claims(r):
+    c = r.get("tosses")
+    return [STUDY.claim("fair", 0.4 < c["share"] < 0.6, **c)] if c else []
+
+
+@STUDY.section
+def section(r):
+    return [STUDY.template.text("said", **r["tosses"])] if "tosses" in r else []
+"""
+
+
+def test_a_study_is_one_file(tmp_path, monkeypatch, capsys):
+    """Put into the folder, it is on the command line and on the page; nothing else is changed."""
+    (tmp_path / "coin_toss.py").write_text(ONE_FILE)
+    monkeypatch.setattr(estimation, "__path__", [*estimation.__path__, str(tmp_path)])
+    found = catalogue.walk()
+    monkeypatch.setattr(catalogue, "STUDIES", found)
+    assert list(found)[-1] == "coin-toss" and "coin-toss" in names()
+    out = tmp_path / "kept"
+    line = ["estimate", "study", "coin-toss", "--seeds", "20", "--out", str(out), "--quiet"]
+    assert cli.main(line) == 0
+    assert "met     share of heads: 50.0 % (40 to 60 %; of 20 tosses)" in capsys.readouterr().out
+    page = estimation_page.page(estimation_page.load(out))
+    assert "## A coin" in page and "Heads fell in 50 % of 20 tosses." in page
+    assert cli.main(line) == 0
+    assert capsys.readouterr().out.startswith("coin-toss: kept")
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,11 @@ from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.identify import gas_path
 from estimators.apu.joint import estimate_joint
 from estimators.apu.recordings.recorded import read_table
-from estimators.apu.sensors import GAS_PATH, gas_path_table, load_sensors, unregister
+from estimators.apu.sensors import GAS_PATH, gas_path_table, unregister
 from estimators.detection.signatures import linearised
 from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterStep, run
 from estimators.filters.stepparts import step_symbols
+from scenarios import extensions
 from scenarios.cli import main
 
 # ------------------------------------------------------------------ a user's files, as they stand
@@ -80,14 +81,15 @@ def ds():
 def mine(tmp_path):
     path = tmp_path / "my_sensors.py"
     path.write_text(SENSORS)
-    yield load_sensors(path)
-    for name in ("T41_slow", "dP"):
+    extensions.load([path])
+    names = ("T41_slow", "dP")
+    yield names
+    for name in names:
         unregister(name)
 
 
 def test_a_sensor_of_ones_own(ds, mine, tmp_path):
     """Registered by one line, it is in filter, joint estimation, identifiability and files."""
-    assert mine == ("T41_slow", "dP")
     table = gas_path_table()
     assert table.outputs == (*GAS_PATH.outputs, *mine)
     filt = gas_path_filter(sensors=table)
@@ -116,10 +118,12 @@ def test_a_sensor_of_ones_own_in_commands(mine, tmp_path, capsys):
     text = "\n".join([head, *(",".join(f"{v:.9g}" for v in row) for row in rows)])
     (tmp_path / "points.csv").write_text(text + "\n")
     argv = ["fit", str(tmp_path / "points.csv"), "--steady", "--json", "--sigma", "dP=1kPa"]
+    argv += ["--with", str(tmp_path / "my_sensors.py")]
     assert main(argv) == 0
     report = json.loads(capsys.readouterr().out)
     assert {"T41_slow", "dP"} <= set(json.dumps(report).replace('"', " ").split())
-    assert main(["identify", "--sensors", "N,dP,Wf,T41_slow", "--json", "--trials", "0"]) == 0
+    given = ["--with", str(tmp_path / "my_sensors.py"), "--sensors", "N,dP,Wf,T41_slow"]
+    assert main(["identify", *given, "--json", "--trials", "0"]) == 0
     assert "T41_slow" in capsys.readouterr().out
 
 

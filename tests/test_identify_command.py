@@ -16,7 +16,7 @@ from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
 from estimators.apu import identify as study
-from estimators.apu import severity
+from estimators.apu import severity, trials
 from estimators.information.identifiability import identify
 from scenarios.cli import main
 from scenarios.figures.estimationplot import plot_gain_of_a_sensor
@@ -121,7 +121,7 @@ def test_random_snapshots_of_the_nonlinear_engine_confirm_the_bounds():
 
     The rms of 60 snapshots' dominant direction has a standard error of 1/sqrt(120) = 9 %.
     """
-    t = study.snapshot_trials(seeds=range(60), eta_bias=study.ETA_BIAS)
+    t = trials.snapshot_trials(seeds=range(60), eta_bias=study.ETA_BIAS)
     assert t.rms_before == pytest.approx(t.bound_before, rel=0.36)
     assert t.rms_after == pytest.approx(t.bound_after, rel=0.36)
     assert t.interval[0] < t.reduction < t.interval[1]

@@ -254,3 +254,13 @@ def test_noise_refuses_unknown_signals_and_negative_spread():
         Noise(gas={"t3": 1.0})
     with pytest.raises(SignalError, match="N"):
         Noise(N=-1.0)
+
+
+def test_a_staircase_of_small_changes_is_fast_by_default():
+    """120 health changes in 61 s, every half second: each step is propagated, none integrated."""
+    events = [HealthChange(0.5 * (k + 1), {"f_eta_c": 1 - 1e-4 * k}) for k in range(120)]
+    ds = simulate_joint(APU, duration=61.0, load=KW225, events=events, waveform_dt=None)
+    status = json.loads(ds.attrs["solver"])
+    assert status["solver"] == "auto" and status["nsteps_generator"] == 0
+    assert status["steps_propagated"] == 3050
+    assert ds["f_eta_c"].values[-1] == pytest.approx(1 - 1e-4 * 119)

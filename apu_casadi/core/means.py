@@ -172,10 +172,11 @@ def _squares(
     determinant = cc * ss - cs * cs
     gain_c, gain_s = (ss * c2 - cs * s2) / determinant, (cc * s2 - cs * c2) / determinant
     own = 1 - gain_c * c2 - gain_s * s2
-    return np.array([
-        (means[n] - gain_c * means[f"{n}*cos2"] - gain_s * means[f"{n}*sin2"]) / own
-        for n in RMS.values()
-    ])  # fmt: skip
+
+    def constant(n: str) -> np.ndarray:
+        return (means[n] - gain_c * means[f"{n}*cos2"] - gain_s * means[f"{n}*sin2"]) / own
+
+    return np.array([constant(n) for n in RMS.values()])
 
 
 def _fundamental(means: Mapping[str, np.ndarray], c2: np.ndarray, s2: np.ndarray) -> np.ndarray:

@@ -334,10 +334,8 @@ def stepper(
     else:
         raise SimulationError(f"{ss.name}: at least one output per step is needed, got {n_out}")
     key = (grid.tobytes(), tuple(quad), solver, rtol, atol)
-    return keep(
-        ss, Stepper, key,
-        lambda: Stepper(twin(ss), grid, quad=quad, solver=solver, rtol=rtol, atol=atol),
-    )  # fmt: skip
+    how = {"quad": quad, "solver": solver, "rtol": rtol, "atol": atol}
+    return keep(ss, Stepper, key, lambda: Stepper(twin(ss), grid, **how))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from apu_casadi.gaspath.conditions import RANGES
 from apu_casadi.gaspath.gas import Gas
 
 G0 = 9.80665  # m/s2
@@ -19,7 +18,6 @@ R_ISA = 287.05287  # J/(kg K), the constant of the ISA definition
 T_SL, P_SL = 288.15, 101325.0  # K, Pa at sea level
 LAPSE = -0.0065  # K/m in the troposphere
 H_TROPOPAUSE = 11000.0  # m
-ALTITUDE_RANGE = RANGES["altitude"]  # m, where this module is meant to be used
 
 
 class Ambient(NamedTuple):

@@ -24,6 +24,7 @@ class Condition(NamedTuple):
         default: its value on the default day.
         lo, hi: lowest and highest value that the model is meant for.
         unit, doc, source: of the value; ``source`` tells where default and range are from.
+        nominal: typical magnitude.
     """
 
     default: float
@@ -32,14 +33,18 @@ class Condition(NamedTuple):
     unit: str
     doc: str
     source: str
+    nominal: float
 
 
 _ISA = "Table 3; the atmosphere's two lowest layers, below the lowest stratosphere"
+_INTAKE = "Table 3; subsonic intake, assumed"
+_DAYS = "Table 3; extreme days, assumed"
+_WET = "Table 4 (SNOx); beyond any wet day"
 _ROWS = {
-    "altitude": (0.0, -1000.0, 15000.0, "m", "geopotential altitude", _ISA),
-    "Mach": (0.0, 0.0, 0.95, "1", "flight Mach number", "Table 3; subsonic intake, assumed"),
-    "dT_isa": (5.0, -60.0, 60.0, "K", "deviation from ISA", "Table 3; extreme days, assumed"),
-    "war": (0.0, 0.0, 0.1, "kg/kg", "water per dry air", "Table 4 (SNOx); beyond any wet day"),
+    "altitude": (0.0, -1000.0, 15000.0, "m", "geopotential altitude", _ISA, 1e4),
+    "Mach": (0.0, 0.0, 0.95, "1", "flight Mach number", _INTAKE, 1.0),
+    "dT_isa": (5.0, -60.0, 60.0, "K", "deviation from ISA", _DAYS, 30.0),
+    "war": (0.0, 0.0, 0.1, "kg/kg", "water per dry air", _WET, 0.01),
 }
 CONDITIONS: Mapping[str, Condition] = MappingProxyType(
     {name: Condition(*row) for name, row in _ROWS.items()}

@@ -26,9 +26,10 @@ from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.atmosphere import Ambient, ambient
 from apu_casadi.gaspath.components.inlet import inlet
 from apu_casadi.gaspath.components.shaft import power_balance, rotor_acceleration
+from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gas import Gas
 from apu_casadi.gaspath.maps.maptable import MapTable
-from apu_casadi.gaspath.maps.scaledmaps import N_CELL, N_SURGE_CELL, per, surface_cell, surge_cell
+from apu_casadi.gaspath.maps.scaledmaps import N_CELL, N_SURGE_CELL, surface_cell, surge_cell
 from apu_casadi.gaspath.stations import (
     AMBIENT_STATE,
     EQUATIONS,
@@ -140,21 +141,21 @@ class Cycle(Parametric):
         """Function u -> (T0, P0, T1, P1)."""
         us = ca.SX.sym("u", _NU)
         v = U.unpack(us)
-        air = {n: v[n] for n in ("altitude", "Mach", "dT_isa", "war")}
+        air = {n: v[n] for n in AMBIENT}
         amb = ambient(**air, gas=Gas(data=self.gas_data))  # no fuel in it
         return ca.Function("ambient", [us], [ca.vertcat(amb.T0, amb.P0, amb.T1, amb.P1)])
 
     def _map_arguments(self, at: Point, unit: UnitParts, PR_c: Any) -> dict[str, Any]:
         """Corrected speeds over design and Reynolds number indices of the two maps."""
-        p, d, T41, N = unit.p, unit.design.values, at.z[Z.index("T41")], at.x
+        p, d, ref, T41, N = unit.p, unit.design.values, unit.ref, at.z[Z.index("T41")], at.x
         _, _, T1, P1 = ca.vertsplit(at.a)
         T2, P2 = inlet(T1=T1, P1=P1, dp_inlet=p.dp_inlet)
         P4 = P2 * PR_c * (1 - p.dp_burner)
         return {
-            "n_c": per(N / ca.sqrt(per(T2, d["T2"])), p.N),
-            "n_t": per(N / ca.sqrt(per(T41, d["T41"])), p.N),
-            "RNI_c": reynolds_index(P=P2, T=T2, P_ref=d["P2"], T_ref=d["T2"]),
-            "RNI_t": reynolds_index(P=P4, T=T41, P_ref=d["P4"], T_ref=d["T41"]),
+            "n_c": N / ca.sqrt(T2 * ref["per_T2"]) * ref["per_N"],
+            "n_t": N / ca.sqrt(T41 * ref["per_T41"]) * ref["per_N"],
+            "RNI_c": reynolds_index(P=P2, T=T2, T_ref=d["T2"], per_ref=ref["per_Re_c"]),
+            "RNI_t": reynolds_index(P=P4, T=T41, T_ref=d["T41"], per_ref=ref["per_Re_t"]),
         }
 
     @staticmethod
@@ -169,7 +170,7 @@ class Cycle(Parametric):
             Residuals in the order of ``EQUATIONS``, power before the load, outputs by name; without
             those that only the maps know.
         """
-        p, d = unit.p, unit.design.values
+        p, ref = unit.p, unit.ref
         z, v, H = Z.unpack(at.z), U.unpack(at.u), THETA.unpack(at.theta)
         W_c, PR_c, eta_c, SM = ca.vertsplit(mc)
         W_t, PR_t, eta_t = ca.vertsplit(mt)
@@ -177,15 +178,13 @@ class Cycle(Parametric):
         T0, P0, T1, P1 = ca.vertsplit(at.a)
         amb = Ambient(T0=T0, P0=P0, V0=ca.SX(0), T1=T1, P1=P1)
         T2, P2 = inlet(T1=T1, P1=P1, dp_inlet=p.dp_inlet)
-        W2 = W_c * H["f_W_c"] * per(P2, d["P2"]) / ca.sqrt(per(T2, d["T2"]))
+        W2 = W_c * H["f_W_c"] * (P2 * ref["per_P2"]) / ca.sqrt(T2 * ref["per_T2"])
         # losses grow with the square of the corrected flow at the inlet of their duct (Table 5)
-        design_31 = p.W2 * ca.sqrt(d["T3"]) / (d["P2"] * p.PR_c)
-        corrected_31 = per(W2 * ca.sqrt(z["T3"]) / (P2 * PR_c), design_31)
+        corrected_31 = W2 * ca.sqrt(z["T3"]) / (P2 * PR_c) * ref["per_flow_31"]
         dp_burner = p.dp_burner * corrected_31**2
         P4 = P2 * PR_c * (1 - dp_burner)
         W5 = W2 * (1 - p.bleed_overboard) + v["Wf"]
-        design_5 = d["W5"] * ca.sqrt(d["T5"]) / d["P5"]
-        corrected_5 = per(W5 * ca.sqrt(z["T5"]) / (P4 / PR_t), design_5)
+        corrected_5 = W5 * ca.sqrt(z["T5"]) / (P4 / PR_t) * ref["per_flow_5"]
         loss = {"dp_burner": dp_burner, "dp_exhaust": p.dp_exhaust * corrected_5**2}
         maps = {"W2": W2, "PR_c": PR_c, "eta_c": eta_c, "PR_t": PR_t, "eta_t": eta_t}
         areas = {"A3": unit.design.A3, "A8": unit.design.A8}

@@ -6,8 +6,8 @@ One set of expressions in three forms, which differ in what theta holds besides 
   :class:`~apu_casadi.gaspath.gasgenerator.GasGenerator`.
 - *the family*: all numbers of an engine, given and derived, so that functions compiled once serve
   every engine.  Derivatives by state, inputs and health only: those by the numbers are zero.
-- *by parameters*: the parameters alone.  The design point is solved inside, so derivatives by
-  every parameter are exact, its shift included; that takes longer.
+- *by parameters*: the parameters alone, or some of one engine.  The design point is solved inside,
+  so derivatives by every parameter are exact, its shift included; that takes longer.
 """
 
 from __future__ import annotations
@@ -35,19 +35,22 @@ class CycleFunctions(Parametric):
     Args:
         cycle: the equations; with free numbers for the form by parameters.
         numbers: of one engine; None for the two other forms.
+        free: parameters of that engine that theta holds.
     """
 
     cycle: Cycle
     numbers: tuple[float, ...] | None = None
+    free: tuple[str, ...] = ()
 
     # ------------------------------------------------------------------ signals
 
     @derived
     def theta(self) -> Signals:
         """The health factors, and what else theta holds."""
-        if self.numbers is not None:
-            return THETA
-        return THETA + (NUMBERS if self.cycle.held else GIVEN)
+        if self.numbers is None:
+            return THETA + (NUMBERS if self.cycle.held else GIVEN)
+        own = {n: self.numbers[GIVEN.index(n)] for n in self.free}
+        return THETA + Signals([replace(GIVEN[n], default=v) for n, v in own.items()])
 
     @derived
     def z(self) -> Signals:
@@ -64,12 +67,17 @@ class CycleFunctions(Parametric):
         return x, z, u, theta
 
     def _split(self, theta: Any) -> tuple[Any, Any, Any]:
-        """Return health factors, numbers, and the residual of the design point, of theta."""
-        if self.numbers is not None:
-            return theta, ca.MX(ca.DM(self.numbers)), 0.0
+        """Return of theta health factors, numbers, and the residual of a design point solved."""
+        if self._closed:
+            return theta, ca.MX(ca.DM(self.numbers)), None
         health, rest = theta[:_NT], theta[_NT:]
+        if self.numbers is not None:
+            own = ca.vertsplit(ca.MX(ca.DM(self.numbers[: len(GIVEN)])))
+            for n, value in zip(self.free, ca.vertsplit(rest), strict=True):
+                own[GIVEN.index(n)] = value
+            rest = ca.vertcat(*own)
         if self.cycle.held:
-            return health, rest, 0.0
+            return health, rest, None
         more, residual = self.cycle.derivation(rest)
         return health, ca.vertcat(rest, more), residual
 
@@ -85,10 +93,11 @@ class CycleFunctions(Parametric):
         x, z, u, theta = self.symbols()
         health, c, design = self._split(theta)
         out = dict(zip(fun.name_out(), fun.call([x, z, u, health, c], True, False), strict=True))
-        if "y" in out:  # the verdict on the design point goes with that on the cycle
-            out["y"][Y.index("residual")] += design
-        elif "residual" in out:
-            out["residual"] += design
+        if design is not None:  # the verdict on the design point goes with that on the cycle
+            if "y" in out:
+                out["y"][Y.index("residual")] += design
+            elif "residual" in out:
+                out["residual"] += design
         names = ["x", "z", "u", "theta"], list(out)
         return ca.Function(fun.name(), [x, z, u, theta], [*out.values()], *names)
 
@@ -156,12 +165,17 @@ class CycleFunctions(Parametric):
         """
         x, _, u, theta = self.symbols()
         _, c, _ = self._split(theta)
-        args = [x, u] if self.numbers is not None else [x, u, theta]
+        args = [x, u] if self._closed else [x, u, theta]
         return ca.Function("similar", args, [self.cycle.similar(x, u, c)])
 
     def start(self, x: Any, u: Any, theta: Any) -> Any:
         """First guess of z; ``theta`` counts where it holds numbers."""
-        return self.similar(x, u) if self.numbers is not None else self.similar(x, u, theta)
+        return self.similar(x, u) if self._closed else self.similar(x, u, theta)
+
+    @property
+    def _closed(self) -> bool:
+        """Whether theta are the health factors alone."""
+        return self.numbers is not None and not self.free
 
     @derived
     def state_space(self) -> StateSpace:

@@ -15,6 +15,7 @@ from apu_casadi.core.sharing import once
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.atmosphere import ambient
 from apu_casadi.gaspath.components.shaft import power_balance
+from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas
 from apu_casadi.gaspath.stations import TEMPERATURES, UNKNOWNS, stations
@@ -92,7 +93,7 @@ class DesignEquations:
         v = dict(zip(self.names, ca.vertsplit(w), strict=True))
         p = of_symbols(GasGeneratorParameters, ps, gas_data=data)
         gas = Gas.of_symbols(p.x_HC, data)
-        amb = ambient(altitude=p.altitude, Mach=p.Mach, dT_isa=p.dT_isa, war=p.war, gas=gas)
+        amb = ambient(**{n: getattr(p, n) for n in AMBIENT}, gas=gas)
         z = {**v, "T4": p.T4}
         loss: dict[str, Any] = {"dp_burner": p.dp_burner, "dp_exhaust": p.dp_exhaust}
         maps = {n: getattr(p, n) for n in ("W2", "PR_c", "eta_c", "eta_t")}

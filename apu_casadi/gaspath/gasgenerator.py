@@ -19,7 +19,7 @@ import numpy as np
 
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.calling import Caller
-from apu_casadi.core.errors import OperatingPointError, SimulationError
+from apu_casadi.core.errors import OperatingPointError, ParameterError, SimulationError, nearest
 from apu_casadi.core.runloop import run
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
@@ -44,7 +44,7 @@ __all__ = [
     "MapChoice",
 ]
 
-_MACH8 = stations.Y.index("Mach8")
+_MACH8, _RESIDUAL = stations.Y.indices(("Mach8", "residual"))
 RESIDUAL_TOL = 1e-9  # largest residual (dimensionless) with which any result is used
 
 
@@ -174,7 +174,13 @@ class GasGenerator(Parametric):
 
     def full(self, theta: Any) -> np.ndarray:
         """Return the family's theta: the health factors, shape (4,), and this engine's numbers."""
-        return np.concatenate([theta, self.numbers])
+        full = self._healthy.copy()
+        full[: len(self.THETA)] = theta
+        return full
+
+    @derived
+    def _healthy(self) -> np.ndarray:
+        return np.concatenate([np.ones(len(self.THETA)), self.numbers])
 
     # ------------------------------------------------------------------ equations
 
@@ -202,6 +208,23 @@ class GasGenerator(Parametric):
         Exact derivatives by every parameter, the shift of the design point included.
         """
         return CycleFunctions(self._equations(held=False))
+
+    @kept
+    def with_free(self, *names: str) -> CycleFunctions:
+        """Return the functions of this engine with some parameters behind the health factors.
+
+        The way to estimate a parameter: it is an entry of theta like a health factor, with this
+        engine's value as default, and its effect on the design point is in all derivatives.
+
+        Raises:
+            ParameterError: an unknown name, or one given twice; the nearest is named.
+        """
+        for n in names:
+            if n not in unitnumbers.GIVEN:
+                raise ParameterError(f"no parameter {n!r} {nearest(n, unitnumbers.GIVEN.names)}")
+        if len(set(names)) < len(names) or not names:
+            raise ParameterError(f"free parameters: {', '.join(names) or 'none'}; each once")
+        return CycleFunctions(self._equations(held=False), tuple(self.numbers.tolist()), names)
 
     @property
     def z(self) -> Signals:
@@ -342,7 +365,7 @@ class GasGenerator(Parametric):
         th = self.full(theta)
         start = self._similar(x, u, th) if z0 is None else z0
         y, z = self._g_call(x, u, th, start)
-        self._check(float(y[self.Y.index("residual")]), x, u, theta, "output")
+        self._check(float(y[_RESIDUAL]), x, u, theta, "output")
         self._check_exit(y)
         return y, z
 

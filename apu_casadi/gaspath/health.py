@@ -45,4 +45,7 @@ HEALTH = tuple(HEALTH_FACTORS)
 """Their names."""
 
 HEALTH_RANGE = (0.3, 2.0)
-"""Lowest and highest value for which the equations are solved; runs allow less."""
+"""Lowest and highest value for which steady points are solved."""
+
+RUN_RANGE = (0.5, 1.5)
+"""Values of a run lie in this interval, its lower end excluded."""

@@ -21,14 +21,13 @@ from apu_casadi.gaspath.health import HEALTH_FACTORS
 
 # ------------------------------------------------------------------------------ signals
 
-_NOMINAL = {"altitude": 1e4, "Mach": 1.0, "dT_isa": 30.0, "war": 0.01}
 X = Signals([Signal("N", "rad/s", "rotor speed", nominal=3775.0)])
 U = Signals(
     [
         Signal("Wf", "kg/s", "fuel flow", nominal=0.05),
         Signal("PW", "W", "shaft power to the load", nominal=5e5),
         *(
-            Signal(n, c.unit, c.doc, default=c.default, nominal=_NOMINAL[n])
+            Signal(n, c.unit, c.doc, default=c.default, nominal=c.nominal)
             for n, c in CONDITIONS.items()
         ),
     ]
@@ -141,16 +140,20 @@ TEMPERATURES = tuple(k.name for k in UNKNOWNS if k.follows)
 EQUATIONS = tuple(k.equation for k in UNKNOWNS)
 
 
-def reynolds_index(*, P: Any, T: Any, P_ref: Any, T_ref: Any) -> Any:
+def viscosity(T: Any) -> Any:
+    """Viscosity of air over a constant, T in K.
+
+    Sutherland's law with 110.4 K (U.S. Standard Atmosphere 1976).
+    """
+    return T**1.5 / (T + 110.4)
+
+
+def reynolds_index(*, P: Any, T: Any, T_ref: Any, per_ref: Any) -> Any:
     """Reynolds number index P/(sqrt(T) viscosity(T)) over its reference; 1 at the reference.
 
-    Viscosity of air by Sutherland's law with 110.4 K (U.S. Standard Atmosphere 1976).
+    ``per_ref`` is viscosity(T_ref)/P_ref.
     """
-
-    def viscosity(t: Any) -> Any:
-        return t**1.5 / (t + 110.4)
-
-    return P * (1 / P_ref) * ca.sqrt(T_ref / T) * viscosity(T_ref) / viscosity(T)
+    return P * per_ref * ca.sqrt(T_ref / T) / viscosity(T)
 
 
 class Pass(NamedTuple):

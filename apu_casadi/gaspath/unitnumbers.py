@@ -9,7 +9,7 @@ compiled in, are gas data and map tables.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,8 +19,13 @@ from apu_casadi.gaspath.design import DesignPoint, design_equations, number_sign
 from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas, fuel_burning, used
 from apu_casadi.gaspath.maps.maptable import MapTable
-from apu_casadi.gaspath.maps.scaledmaps import MapCalibration, ScaledMap, table_logs
-from apu_casadi.gaspath.stations import TEMPERATURES
+from apu_casadi.gaspath.maps.scaledmaps import (
+    MapCalibration,
+    ScaledMap,
+    scale_factors,
+    table_logs,
+)
+from apu_casadi.gaspath.stations import TEMPERATURES, viscosity
 
 MAPS = ("compressor_map", "turbine_map")
 _PLACE = (
@@ -41,6 +46,10 @@ GIVEN = OWN + _map_signals("compressor_map") + _map_signals("turbine_map")
 
 _VALUES = ("T2", "P2", "P4", "W5", "P5", "Wf", "PW")  # of the design point, beside z
 _LOGS = ("ln_W", "ln_PR_1", "ln_eta")
+_REFERENCES = tuple(
+    f"per_{n}" for n in ("N", "T2", "T41", "P2", "Re_c", "Re_t", "flow_31", "flow_5")
+)
+_FACTORS = ("per_N_map", "per_W", "per_line")
 _LETTERS = ["a1", "a2", "a3", "a4", "a5", "a6", "a7", "b1", "b2"]
 _RANGES = tuple(f"{r}_{a}" for r in ("low", "high") for a in _LETTERS)
 DERIVED = Signals(
@@ -54,6 +63,8 @@ DERIVED = Signals(
         *(Signal(f"{m}.{n}", "1", "of the table at the design point") for m in MAPS for n in _LOGS),
         *(Signal(f"fuel.{n}", "1", "coefficient of burning 1 kg of fuel") for n in _RANGES),
         Signal("fuel.R", "J/(kg K)", "change of the gas constant by burning 1 kg of fuel"),
+        *(Signal(f"reference.{n}", "1", "reciprocal of a design value, SI") for n in _REFERENCES),
+        *(Signal(f"{m}.{n}", "1", "factor of the scaled map") for m in MAPS for n in _FACTORS),
     ]
 )
 """What follows from them."""
@@ -62,13 +73,26 @@ NUMBERS = GIVEN + DERIVED
 
 
 class UnitParts(NamedTuple):
-    """Parameters, gas, design point and maps of an engine whose numbers are symbols."""
+    """Parameters, gas, design point and maps of an engine whose numbers are symbols.
+
+    ``ref`` are the reciprocals of design values by name (``per_T2``): computed once an engine.
+    """
 
     p: GasGeneratorParameters
     gas: Gas
     design: DesignPoint
     cmap: ScaledMap
     tmap: ScaledMap
+    ref: dict[str, Any]
+
+
+def references(p: GasGeneratorParameters, design: DesignPoint) -> list[Any]:
+    """Return the reciprocals of design values, in the order of their names."""
+    d = design.values
+    per_Re = (viscosity(d[T]) / d[P] for T, P in (("T2", "P2"), ("T41", "P4")))
+    flow_31 = p.W2 * ca.sqrt(d["T3"]) / (d["P2"] * p.PR_c)
+    flow_5 = d["W5"] * ca.sqrt(d["T5"]) / d["P5"]
+    return [1 / p.N, *(1 / d[n] for n in ("T2", "T41", "P2")), *per_Re, 1 / flow_31, 1 / flow_5]
 
 
 def parts(c: ca.SX, data: str, compressor: MapTable, turbine: MapTable) -> UnitParts:
@@ -93,8 +117,11 @@ def parts(c: ca.SX, data: str, compressor: MapTable, turbine: MapTable) -> UnitP
         made.__dict__.update({n: v[f"{name}.{n}"] for n, _ in _PLACE})
         made.__dict__["cal"] = of_symbols(MapCalibration, c[k : k + _N_CALIBRATION])
         made.__dict__["design_logs"] = tuple(v[f"{name}.{n}"] for n in _LOGS)
+        made.__dict__["factors"] = tuple(v[f"{name}.{n}"] for n in _FACTORS)
         scaled.append(made)
-    return UnitParts(p, gas, design, *scaled)
+    ref = {n: v[f"reference.{n}"] for n in _REFERENCES}
+    cmap, tmap = scaled
+    return UnitParts(p, gas, design, cmap, tmap, ref)
 
 
 def vector(
@@ -109,7 +136,8 @@ def vector(
     z = [design.z[n] for n in TEMPERATURES]
     values = [design.values[n] for n in _VALUES]
     logs = [e for m in maps for e in m.design_logs]
-    return np.array([*given, *first, *z, *values, *logs, *coefficients.ravel(), R], float)
+    last = [*references(p, design), *(e for m in maps for e in m.factors)]
+    return np.array([*given, *first, *z, *values, *logs, *coefficients.ravel(), R, *last], float)
 
 
 def derivation(data: str, compressor: MapTable, turbine: MapTable) -> ca.Function:
@@ -135,7 +163,15 @@ def derivation(data: str, compressor: MapTable, turbine: MapTable) -> ca.Functio
     fuel = ca.Function("fuel", [x], [ca.vertcat(ca.vec(coefficients.T), R)])
     burnt = fuel(own[OWN.index("gas_generator.x_HC")])
     first = point[: 4 + len(TEMPERATURES)]
-    derived = ca.vertcat(first, *(rest[n] for n in _VALUES), *logs, burnt)
+    most = ca.vertcat(first, *(rest[n] for n in _VALUES), *logs, burnt)
+    c = ca.SX.sym("c", len(NUMBERS))
+    unit = parts(c, data, compressor, turbine)
+    factors = (e for m in (unit.cmap, unit.tmap) for e in scale_factors(m))
+    last = ca.vertcat(*references(unit.p, unit.design), *factors)
+    more = ca.Function("references", [c], [last])
+    derived = ca.vertcat(most, more(ca.vertcat(given, most, ca.DM.zeros(last.numel()))))
     names = ["given"], ["derived", "residual"]
-    residual = ca.norm_inf(eq.residual(w, own))
+    # a root below the bounds, such as one of negative fuel flow, is none
+    bounds = ca.if_else(ca.mmin(w - ca.DM(eq.newton.lower)) > 0, 0.0, 1.0)
+    residual = ca.norm_inf(eq.residual(w, own)) + bounds
     return ca.Function("derivation", [given], [derived, residual], *names)

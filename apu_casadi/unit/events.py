@@ -8,27 +8,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
 from apu_casadi.core.runloop import SAME_INSTANT
+from apu_casadi.gaspath import health
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
 
 if TYPE_CHECKING:
     from apu_casadi.machine.faults.fault import Fault
 
 HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
-    {
-        "f_eta_c": "compressor efficiency factor",
-        "f_W_c": "compressor flow capacity factor",
-        "f_eta_t": "turbine efficiency factor",
-        "f_W_t": "turbine flow capacity factor",
-    }
+    {n: f.doc for n, f in health.HEALTH_FACTORS.items()}
 )
 """The health factors of the gas path, one when healthy, with their meaning."""
 
-HEALTH_LO, HEALTH_HI = 0.5, 1.5
+HEALTH_LO, HEALTH_HI = health.RUN_RANGE
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
 
 
@@ -151,6 +147,26 @@ class FaultChange:
 
 
 Event = LoadChange | HealthChange | FaultChange
+
+
+class Holding(NamedTuple):
+    """What holds at an instant: load, fault, and all health factors by name."""
+
+    load: Any
+    fault: Fault | None
+    factors: Mapping[str, float]
+
+    def after(self, events: Iterable[Event]) -> Holding:
+        """Return what holds after events."""
+        now = self
+        for event in events:
+            if isinstance(event, HealthChange):
+                now = now._replace(factors={**now.factors, **event.factors})
+            elif isinstance(event, LoadChange):
+                now = now._replace(load=event.load)
+            else:
+                now = now._replace(fault=event.fault)
+        return now
 
 
 def _refuse_second(i: int, e: Event, other: Event) -> None:

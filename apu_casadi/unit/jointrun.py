@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.errors import NotApplicable, SimulationError
+from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import Ambient, Event, FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.events import Ambient, Event, Holding
 from apu_casadi.unit.exchange import PAPER, governed_step
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
 from apu_casadi.unit.jointstep import BLOCK
@@ -65,58 +65,50 @@ class JointRun:
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
         start = asked.load.balanced_part
-        self.factors = dict(asked.health)
-        self.point = apu.steady_state(start, ambient=asked.ambient, health=self.factors)
+        self.now = Holding(asked.load, asked.fault, asked.health)
+        self.point = apu.steady_state(start, ambient=asked.ambient, health=self.now.factors)
         self.machine = MachineStep(apu, self.point.generator, start, settings, asked.phasors)
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)
         self.governor = apu.governor.start(float(gas["Wf"]))
-        self.load, self.fault = asked.load, asked.fault
         self.slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
         self._gas_step = gg.stepper if settings.fast else None
-        self._free = asked.hook is None and not (asked.noise.N or settings.noisy)
+        by_blocks = settings.exact and asked.hook is None and not asked.noise.N
+        self._ways = (self._block, self._step) if by_blocks else (self._step,)
 
     def at_start(self) -> Row:
         """What is recorded of the first instant."""
         point = self.point.generator
         means = self.machine.means.at_rest(point)
         w = np.array([[point.y[n]] for n in WAVEFORMS])
-        return Row(self.y, means, self.factors, None, np.zeros(1), w)
+        return Row(self.y, means, self.now.factors, None, np.zeros(1), w)
 
     def switch(self, events: Sequence[Event], t: float) -> None:
         """Take the events of an instant, s, which are one switch, whatever their order."""
-        for event in events:
-            self.slope = None
-            if isinstance(event, HealthChange):
-                self.factors = {**self.factors, **event.factors}
-                self.theta = self.apu.gas_generator.THETA.pack(self.factors)
-            elif isinstance(event, LoadChange):
-                self.load = event.load
-            elif isinstance(event, FaultChange):
-                self.fault = event.fault
-        if self.machine.switch(self.load, self.fault, t):
+        before, self.now = self.now, self.now.after(events)
+        if self.now.factors is not before.factors:
+            self.theta = self.apu.gas_generator.THETA.pack(self.now.factors)
+        if self.machine.switch(self.now.load, self.now.fault, t) or events:
             self.slope = None
 
     def advance(self, k: int, until: float) -> tuple[int, Row]:
         """Go on by a block of exchange steps, or by one."""
-        return first_able((self._block, self._step), k, until)
+        grid = self.asked.grid
+        free = k + BLOCK < grid.size and grid[k + BLOCK] <= until + SAME_INSTANT
+        return first_able(self._ways if free else self._ways[-1:], k)
 
-    def _block(self, k: int, until: float) -> tuple[int, Row]:
+    def _block(self, k: int) -> tuple[int, Row]:
         grid = self.asked.grid[k : k + BLOCK + 1]
-        if not self._free:
-            raise NotApplicable("noise or a hook acts in every step")
-        if grid[-1] > until + SAME_INSTANT:
-            raise NotApplicable(f"an event at {until:.6g} s is near")
         done, made = self.machine.block(self.x, self.z, self.governor, self.u, self.theta, grid)
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
         return BLOCK, self._row(done.y, made)
 
     def _row(self, y: np.ndarray, made: MachineMade) -> Row:
-        return Row(y, made.means, self.factors, self.machine.phase.fault, made.t, made.w)
+        return Row(y, made.means, self.now.factors, self.machine.phase.fault, made.t, made.w)
 
-    def _step(self, k: int, _until: float) -> tuple[int, Row]:
+    def _step(self, k: int) -> tuple[int, Row]:
         noise, way, gg = self.asked.noise, self.settings.way, self.apu.gas_generator
         if noise.w1 or noise.w2:
             draw = self._rng.standard_normal
@@ -176,6 +168,6 @@ class JointRun:
         Wf, PW = (float(v) for v in self.u[:2])
         asked: dict[str, Any] = {"ambient": dataclasses.asdict(self.asked.ambient)}
         asked["PW"] = PW if math.isfinite(PW) else float(self.y[gg.Y.index("PW")])
-        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.factors, **asked)
+        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.now.factors, **asked)
         words = words or f"{error}; {validity.before(gg, t, self.y)}"
         return SimulationError(f"at t = {end:.6g} s: {words}")

@@ -346,10 +346,8 @@ def linearise(
     (A, B_u, B_theta), (C, D_u, D_theta) = (
         np.split(part, cut, axis=1) for part in (J[:nx], J[nx:])
     )
-    return LinearModel(
-        ss.name, ss.x, ss.u, ss.theta, ss.y, A, B_u, B_theta, C, D_u, D_theta, x0, u0, theta0, y,
-        xdot,
-    )  # fmt: skip
+    signals, point = (ss.x, ss.u, ss.theta, ss.y), (x0, u0, theta0, y, xdot)
+    return LinearModel(ss.name, *signals, A, B_u, B_theta, C, D_u, D_theta, *point)
 
 
 def _vector(ss: StateSpace, label: str, signals: Signals, value: Any) -> np.ndarray:

@@ -1,8 +1,7 @@
 """The generators between two exchange instants: state, load, fault, and what integrates them.
 
 A :class:`Phase <apu_casadi.unit.integrators.Phase>` holds from one switch to the next, with the
-integrators that can be asked in it (:mod:`apu_casadi.unit.integrators`) and, for blocks of exchange
-steps, :class:`Blocks`.
+integrators that can be asked in it (:mod:`apu_casadi.unit.integrators`).
 """
 
 from __future__ import annotations
@@ -18,11 +17,7 @@ from apu_casadi.machine.generator import GeneratorPoint
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.integrators import (
     SETTLED,
-    WAVEFORMS,
-    Integrator,
-    Means,
     Phase,
-    Samples,
     Settings,
     Step,
     integrators,
@@ -83,8 +78,9 @@ class MachineStep:
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
-        self._integrators: list[Integrator] = integrators(phase, self.settings, self.means)
-        self._blocks = Blocks(self.apu, phase, self._integrators[0], self.settings)
+        self._integrators = integrators(phase, self.settings, self.means)
+        self._block: JointBlock | None = None
+        self._no_block = ""
         self._at = phase.ss.u.index("w_r")
 
     def samples(self, grid: np.ndarray) -> int:
@@ -154,60 +150,21 @@ class MachineStep:
         """
         if self._since < SETTLED - SAME_INSTANT:
             raise NotApplicable("the windings have not settled")
-        done, t, w = self._blocks(x, z, governor, self.x, u, theta, self.u, grid)
-        self.propagated += BLOCK
-        self.w_r, h = self.apu.w_r(float(x[0])), self.settings.dt
-        quad, symmetric = self._blocks.quad, self.phase.symmetric
-        means = RawMeans.of(quad, symmetric, done.means, h, self.w_r, grid[1:])
-        made = MachineMade(done.x_sg, means, t, w)
-        self.accept(made, 0.0)
-        return done, made
-
-
-class Blocks:
-    """Blocks of exchange steps of a phase, made when first asked for."""
-
-    def __init__(self, apu: Apu, phase: Phase, fast: Integrator, settings: Settings) -> None:
-        self.apu, self.phase, self.settings = apu, phase, settings
-        self.fast = fast if isinstance(fast, Means | Samples) else None
-        self._made: JointBlock | None = None
-
-    @property
-    def quad(self) -> tuple[str, ...]:
-        """What is averaged over each step."""
-        return () if self.fast is None else self.fast.quad
-
-    def _block(self) -> JointBlock:
-        if self._made is None:
-            if self.fast is None:
-                raise NotApplicable("exact propagation does not hold, or is not asked for")
-            fast = self.fast.fast()
-            if isinstance(self.fast, Samples) and not fast.constant:
-                raise NotApplicable(f"{fast.ss.name}: its coefficients depend on the rotor angle")
-            self._made = JointBlock(self.apu, fast)
-        return self._made
-
-    def __call__(
-        self,
-        x: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
-        x_sg: np.ndarray,
-        u: np.ndarray,
-        theta: np.ndarray,
-        u_sg: np.ndarray,
-        grid: np.ndarray,
-    ) -> tuple[BlockResult, np.ndarray, np.ndarray]:
-        """Advance over the grid of a block; with the samples' instants and waveforms."""
-        if grid.size != BLOCK + 1 or np.abs(np.diff(grid) - self.settings.dt).max() > SAME_INSTANT:
+        if self._no_block:
+            raise NotApplicable(self._no_block)
+        fast, h = self._integrators[0], self.settings.dt
+        if self._block is None:
+            try:
+                self._block = JointBlock(self.apu, fast.for_blocks())
+            except NotApplicable as error:
+                self._no_block = str(error)
+                raise
+        if np.abs(np.diff(grid) - h).max() > SAME_INSTANT:
             raise NotApplicable("the steps of a block are whole exchange steps")
-        done = self._block()(x, z, governor, x_sg, u, theta, u_sg)
-        if self.settings.waveform_dt is None or not isinstance(self.fast, Samples):
-            return done, np.empty(0), np.empty((len(WAVEFORMS), 0))
-        fast, stored = self.fast.fast(), self.fast.stored
-        t = np.concatenate([fast.times(float(at))[stored] for at in grid[:-1]])
-        kept = np.arange(fast.n_out)[stored]
-        w = done.waves
-        if kept.size < fast.n_out:
-            w = w[:, (fast.n_out * np.arange(BLOCK)[:, None] + kept).ravel()]
-        return done, t, w
+        done = self._block(x, z, governor, self.x, u, theta, self.u)
+        t, w = fast.waves(done.waves, grid)
+        self.propagated += BLOCK
+        self.w_r = self.apu.w_r(float(x[0]))
+        means = RawMeans.of(fast.quad, self.phase.symmetric, done.means, h, self.w_r, grid[1:])
+        self.x = done.x_sg
+        return done, MachineMade(done.x_sg, means, t, w)

@@ -31,15 +31,7 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import (
-    Ambient,
-    Event,
-    FaultChange,
-    HealthChange,
-    LoadChange,
-    all_factors,
-    in_order,
-)
+from apu_casadi.unit.events import Ambient, Event, Holding, all_factors, in_order
 from apu_casadi.unit.exchange import coupled
 from apu_casadi.unit.multirate import exchange_grid
 from apu_casadi.unit.stepmeans import MEANS, rms_at_rest
@@ -203,8 +195,7 @@ class _OneModel:
         how: dict[str, Any],
     ) -> None:
         self.apu, self.grid, self.ambient, self.how = apu, grid, ambient, how
-        self.load, self.factors = load, health
-        self.fault: Fault | None = None
+        self.now = Holding(load, None, health)
         self.point = apu.steady_state(load, ambient=ambient, health=health)
         self.y, self.nsteps, self.worst = self.point.gas.y, 0, 0.0
         own = (*apu.governor.start(self.point.gas["Wf"]), *self.point.generator.x)
@@ -215,23 +206,23 @@ class _OneModel:
     @property
     def symmetric(self) -> bool:
         """Whether the phases differ by rotation only."""
-        return self.fault is None and self.load.balanced
+        return self.now.fault is None and self.now.load.balanced
 
     def _prepare(self) -> None:
         """Choose the models of load and fault, with their inputs and parameters."""
         gen, gg = self.apu.generator, self.apu.gas_generator
         self.quad = (*MEANS, *wanted(phasors=False, short=True, symmetric=self.symmetric))
-        kind = gen.fault_kind(self.load, self.fault)
-        self.ss = joint_state_space(self.apu, self.load.kind, kind, self.quad)
-        self.sg = gen.variant(self.load, self.fault)
+        kind = gen.fault_kind(self.now.load, self.now.fault)
+        self.ss = joint_state_space(self.apu, self.now.load.kind, kind, self.quad)
+        self.sg = gen.variant(self.now.load, self.now.fault)
         rest = np.delete(self._u_sg(), self.sg.u.index("w_r"))
         self.u = np.concatenate([dataclasses.astuple(self.ambient), rest, [0.0]])
-        fault = gen.fault_vector(self.load, self.fault)
-        self.theta = np.concatenate([gg.THETA.pack(self.factors), fault])
+        fault = gen.fault_vector(self.now.load, self.now.fault)
+        self.theta = np.concatenate([gg.THETA.pack(self.now.factors), fault])
 
     def _u_sg(self) -> np.ndarray:
         w_r, V_ref = self.apu.w_r(float(self.x[0])), self.point.generator.V_ref
-        return self.apu.generator.inputs(self.load, w_r=w_r, V_ref=V_ref)
+        return self.apu.generator.inputs(self.now.load, w_r=w_r, V_ref=V_ref)
 
     def at_start(self) -> np.ndarray:
         """Outputs and means at the first instant."""
@@ -244,16 +235,10 @@ class _OneModel:
         if not events:
             return
         gen, old, u_old = self.apu.generator, self.sg, self._u_sg()
-        theta_old = gen.fault_vector(self.load, self.fault)
-        for event in events:
-            if isinstance(event, HealthChange):
-                self.factors = {**self.factors, **event.factors}
-            elif isinstance(event, LoadChange):
-                self.load = event.load
-            elif isinstance(event, FaultChange):
-                self.fault = event.fault
+        theta_old = gen.fault_vector(self.now.load, self.now.fault)
+        self.now = self.now.after(events)
         self._prepare()
-        theta = gen.fault_vector(self.load, self.fault)
+        theta = gen.fault_vector(self.now.load, self.now.fault)
         x_sg = gen.transfer(
             self.x[self._first :],
             old,
@@ -268,7 +253,7 @@ class _OneModel:
     def advance(self, k: int, _until: float) -> tuple[int, np.ndarray]:
         """Integrate over one output interval."""
         t, h = float(self.grid[k]), float(self.grid[k + 1] - self.grid[k])
-        gg, at, fine = self.apu.gas_generator, self.ss.x.index("theta_e"), self.load.fineness
+        gg, at, fine = self.apu.gas_generator, self.ss.x.index("theta_e"), self.now.load.fineness
         self.u[-1] = h
         how = self.how | {n: fine * self.how[n] for n in ("rtol", "atol")}
         x0 = np.concatenate([self.x, np.zeros(1 + len(self.quad))])
@@ -299,7 +284,7 @@ class _OneModel:
             Wf=self.apu.link.fuel(N, self.x[1 : self._first].tolist()).Wf,
             PW=float(self.y[gg.Y.index("PW")]),
             ambient=dataclasses.asdict(self.ambient),
-            health=self.factors,
+            health=self.now.factors,
         )
         last = validity.before(gg, self.grid[k], self.y)
         return SimulationError(f"at t = {self.grid[k + 1]:.6g} s: {more or f'{error}; {last}'}")

@@ -11,9 +11,19 @@ The paper's exchange holds the speed that the machine sees, and the fuel, at the
 beginning of the step: half a step late on average, hence an error of first order in the step
 (docs/MULTIRATE.md).  ``exchange="predicted"`` lets the machine's speed go on with its last slope,
 and holds the fuel that the governor would give at mid-step; the error is then of second order at
-about the same price, and no staircase of speed excites the voltage regulator.  ``"corrected"``
-computes each step a second time with the slope that the first gave; it errs less, at twice the
-machine's price.
+about the same price, and no staircase of speed excites the voltage regulator.  The step after an
+event is computed twice, since no slope is known there.  ``"corrected"`` computes each step a second
+time with the slope that the first gave; it errs less, at twice the machine's price.  ``"predicted
+speed"`` and ``"predicted fuel"`` do half of it, to tell the two errors apart.  Energy is handed
+over exactly in each.
+
+Phasors ``V_a_re``, ``V_a_im``, ... are rms values with the rotor angle as reference,
+v_a = sqrt(2) Re(V_a exp(j theta_e)), by least squares over the step.
+
+Results are in memory; or, with a folder as ``storage``, in a temporary file in it that vanishes
+with the dataset, whose values are read when they are asked for, each time anew; ``"auto"`` takes
+memory up to :data:`~apu_casadi.core.runstorage.IN_MEMORY` bytes, beyond that a file in the
+system's folder of temporary files where there is room.
 """
 
 from __future__ import annotations
@@ -97,61 +107,38 @@ def simulate_joint(
     storage: str | os.PathLike[str] = "auto",
     warn_exchange: bool = True,
 ) -> xr.Dataset:
-    """Simulate gas generator, two generators and governor together.
+    """Simulate gas generator, two generators and governor together, from a steady start.
 
-    The run starts in steady state, so nothing moves before the first event.  A fault or an
-    unbalanced load given for the start acts from t = 0 on the steady healthy, balanced unit.
+    Nothing moves before the first event.  A fault or an unbalanced load given for the start acts
+    from t = 0 on the steady healthy, balanced unit.
 
     Args:
-        apu: the unit.
-        duration: s.
-        load: of each generator, from t = 0.
-        ambient: altitude, Mach, ISA deviation, humidity; the default day where nothing is given
-            (:mod:`apu_casadi.gaspath.conditions`).
-        health: factors by name that hold from the start (trimmed with them).
-        fault: stator fault from the start, None: healthy.
+        apu, load, fault: the unit; load and fault of each generator from the start.
+        duration, dt: of the run, and exchange step, s.
+        ambient, health: day (the default one if not given), and factors by name.
         events: :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`.
-        dt: exchange step, s.
-        exchange: ``"paper"``: eqs. (1)-(2) as printed, speed and fuel from the beginning of the
-            step; ``"predicted"``: the speed as a ramp with the slope of the last step, the fuel of
-            mid-step, second order.  The step after an event is then computed twice, since no slope
-            is known there.  ``"corrected"``: every step twice.  (``"predicted speed"`` and
-            ``"predicted fuel"`` do half of it, to tell the two errors apart.)  Energy is handed
-            over exactly in each.
+        exchange: one of ``EXCHANGES``, see the module's text.
         waveform_dt: sampling of the stored waveforms, s; None stores none.
-        phasors: whether to store, for each exchange step, the fundamental phasors of the phase
-            voltages and currents: ``V_a_re``, ``V_a_im``, ..., rms values with the rotor angle as
-            reference, v_a = sqrt(2) Re(V_a exp(j theta_e)); least squares over the step.
+        phasors: store fundamental phasors of voltages and currents of each exchange step, too.
         noise, seed: uncertainty and the seed of its random numbers.
         hook: processes the rotor speed between state update and output (Algorithm 2).
-        solver, rtol, atol: integrator of the generators and its tolerances: ``"auto"``, exact
-            propagation where it holds (a hundred times faster than real time with a C compiler) and
-            CVODES elsewhere, also called ``"propagator"``; ``"cvodes"``; ``"idas"``.
-        progress: called with (done, total) seconds after every exchange step.
+        solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
+        progress: called with (done, total) seconds.
         attrs: more attributes for the dataset.
-        storage: where the results are: ``"memory"``; a folder, for a temporary file in it that
-            vanishes with the dataset, whose values are then read when they are asked for, each time
-            anew; ``"auto"``: in memory up to :data:`~apu_casadi.core.runstorage.IN_MEMORY` bytes,
-            beyond that in a file of the system's folder of temporary files where there is room.
-        warn_exchange: whether an estimated exchange error beyond 1 % of the speed's excursion is
-            warned of; the paper's exchange with steps up to its own 20 ms is not, see
-            :mod:`apu_casadi.unit.validity`.
+        storage: ``"memory"``, a folder for a temporary file, or ``"auto"``; the module's text.
+        warn_exchange: whether an exchange error beyond 1 % of the speed's excursion is warned of.
 
     Returns:
-        xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms); see
-        :mod:`apu_casadi.core.results`.  Attributes tell what was asked
-        (:mod:`apu_casadi.unit.runrecord`), the estimated ``exchange_error`` (NaN with state noise
-        or a hook), where the run left the limits of the trim (``validity``), and all ``warnings``.
+        xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms), see
+        :mod:`apu_casadi.core.results`.  Attributes: what was asked, ``exchange_error`` (NaN with
+        state noise or a hook), ``validity`` and ``warnings``.
 
     Warns:
-        ValidityWarning: the run left the limits of the trim, or ended with too little fuel.
-        ExchangeWarning: the estimated exchange error is beyond 1 % of the speed's excursion.
+        ValidityWarning, ExchangeWarning: see :mod:`apu_casadi.unit.validity`.
 
     Raises:
-        ScenarioError: impossible times or events.
-        DataError: ``storage`` is a folder without room for the file.
-        OperatingPointError: no steady start.
-        SimulationError: an integration or a cycle solution failed; says when and why.
+        ScenarioError, DataError: impossible times or events; no room in the ``storage`` folder.
+        OperatingPointError, SimulationError: no steady start; a step failed: when and why.
     """
     noise = Noise() if noise is None else noise
     duration = number("duration", duration, error=ScenarioError)

@@ -82,6 +82,8 @@ class Recorder:
         self._first = self._end = 0  # instants in the arrays
         self._first_w = self._n = 0  # samples before those in the arrays, and in them
         self._residual = 0.0
+        self._factors: Mapping[str, float] | None = None
+        self._fault: Fault | None = None
         self.file: RowFile | None = None
         where = place(size, storage)
         if where is None:
@@ -98,8 +100,8 @@ class Recorder:
     def _allocate(self, steps: int, samples: int) -> None:
         self.Y = np.zeros((len(self.gg.Y), steps))
         self.means = np.zeros((len(self._means.kept), steps))
-        self.factors = np.empty((len(self.gg.THETA), steps))
-        self.severity = np.empty((len(self.severities), steps))
+        # health and severity
+        self.held = np.empty((len(self.gg.THETA) + len(self.severities), steps))
         self.t_w = np.empty(samples)
         self.waves = np.empty((len(WAVEFORMS), samples))
 
@@ -111,8 +113,11 @@ class Recorder:
             self._later(at.start, row.means)
         else:
             self.means[:, at] = row.means.reshape(-1, n)
-        self.factors[:, at] = np.array(tuple(row.factors.values()))[:, None]
-        self.severity[:, at] = np.array(_now(self.severities, row.fault))[:, None]
+        if row.factors is not self._factors or row.fault is not self._fault:
+            self._factors, self._fault = row.factors, row.fault
+            now = (*row.factors.values(), *_now(self.severities, row.fault))
+            self._column = np.array(now)[:, None]
+        self.held[:, at] = self._column
         if self.t_w.size:
             self._put_waves(row.t, row.w)
 
@@ -155,7 +160,7 @@ class Recorder:
         n = self._end - self._first
         part = copy.copy(self)
         part.Y, part.means = self.Y[:, :n], self.means[:, :n]
-        part.factors, part.severity = self.factors[:, :n], self.severity[:, :n]
+        part.held = self.held[:, :n]
         for name, row in part._rows().items():
             self.file.write(name, self._first, row)
         self._residual = self.residual_max()
@@ -203,8 +208,8 @@ class Recorder:
     def _slow(self) -> dict[str, np.ndarray]:
         """Means, rms values, phasors, health and severity by name."""
         d = dict(zip(self._means.kept, self.means, strict=True))
-        d |= dict(zip(self.gg.THETA.names, self.factors, strict=True))
-        return d | dict(zip(self.severities.names, self.severity, strict=True))
+        names = (*self.gg.THETA.names, *self.severities.names)
+        return d | dict(zip(names, self.held, strict=True))
 
     def collect(
         self,

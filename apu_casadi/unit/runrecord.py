@@ -48,18 +48,13 @@ def asked(
     faults += [(e.t, e.fault) for e in events if isinstance(e, FaultChange)]
     return {
         "ambient": json.dumps(dataclasses.asdict(ambient)),
-        "loads": json.dumps(
-            [{"t": t, "load": load_words(x), **_fields(x)} for t, x in loads]
-        ),
-        "faults": json.dumps(
-            [{"t": t, **({"phase": None} if f is None else _fields(f))}
-             for t, f in faults]
-        ),
+        "loads": json.dumps([{"t": t, "load": load_words(x), **_fields(x)} for t, x in loads]),
+        "faults": json.dumps([{"t": t, **_fields(f)} for t, f in faults]),
         "seed": "none" if seed is None else seed,
         "apu_casadi_version": installed(),
-    }  # fmt: skip
+    }
 
 
 def _fields(part: Any) -> dict[str, Any]:
-    """Return the fields of a load or fault, which are dataclasses."""
-    return dataclasses.asdict(part)
+    """Return the fields of a load or fault, both dataclasses; "phase" alone without a fault."""
+    return {"phase": None} if part is None else dataclasses.asdict(part)

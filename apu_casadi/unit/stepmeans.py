@@ -40,11 +40,12 @@ class RawMeans(NamedTuple):
     t: Any
 
     @classmethod
-    def of(cls, quad: tuple[str, ...], symmetric: bool, means: np.ndarray, h: float, w_r: float,
-           t: Any) -> RawMeans:  # fmt: skip
+    def of(
+        cls, quad: tuple[str, ...], sym: bool, means: np.ndarray, h: float, w_r: float, t: Any
+    ) -> RawMeans:
         """Copy the means of steps of length h that end at t, s."""
         values = means.reshape(len(quad), -1).copy()
-        return cls(quad, symmetric, values, h * w_r / (2 * math.pi), w_r, t)
+        return cls(quad, sym, values, h * w_r / (2 * math.pi), w_r, t)
 
 
 class StepMeans:

@@ -32,10 +32,12 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ApuWarning, ExchangeWarning, OperatingPointError, ValidityWarning
+from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.control import Governor
 from apu_casadi.unit.events import Event, LoadChange
 
 if TYPE_CHECKING:
@@ -281,14 +283,8 @@ class _Rotor:
 
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:
         """Rates of (n, x) and demand under the unlimited governor: factors of n, x, d and 1."""
-        law, m = self.link.governor, self.state.size
-        s = ca.SX.sym("s", m)
-        e = (self.link.N_ref - self.N_0 - s[0]) / self.link.N_ref
-        x = ca.vertsplit(s[1:])
-        own = ca.vertcat(law.demand(e, x), *law.rates(e, x, 0.0))
-        value, slope = (
-            v.full() for v in ca.Function("own", [s], [own, ca.jacobian(own, s)])(self.state)
-        )
+        m, law = self.state.size, _law(self.link.governor)
+        value, slope = (v.full() for v in law(self.state, self.N_0, self.link.N_ref))
         rows = np.zeros((m, m + 2))
         rows[:, :m], rows[:, -1] = slope, value.ravel() - slope @ self.state
         M = np.zeros((m + 2, m + 2))
@@ -300,6 +296,8 @@ class _Rotor:
 
     def _move(self, h: float) -> np.ndarray:
         """Exact step of (n, x) over h, and the demand at its end: factors of n, x, d and 1."""
+        if h in self._moves:
+            return self._moves[h]
         M, m = self._matrix, self.state.size
         # scaled, Taylor's series, squared again; scipy's expm costs a hundred times as much
         halvings = max(0, math.ceil(math.log2(float(np.abs(M).sum(1).max()) * h)) + 2)
@@ -310,31 +308,34 @@ class _Rotor:
             E = E + term
         for _ in range(halvings):
             E = E @ E
-        return np.vstack([E[:m], self._demand @ E])
+        if len(self._moves) > 64:
+            self._moves.clear()
+        self._moves[h] = np.vstack([E[:m], self._demand @ E])
+        return self._moves[h]
 
     def drive(self, h: np.ndarray, d: np.ndarray, run: np.ndarray) -> None:
         """Go on over steps of lengths h by their disturbances; compare with the speeds of a run."""
         low, high = self.link.governor.Wf_min, self.link.governor.Wf_max
-        m, v = self.state.size, np.append(self.state, [0.0, 1.0])
+        m, v, speeds = self.state.size, np.append(self.state, [0.0, 1.0]), []
         now = float(self._demand @ v)
         steps = np.round(h, 12).tolist()  # equal but for rounding: one exponential
-        for step, dist, seen in zip(steps, d.tolist(), run.tolist(), strict=True):
-            if step not in self._moves:
-                if len(self._moves) > 64:
-                    self._moves.clear()
-                self._moves[step] = self._move(step)
+        last, move = math.nan, np.empty(0)
+        for step, dist in zip(steps, d.tolist(), strict=True):
+            if step != last:
+                last, move = step, self._move(step)
             v[m] = dist
-            after = self._moves[step] @ v
+            after = move.dot(v)
             then = float(after[m])
-            if low < min(now, then) and max(now, then) < high:
+            if low < now < high and low < then < high:
                 v[:m] = after[:m]
             else:
                 v[:m] = self._by_parts(v[:m], step, dist)
                 then = float(self._demand @ v)
-            now, n = then, float(v[0])
-            self.error = max(self.error, abs(seen - n))
-            self.excursion = max(self.excursion, abs(n))
+            now = then
+            speeds.append(float(v[0]))
         self.state = v[:m].copy()
+        self.error = max(self.error, float(np.abs(run - speeds).max()))
+        self.excursion = max(self.excursion, float(np.abs(speeds).max()))
 
     def _by_parts(self, state: np.ndarray, h: float, dist: float) -> np.ndarray:
         def rates(s: np.ndarray) -> np.ndarray:
@@ -348,6 +349,15 @@ class _Rotor:
             k2 = rates(state + h / parts * k1)
             state = state + h / parts / 2 * (k1 + k2)
         return state
+
+
+@once
+def _law(governor: Governor) -> ca.Function:
+    """(n and states, N_0, N_ref) -> demand and rates without limits, and their derivatives."""
+    s, N_0, N_ref = (ca.SX.sym(k, n) for k, n in (("s", 1 + len(governor.X)), ("N", 1), ("R", 1)))
+    e, x = (N_ref - N_0 - s[0]) / N_ref, ca.vertsplit(s[1:])
+    own = ca.vertcat(governor.demand(e, x), *governor.rates(e, x, 0.0))
+    return ca.Function("law", [s, N_0, N_ref], [own, ca.jacobian(own, s)])
 
 
 def _slopes(gg: GasGenerator, point: OperatingPoint) -> tuple[float, float]:

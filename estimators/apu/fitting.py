@@ -26,6 +26,7 @@ from apu_casadi.core.sharing import kept, once
 from apu_casadi.core.simulation import stepper
 from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.exchange import moved
@@ -57,7 +58,6 @@ __all__ = [
     "words",
 ]
 
-HEALTH = GasGenerator.THETA.names
 OUTPUTS = GAS_PATH.outputs
 INPUTS = tuple(n for n in GAS_PATH.names if n not in OUTPUTS)
 OPEN = 10.0  # standard deviation of an input that is not measured, of its magnitude: tells nothing
@@ -456,13 +456,8 @@ def coverage(
     healths = _healths(seed0)
     truth = [(steady_truth if steady else transient_truth)(gg, th) for th in healths]
     averaged = READINGS if steady else 1
-    problem = FitProblem(
-        lifted,
-        [truth[0].t.size],
-        HEALTH,
-        consider=tuple(considered),
-        build=(not steady) if build is None else build,
-    )
+    build, size = (not steady) if build is None else build, [truth[0].t.size]
+    problem = FitProblem(lifted, size, HEALTH, consider=tuple(considered), build=build)
     error, sigma = np.full((n, 4), np.nan), np.full((n, 4), np.nan)
     chi2, freedom, failed = [], 0, 0
     for i in range(n):

@@ -284,6 +284,8 @@ def gas_path_filter(
     gg = GasGenerator() if gg is None else gg
     if missing := [n for n in ("Wf", "PW") if n not in sensors]:
         raise ParameterError(f"a gas-path filter takes {missing[0]} as an input: no sensor of it")
+    if late := [n for n in ("Wf", "PW") if sensors[n].tau]:
+        raise ParameterError(f"sensor {late[0]}: the lag of a measured input is not modelled")
     named = (sensors.uncertain if gains else ()) if isinstance(gains, bool) else tuple(gains)
     sigma = {"N": N_SIGMA} | dict.fromkeys(HEALTH, health_sigma)
     walks = {"N": N_WALK} | dict.fromkeys(HEALTH, HEALTH_WALK)

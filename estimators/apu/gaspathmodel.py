@@ -24,6 +24,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.sensors import GAS_PATH, Sensor
 from estimators.models.filtermodel import FilterModel
@@ -40,7 +41,6 @@ __all__ = [
 ]
 
 DT = 0.02  # s; step of the gas-path filter (paper, section 3.3)
-HEALTH = GasGenerator.THETA.names
 OUTPUTS = GAS_PATH.outputs
 GAINED = GAS_PATH.uncertain
 POWER = ("measured", "unknown")
@@ -197,8 +197,7 @@ def gas_path_model(
         sensors = model_sensors(gg, GAS_PATH.only(OUTPUTS).sensors)
     known = power == "measured"
     _check_gains(power, gains, consider, power_jumps, {s.name for s in sensors})
-    X = _states(gg, known, gains, sensors)
-    U, W = _inputs(gg, known, power_jumps)
+    X, (U, W) = _states(gg, known, gains, sensors), _inputs(gg, known, power_jumps)
     x, u, w = (ca.MX.sym(n, len(s)) for n, s in (("x", X), ("u", U), ("w", W)))
     p, dt = ca.MX.sym("p", 0), ca.MX.sym("dt")
     at, given, noise = (
@@ -216,9 +215,8 @@ def gas_path_model(
     before = ca.vertcat(*(at[n] for n in HEALTH))
     _, y, check_out, _ = engine(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), before)
     seen = {"N": N} | {n: y[i] for i, n in enumerate(reads)}
-    readings = [
-        (at[s.name] if s.tau else s.of(seen)) * (1 + at.get(f"gain_{s.name}", 0.0)) for s in sensors
-    ]
+    own = {s: at[s.name] if s.tau else s.of(seen) for s in sensors}
+    readings = [v * (1 + at.get(f"gain_{s.name}", 0.0)) for s, v in own.items()]
     # a jump happens at the beginning of the step, after the sample
     at |= {n: at[n] + given["jump"] * noise[f"w_{n}"] for n in HEALTH}
     if power_jumps:
@@ -234,11 +232,8 @@ def gas_path_model(
     x1 = at | {"N": N + dt * k2 / (1 + at.get("gain_J", 0.0))}
     amid = {"N": N + dt / 2 * k1} | {n: y_mid[i] for i, n in enumerate(reads)}
     x1 |= _lagged(sensors, amid, at, dt)
-    return FilterModel.of(
-        f"gas_path_{power}",
-        (X, U, Signals(), W, Signals([s.signal for s in sensors])),
-        (x, u, p, w, dt),
-        (ca.vertcat(*x1.values()), check + check_mid),
-        (ca.vertcat(*readings), check_out),
-        consider=consider,
-    ).with_walk(dict(walks))
+    signals = X, U, Signals(), W, Signals([s.signal for s in sensors])
+    step = ca.vertcat(*x1.values()), check + check_mid
+    output, name = (ca.vertcat(*readings), check_out), f"gas_path_{power}"
+    made = FilterModel.of(name, signals, (x, u, p, w, dt), step, output, consider=consider)
+    return made.with_walk(dict(walks))

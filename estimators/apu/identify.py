@@ -14,22 +14,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
-from apu_casadi.core.measuring import measure
 from apu_casadi.core.sharing import last
 from apu_casadi.core.signals import Signal, Signals
-from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu.sensors import GAS_PATH, SensorSet
 from estimators.filters.belief import Belief
-from estimators.information import consistency
 from estimators.information.identifiability import Identifiability, identify
 from estimators.information.sensitivities import (
     Sensitivities,
@@ -46,7 +43,6 @@ __all__ = [
     "BASE",
     "CANDIDATES",
     "POINTS",
-    "Trials",
     "findings",
     "gas_path",
     "gas_path_transient",
@@ -55,7 +51,7 @@ __all__ = [
     "needed_samples",
     "shaft_power_snapshot",
     "snapshot_sweep",
-    "snapshot_trials",
+    "steady_point",
 ]
 
 #: Steady points by name: shaft power, W, and ambient conditions, those of the default day where
@@ -87,7 +83,8 @@ POWER_NOISES = (0.0025, 0.005, 0.01, 0.02, 0.05)
 
 
 @last(16)
-def _steady(point: str, gg: GasGenerator) -> OperatingPoint:
+def steady_point(point: str, gg: GasGenerator) -> OperatingPoint:
+    """Return a point of :data:`POINTS`."""
     if point not in POINTS:
         raise ParameterError(f"unknown point {point!r} {nearest(point, POINTS)}")
     conditions: dict[str, Any] = dict(POINTS[point])
@@ -97,7 +94,7 @@ def _steady(point: str, gg: GasGenerator) -> OperatingPoint:
 @last(16)
 def _derivatives(point: str, gg: GasGenerator) -> tuple[OperatingPoint, np.ndarray, np.ndarray]:
     """Return the point, dy/d unknown of every output and dPW/d unknown, own units."""
-    at = _steady(point, gg)
+    at = steady_point(point, gg)
     _, y, xdot_w, y_w, _ = (a.full() for a in gg.cycle.sensitivities(at.x, at.z, at.u, at.theta))
     off = float(np.abs(y[:, 0] - [at[n] for n in gg.Y.names]).max())
     if not off < 1e-3:  # own units, mostly Pa and W: rounding of the root finder
@@ -430,177 +427,6 @@ def needed_samples(aim: float, point: str = "design", **options: Any) -> int | N
         middle = (low + high) // 2
         low, high = (low, middle) if reached(middle) else (middle + 1, high)
     return low
-
-
-@dataclass(frozen=True)
-class Trials:
-    """Maximum a posteriori estimates from random snapshots, without and with shaft power.
-
-    Args:
-        seeds: number of snapshots.
-        rms_before, rms_after: rms error of the four health factors, without and with PW.
-        bound_before, bound_after: what the bound says of them.
-        reduction: of the rms error by PW.
-        interval: 95 % interval of the reduction over the seeds (bootstrap of 2000).
-        nees: mean normalised estimation error squared of the four factors over 4, with PW; 1
-            ideally.
-        nees_band: its 95 % band if the claimed covariances are right.
-        null_before, null_after: rms error along the null direction.
-    """
-
-    seeds: int
-    rms_before: float
-    rms_after: float
-    bound_before: float
-    bound_after: float
-    reduction: float
-    interval: tuple[float, float]
-    nees: float
-    nees_band: tuple[float, float]
-    null_before: float
-    null_after: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Reader:
-    """The nonlinear steady readings of (N, Wf, health) about a point, with exact derivatives."""
-
-    gg: GasGenerator
-    at: OperatingPoint
-
-    def __call__(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return all outputs (ny,) and their derivatives (ny, 6) along steady states."""
-        gg, U = self.gg, self.gg.U
-        x, u, theta = v[:1], self.at.u.copy(), v[2:]
-        u[U.index("Wf")] = v[1]
-        z = gg.solve(self.at.z, x, u, theta)
-        # cycle equations do not contain PW: the balance gives it from the rate at any other
-        ode, alg, _ = gg.equations(x, z, u, theta)
-        u[U.index("PW")] += float(ode) * gg.parameters.J * float(v[0])
-        worst = float(ca.norm_inf(alg))
-        if not worst < RESIDUAL_TOL:
-            raise EstimationError(
-                f"no steady readings at health {np.round(theta, 4)}: cycle residual {worst:.1e}, "
-                f"{RESIDUAL_TOL:.0e} allowed; the draw left the maps"
-            )
-        _, y, xdot_w, y_w, _ = (a.full() for a in gg.cycle.sensitivities(x, z, u, theta))
-        w = gg.X + gg.U + gg.THETA
-        H, _ = steady_sensitivities(
-            xdot_w, y_w, w, unknown=["N", "Wf", *gg.THETA.names], solved=["PW"]
-        )
-        return y[:, 0], H
-
-
-def snapshot_trials(
-    point: str = "design",
-    *,
-    seeds: Sequence[int] = range(10_000, 10_500),
-    prior: float = PRIOR,
-    power_noise: float = GAS_PATH["PW"].noise,
-    eta_bias: float = 0.0,
-    samples: int = SAMPLES,
-    gas_generator: GasGenerator | None = None,
-) -> Trials:
-    """Estimate the health factors from random snapshots of the nonlinear engine.
-
-    Health drawn from the prior, noise and efficiency bias from their distributions; the estimate is
-    the most probable one (Gauss-Newton on the exact equations).  It shows whether the bounds of
-    :func:`shaft_power_snapshot`, which are first order, are what an estimator gets.
-
-    Raises:
-        EstimationError: a draw has no steady readings, or the iteration does not converge.
-    """
-    gg = gas_generator or _DEFAULT
-    at = _steady(point, gg)
-    read = _Reader(gg, at)
-    rows = gg.Y.indices(GAS_PATH.names)
-    g = gas_path(
-        point,
-        sensors=GAS_PATH,
-        samples=samples,
-        prior=prior,
-        power_noise=power_noise,
-        eta_bias=eta_bias,
-        gas_generator=gas_generator,
-    )
-    nominal = np.array([at[n] for n in GAS_PATH.names])
-    sigma = np.array([GAS_PATH.sigma(n, v) for n, v in zip(GAS_PATH.names, nominal, strict=True)])
-    sigma /= math.sqrt(samples)
-    power = GAS_PATH.names.index("PW")
-    # considered: in the variance of the reading, where Schmidt's gain is the optimal one
-    bias = eta_bias * nominal[power]
-    sigma[power] = power_noise * nominal[power]
-    claimed = sigma.copy()
-    claimed[power] = math.hypot(sigma[power], bias)
-    start = np.array([at["N"], at["Wf"], 1.0, 1.0, 1.0, 1.0])
-    without = [i for i in range(len(rows)) if i != power]
-    errors: dict[str, list[np.ndarray]] = {"before": [], "after": []}
-    nees = []
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        true = start.copy()
-        true[2:] += prior * rng.standard_normal(4)
-        y = measure(read(true)[0][rows], sigma, rng)
-        y[power] += bias * rng.standard_normal()
-        for label, use in (("before", without), ("after", list(range(len(rows))))):
-            found, cov = _most_probable(
-                read, start, y[use], [rows[i] for i in use], claimed[use], prior
-            )
-            e = (found - true)[2:]
-            errors[label].append(e)
-        nees.append(float(e @ np.linalg.solve(cov[2:, 2:], e)) / 4)
-    before, after = np.array(errors["before"]), np.array(errors["after"])
-    null = np.array(
-        list(shaft_power_snapshot(point, samples=samples, prior=prior)["null"].values())
-    )
-
-    def rms(e: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(e**2)))
-
-    n = len(before)
-    pick = np.random.default_rng(0).integers(0, n, (2000, n))
-    square = np.array([(e**2).sum(1) for e in (before, after)])
-    drawn = 1 - np.sqrt(square[1][pick].sum(1) / square[0][pick].sum(1))
-    low, high = (float(q) for q in np.quantile(drawn, [0.025, 0.975]))
-    band = consistency.band(n, 4)
-    return Trials(
-        seeds=n,
-        rms_before=rms(before),
-        rms_after=rms(after),
-        bound_before=float(np.sqrt(np.trace(g.only(BASE).covariance()) / 4)),
-        bound_after=float(np.sqrt(np.trace(g.covariance()) / 4)),
-        reduction=1 - rms(after) / rms(before),
-        interval=(low, high),
-        nees=float(np.mean(nees)),
-        nees_band=(band[0] / 4, band[1] / 4),
-        null_before=rms(before @ null),
-        null_after=rms(after @ null),
-    )
-
-
-def _most_probable(
-    read: _Reader,
-    start: np.ndarray,
-    y: np.ndarray,
-    rows: Sequence[int],
-    sigma: np.ndarray,
-    prior: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the most probable (N, Wf, health) and its covariance, by Gauss-Newton."""
-    v = start.copy()
-    weights = np.array([0.0, 0.0, *[1 / prior] * 4])
-    for _ in range(20):
-        h, H = read(v)
-        A = np.vstack([H[rows] / sigma[:, None], np.diag(weights)]) * start
-        r = np.concatenate([(y - h[rows]) / sigma, weights * (start - v)])
-        step = start * np.linalg.lstsq(A, r, rcond=None)[0]
-        v = v + step
-        if np.abs(step / start).max() < 1e-8:
-            return v, np.asarray(np.linalg.inv(A.T @ A) * np.outer(start, start))
-    raise EstimationError(
-        f"the most probable health was not found in 20 steps; last step "
-        f"{np.abs(step / start).max():.1e} of the nominal values"
-    )
 
 
 def findings(point: str, sensors: Sequence[str], **options: Any) -> Identifiability:

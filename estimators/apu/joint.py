@@ -34,6 +34,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
@@ -41,7 +42,7 @@ from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples, window_means
-from estimators.apu.gaspathmodel import DT, HEALTH
+from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from estimators.filters.ekf import ekf_step

@@ -21,11 +21,12 @@ import numpy as np
 from apu_casadi.core.sharing import Parametric, kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.tracking import window_power
 from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples
-from estimators.apu.gaspathmodel import DT, GOVERNOR, HEALTH, engine_function
+from estimators.apu.gaspathmodel import DT, GOVERNOR, engine_function
 from estimators.apu.joint import better_speed, electrical_samples, speed_from_generators
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief

@@ -13,7 +13,8 @@ lists from the tables: :data:`GAS_PATH` and :data:`ELECTRICAL`, whose numbers al
 >>> GAS_PATH.add("P5").outputs
 ('N', 'P3', 'T3', 'T5', 'P5')
 
-A sensor of one's own is registered by one line, in a file of one's own (:func:`load_sensors`)::
+A sensor of one's own is registered by one line, in a module of one's own, which commands and
+scenarios load by ``--with`` and ``extensions`` (:mod:`scenarios.extensions`)::
 
     register(Sensor("dP", 0.005, True, 0.005, "Pa", "assumed", reads=("P3", "P5"),
                     value=lambda P3, P5: P3 - P5))
@@ -23,20 +24,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import runpy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apu_casadi.core.checked import number
-from apu_casadi.core.errors import ApuError, DataError, ParameterError, nearest
+from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.core.measuring import measure
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.park import PHASES
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "ELECTRICAL",
@@ -46,7 +48,6 @@ __all__ = [
     "Sensor",
     "SensorSet",
     "gas_path_table",
-    "load_sensors",
     "register",
     "respond",
     "unregister",
@@ -254,7 +255,7 @@ class SensorSet:
         out = {}
         for name, v in true.items():
             gain = (gains or {}).get(name, 0.0)
-            size = v if noise_of == "true" else (1.0 + gain) * v
+            size = v if noise_of == "true" or not gain else (1.0 + gain) * v
             sigma = self.sigma(name, size)
             out[name] = measure(v, sigma / math.sqrt(averaged), rng, gain=gain)
         return out
@@ -265,6 +266,24 @@ class SensorSet:
         """Draw the constant gain errors of some sensors (all by default), Gaussian."""
         names = self.names if names is None else names
         return {n: self[n].gain * float(rng.standard_normal()) for n in names}
+
+    def copies(
+        self, ds: xr.Dataset, seed: int | None, *, gains: Mapping[str, float] | None = None
+    ) -> xr.Dataset:
+        """Return a run with a measured copy ``<name>_meas`` for each sensor, on its ``time``.
+
+        Args:
+            ds: from :func:`apu_casadi.unit.multirate.simulate_joint`.
+            seed: of the noise; None for none.
+            gains: actual relative gain errors by sensor.
+        """
+        time = np.asarray(ds["time"].values, float)
+        there = {n: np.asarray(ds[n].values, float) for s in self.sensors for n in s.reads}
+        rng = None if seed is None else np.random.default_rng(seed)
+        read = self.measure(self.true(time, there), rng, gains=gains)
+        docs = {n: f"measured: {self[n].signal.doc}" for n in read}
+        told = {n: {"units": self[n].unit, "long_name": docs[n]} for n in read}
+        return ds.assign({f"{n}_meas": ("time", v, told[n]) for n, v in read.items()})
 
 
 def respond(t: np.ndarray, v: np.ndarray, tau: float) -> np.ndarray:
@@ -363,22 +382,3 @@ def unregister(name: str) -> None:
 def gas_path_table() -> SensorSet:
     """Return the gas-path sensors that commands use: :data:`GAS_PATH` and what was registered."""
     return GAS_PATH.add(*_registered.values())
-
-
-def load_sensors(path: str | Path) -> tuple[str, ...]:
-    """Run a Python file that registers sensors; returns their names.
-
-    Raises:
-        DataError: the file cannot be read or run, or registers nothing.
-    """
-    before = dict(_registered)
-    try:
-        runpy.run_path(str(path))
-    except ApuError:
-        raise
-    except Exception as e:
-        raise DataError(f"{path}: no sensors could be read: {type(e).__name__}: {e}") from None
-    new = tuple(n for n, s in _registered.items() if before.get(n) is not s)
-    if not new:
-        raise DataError(f"{path} registers no sensor: register(Sensor(...)) is expected")
-    return new

@@ -30,7 +30,7 @@ from estimators.filters.algebra import root_of
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.rootfilter import root_functions
-from estimators.filters.stepparts import kind_of
+from estimators.filters.stepparts import kind_of, linearisation
 from estimators.models.filtermodel import FilterModel
 from estimators.models.lifting import Lifted, plain
 from estimators.models.recording import Recording
@@ -69,11 +69,8 @@ def _along(model: FilterModel) -> ca.Function:
     m, L, at, w, u, p, y, R, dt = args
     update, predict = root_functions(model, ())
     point, mean = ca.vertcat(at, w), ca.vertcat(m, kind.zeros(nw))
-    s = kind.sym("s", nx + nw)
-    h, _ = model.output(s[:nx], u, p, s[nx:])
-    x1, _ = model.transition(s[:nx], u, p, s[nx:], dt)
-    line = ca.Function("line", [s, u, p, dt], [h, ca.jacobian(h, s), x1, ca.jacobian(x1, s)])
-    h0, H, f0, F = line(point, u, p, dt)
+    outputs, forecast = linearisation(model, kind, u, p, dt)
+    (h0, H, _), (f0, F, _) = outputs(point, u, p), forecast(point, u, p, dt)
     nu = y - h0 + H @ (point - mean)
     d, La, S, nis, loglik, measured = update(ca.tril(L), H, nu, R)
     m1 = f0 + F @ (mean + d - point)

@@ -24,7 +24,7 @@ from estimators.batch.smoother import rts_smoother
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
 from estimators.filters.filtering import FilterResult
-from estimators.filters.stepparts import kind_of
+from estimators.filters.stepparts import kind_of, linearisation
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
@@ -44,12 +44,8 @@ def linearised(model: FilterModel) -> FilterModel:
     model = model.expanded()
     kind = kind_of(model)
     nx, nu, np_, nw, _ = model.sizes
-    s, u, p, dt = kind.sym("s", nx + nw), kind.sym("u", nu), kind.sym("p", np_), kind.sym("dt")
-    y, check_y = model.output(s[:nx], u, p, s[nx:])
-    x1, check_x = model.transition(s[:nx], u, p, s[nx:], dt)
-    outputs = ca.Function("outputs", [s, u, p], [y, ca.jacobian(y, s), check_y])
-    forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_x])
-
+    u, p, dt = kind.sym("u", nu), kind.sym("p", np_), kind.sym("dt")
+    outputs, forecast = linearisation(model, kind, u, p, dt)
     x, w, given = kind.sym("x", nx), kind.sym("w", nw), kind.sym("u", nu + nx)
     at = ca.vertcat(given[nu:], kind.zeros(nw))
     beside = ca.vertcat(x - given[nu:], w)

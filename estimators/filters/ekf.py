@@ -32,7 +32,14 @@ from estimators.filters.algebra import backward, cholesky, forward, symmetric
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
 from estimators.filters.rootfilter import ekf_root_step
-from estimators.filters.stepparts import kind_of, projected, step_symbols
+from estimators.filters.stepparts import (
+    iterated_update,
+    kind_of,
+    linearisation,
+    projected,
+    step_symbols,
+    suffix,
+)
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
@@ -142,41 +149,26 @@ def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> 
     prior = ca.vertcat(m, kind.zeros(nw))
     Pa = ca.diagcat(P, kind.eye(nw)) if nw else P
 
-    s = kind.sym("s", nx + nw)
-    h, check_h = model.output(s[:nx], u, p, s[nx:])
-    outputs = ca.Function("outputs", [s, u, p], [h, ca.jacobian(h, s), check_h])
-    x1, check_f = model.transition(s[:nx], u, p, s[nx:], dt)
-    forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_f])
+    outputs, forecast = linearisation(model, kind, u, p, dt)
 
-    at, check, first = prior, kind(0), None
-    done = moved = None
-    for _ in range(iterations):
-        h, H, c = outputs(at, u, p)
-        # linearised at the iterate, but always an update of the prior
-        done = correct(Pa, H, y - h + H @ (at - prior), R, fixed)
-        if first is None:
-            first = done, y - h
-        moved, check = prior + done.d, check + c
-        at = moved if iterated == "all" else ca.vertcat(m, moved[nx:])
-    assert done is not None and first is not None
+    def update(H: Any, e: Any) -> Corrected:
+        return correct(Pa, H, e, R, fixed)
+
+    found = iterated_update(outputs, update, prior, (u, p, y), nx, iterations, iterated)
+    moved, check, nu, first, done = found
     at = projected(moved, done.P, model.lower, model.upper, fixed)
     x1, F, c = forecast(at, u, p, dt)
     C = done.P[:nx, :] @ F.T
     P1 = ca.mtimes(F, done.P @ F.T) + ca.diag(ca.DM(model.walk**2)) * dt
     P1 = ca.tril(P1) + ca.tril(P1, False).T  # half the work, exactly symmetric
-    nu = ca.if_else(R >= 0, first[1], 0)
-    stats = ca.vertcat(check + c, first[0].nis, first[0].loglik, first[0].measured)
-    out = [x1, P1, at[:nx], done.P[:nx, :nx], C, nu, first[0].S, stats]
+    nu = ca.if_else(R >= 0, nu, 0)
+    stats = ca.vertcat(check + c, first.nis, first.loglik, first.measured)
+    out = [x1, P1, at[:nx], done.P[:nx, :nx], C, nu, first.S, stats]
     out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
-    kept = "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"
-    name = f"ekf{kept}_{model.name}"
+    name = f"ekf{suffix(iterations, iterated)}_{model.name}"
     function = ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT)
-    return FilterStep(model, function, wide=partial(_with_roots, model, iterations, iterated))
-
-
-def _with_roots(model: FilterModel, iterations: int, iterated: str) -> FilterStep:
-    """The same filter in square-root form; made only where it is needed."""
-    return ekf_root_step(model, iterations, iterated)
+    wide = partial(ekf_root_step, model, iterations, iterated)
+    return FilterStep(model, function, wide=wide)
 
 
 def extended_kalman_filter(

@@ -24,7 +24,14 @@ import casadi as ca
 from apu_casadi.core.sharing import kept, once
 from estimators.filters.algebra import graded_lower, root_update, without_gain
 from estimators.filters.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterStep
-from estimators.filters.stepparts import kind_of, projected, step_symbols
+from estimators.filters.stepparts import (
+    iterated_update,
+    kind_of,
+    linearisation,
+    projected,
+    step_symbols,
+    suffix,
+)
 from estimators.models.filtermodel import FilterModel
 
 __all__ = ["ekf_root_step", "root_functions"]
@@ -88,33 +95,19 @@ def ekf_root_step(model: FilterModel, iterations: int = 1, iterated: str = "all"
     low = ca.tril(L)
     prior = ca.vertcat(m, kind.zeros(nw))
 
-    s = kind.sym("s", nx + nw)
-    h, check_h = model.output(s[:nx], u, p, s[nx:])
-    outputs = ca.Function("outputs", [s, u, p], [h, ca.jacobian(h, s), check_h])
-    x1, check_f = model.transition(s[:nx], u, p, s[nx:], dt)
-    forecast = ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_f])
-
-    at, check, first, moved, La = prior, kind(0), None, prior, None
-    for _ in range(iterations):
-        h, H, c = outputs(at, u, p)
-        # linearised at the iterate, but always an update of the prior
-        d, La, S, nis, loglik, measured = update(low, H, y - h + H @ (at - prior), R)
-        if first is None:
-            first = S, nis, loglik, measured, ca.if_else(R >= 0, y - h, 0)
-        moved, check = prior + d, check + c
-        at = moved if iterated == "all" else ca.vertcat(m, moved[nx:])
-    assert first is not None and La is not None
+    outputs, forecast = linearisation(model, kind, u, p, dt)
+    moved, check, nu, first, (_, La, *_) = iterated_update(
+        outputs, lambda H, e: update(low, H, e, R), prior, (u, p, y), nx, iterations, iterated
+    )
     own = La[:nx, :nx]
     P_f = ca.mtimes(own, own.T)
     at = projected(moved, ca.mtimes(La, La[:nx, :].T), model.lower, model.upper, fixed)
     x1, F, c = forecast(at, u, p, dt)
     L1, C, Y, Z = predict(La, F, dt)
-    S, nis, loglik, measured, nu = first
+    _, _, S, nis, loglik, measured = first
     stats = ca.vertcat(check + c, nis, loglik, measured)
-    out = [x1, L1, at[:nx], P_f, C, nu, S, stats, Y, Z, own]
+    out = [x1, L1, at[:nx], P_f, C, ca.if_else(R >= 0, nu, 0), S, stats, Y, Z, own]
     out = [ca.densify(o) for o in (ca.cse(out) if kind is ca.SX else out)]
-    kept = "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"
-    function = ca.Function(
-        f"ekf{kept}_root_{model.name}", [m, L, u, p, y, R, dt], out, STEP_IN, STEP_OUT + ROOT_OUT
-    )
+    name = f"ekf{suffix(iterations, iterated)}_root_{model.name}"
+    function = ca.Function(name, [m, L, u, p, y, R, dt], out, STEP_IN, STEP_OUT + ROOT_OUT)
     return FilterStep(model, function, root=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -10,7 +11,16 @@ import numpy as np
 from estimators.filters.filtering import STEP_IN
 from estimators.models.filtermodel import FilterModel
 
-__all__ = ["kind_of", "projected", "step_symbols"]
+__all__ = [
+    "iterated_update",
+    "kind_of",
+    "linearisation",
+    "projected",
+    "step_symbols",
+    "suffix",
+]
+
+T = TypeVar("T", bound=tuple[Any, ...])
 
 
 def projected(
@@ -55,3 +65,58 @@ def step_symbols(model: FilterModel, kind: Any) -> list[Any]:
     nx, nu, np_, _, ny = model.sizes
     shapes = [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)]
     return [kind.sym(n, *s) for n, s in zip(STEP_IN, shapes, strict=True)]
+
+
+def linearisation(
+    model: FilterModel, kind: Any, u: Any, p: Any, dt: Any
+) -> tuple[ca.Function, ca.Function]:
+    """Return the functions (s, u, p) -> (y, dy/ds, check) and (s, u, p, dt) -> (x1, dx1/ds, check).
+
+    s is the state with the noise w below it; u, p, dt are symbols.
+    """
+    nx, _, _, nw, _ = model.sizes
+    s = kind.sym("s", nx + nw)
+    y, check_y = model.output(s[:nx], u, p, s[nx:])
+    x1, check_x = model.transition(s[:nx], u, p, s[nx:], dt)
+    return (
+        ca.Function("outputs", [s, u, p], [y, ca.jacobian(y, s), check_y]),
+        ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_x]),
+    )
+
+
+def iterated_update(
+    outputs: ca.Function,
+    update: Callable[[Any, Any], T],
+    prior: Any,
+    given: tuple[Any, Any, Any],
+    nx: int,
+    iterations: int,
+    iterated: str,
+) -> tuple[Any, Any, Any, T, T]:
+    """Correct a mean by Gauss-Newton: linearised at the iterate, but always an update of the prior.
+
+    Args:
+        outputs: of :func:`linearisation`.
+        update: (H, innovation) -> the update, whose first part is the change of the mean.
+        prior: state and noise before the sample.
+        given: u, p, y.
+        nx: number of states.
+        iterations, iterated: see :func:`~estimators.filters.ekf.ekf_step`.
+
+    Returns:
+        The corrected mean, the sum of the checks, the innovation, the first and the last update.
+    """
+    u, p, y = given
+    at, check, nu, done = prior, type(prior)(0), None, []
+    for _ in range(iterations):
+        h, H, c = outputs(at, u, p)
+        done.append(update(H, y - h + H @ (at - prior)))
+        nu = y - h if nu is None else nu
+        moved, check = prior + done[-1][0], check + c
+        at = moved if iterated == "all" else ca.vertcat(prior[:nx], moved[nx:])
+    return moved, check, nu, done[0], done[-1]
+
+
+def suffix(iterations: int, iterated: str) -> str:
+    """Return what the name of an iterated filter's function ends with."""
+    return "" if iterations == 1 else f"{iterations}{'w' if iterated == 'noise' else ''}"

@@ -292,13 +292,15 @@ def _split(equations: ca.Function) -> tuple[ca.Function, ca.Function]:
         or not all(o.which_output() == i for i, o in enumerate(out) if o.is_output())
     ):
         return whole
-    parts = [inner.size1_in(i) for i in range(4, n)]
-    k = ca.SX.sym("k", sum(parts))
+    more = [call.dep(i) for i in range(4, n)]
+    found = [d for d in more if not d.is_constant()]  # the numbers of a unit are no part of k
+    k = ca.SX.sym("k", sum(d.size1() for d in found))
     given = [ca.SX.sym("q", m) for m in sizes]
-    pieces = ca.vertsplit(k, [0, *np.cumsum(parts).tolist()])
+    pieces = iter(ca.vertsplit(k, [0, *np.cumsum([d.size1() for d in found]).tolist()]))
+    rest = [ca.SX(d.to_DM()) if d.is_constant() else next(pieces) for d in more]
     return (
-        ca.Function("smooth", [*given, k], inner.call([*given, *pieces], True, False)),
-        ca.Function("cells", args, [ca.vertcat(*(call.dep(i) for i in range(4, n)))]),
+        ca.Function("smooth", [*given, k], inner.call([*given, *rest], True, False)),
+        ca.Function("cells", args, [ca.vertcat(*found)]),
     )
 
 

@@ -133,8 +133,9 @@ def python(code: str, stdin: str | None = None, **env: str) -> str:
         SimulationError: it failed.
     """
     how: dict[str, Any] = {"capture_output": True, "text": True, "check": False, "timeout": 1800}
-    env_ = {**os.environ, **env}
-    done = subprocess.run([sys.executable, "-c", code], input=stdin, env=env_, **how)
+    how["env"] = {**os.environ, **env}
+    command = [sys.executable, "-c", code]
+    done: subprocess.CompletedProcess[str] = subprocess.run(command, input=stdin, **how)
     if done.returncode:
         raise SimulationError(f"a process of the benchmark failed: {done.stderr.strip()[-500:]}")
     return done.stdout

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.identify import Trials
     from estimators.apu.severity import Severity
+    from estimators.apu.trials import Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
@@ -132,6 +132,7 @@ class Found:
 def _found(args: argparse.Namespace) -> Found:
     from estimators.apu import identify as study
     from estimators.apu.severity import severity_study
+    from estimators.apu.trials import snapshot_trials
     from estimators.information.identifiability import identify
 
     first, prior = given.names(args.point)[0], args.prior / 100
@@ -147,7 +148,7 @@ def _found(args: argparse.Namespace) -> Found:
     if args.trials:
         progress.tell(f"estimating from {args.trials} snapshots, several times", quiet=args.json)
         for n in study.AIMS:
-            trials[n] = study.snapshot_trials(first, seeds=seeds, **options, **variants[n])
+            trials[n] = snapshot_trials(first, seeds=seeds, **options, **variants[n])
     ramp = None
     if args.transient:
         powers = {"without PW": False, "with PW": True}

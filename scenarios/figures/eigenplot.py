@@ -8,18 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import (
-    INK,
-    LINE_INK,
-    MARKS,
-    MUTED,
-    PATCH,
-    caption,
-    drawing,
-    new_figure,
-    remark,
-    title,
-)
+from scenarios.figures import figstyle as fs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,12 +33,12 @@ def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figur
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter
 
-    if not 1 <= len(models) <= len(MARKS):
-        raise SignalError(f"one to {len(MARKS)} models can be drawn, got {len(models)}")
+    if not 1 <= len(models) <= len(fs.MARKS):
+        raise SignalError(f"one to {len(fs.MARKS)} models can be drawn, got {len(models)}")
     modes = {label: m.eigenvalues() for label, m in models.items()}
     values = np.array([e.value for es in modes.values() for e in es])
-    with drawing():
-        fig = new_figure(5.6)
+    with fs.drawing():
+        fig = fs.new_figure(5.6)
         ax = fig.add_axes((0.075, 0.19, 0.91, 0.735))
         ax.set_xscale("symlog", linthresh=_LINEAR, linscale=0.6)
         ax.set_yscale("symlog", linthresh=_LINEAR, linscale=0.6)
@@ -59,23 +48,24 @@ def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figur
         ax.set_xlim(-left, right)
         ax.set_ylim(-high, high)
         ax.axvspan(0, right, color="#fbe3e0", lw=0, zorder=0)
-        ax.axvline(0, color=INK, lw=1.0, zorder=1)
-        ax.axhline(0, color=MUTED, lw=0.8, zorder=1)
+        ax.axvline(0, color=fs.INK, lw=1.0, zorder=1)
+        ax.axhline(0, color=fs.MUTED, lw=0.8, zorder=1)
         decay = np.geomspace(1e-2, left, 300)
         for zeta in (0.1, 0.5, 0.9):
             w = decay * np.sqrt(1 / zeta**2 - 1)
             for sign in (1, -1):
-                ax.plot(-decay, sign * w, color=MUTED, lw=0.7, ls=(0, (3, 3)), zorder=1)
+                ax.plot(-decay, sign * w, color=fs.MUTED, lw=0.7, ls=(0, (3, 3)), zorder=1)
             k = int(np.argmin(np.abs(w - 2.0 * np.sqrt(high))))
             if decay[k] < 0.6 * left:
-                look = {"color": MUTED, "ha": "center", "va": "center", "zorder": 3, "bbox": PATCH}
-                remark(ax, f"ζ = {zeta:g}", (-decay[k], -w[k]), (0, 0), fontsize=7.4, **look)
+                small = {"color": fs.MUTED, "ha": "center", "va": "center", "bbox": fs.PATCH}
+                at = (-decay[k], -w[k])
+                fs.remark(ax, f"ζ = {zeta:g}", at, (0, 0), fontsize=7.4, zorder=3, **small)
         for k, (label, es) in enumerate(modes.items()):
             v = np.array([e.value for e in es])
             both = np.concatenate([v, v[v.imag > 0].conj()])
-            ink = LINE_INK[k % len(LINE_INK)]
+            ink = fs.LINE_INK[k % len(fs.LINE_INK)]
             look = {"ms": 6, "mfc": "none"} if k else {"ms": 7, "mfc": ink}
-            mark = {"marker": MARKS[k], "ls": "none", "mec": ink, "mew": 1.5}
+            mark = {"marker": fs.MARKS[k], "ls": "none", "mec": ink, "mew": 1.5}
             ax.plot(both.real, both.imag, label=label, zorder=5 + k, **look, **mark)
         _name_modes(ax, next(iter(modes.values())))
         ticks = [s * 10.0**e for e in range(0, 7) for s in (1, -1)]
@@ -91,7 +81,7 @@ def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figur
         ax.set_xlabel("Real part [1/s]")
         ax.set_ylabel("Imaginary part [rad/s]")
         which = dict.fromkeys(m.name.replace("_", " ") for m in models.values())
-        title(ax, f"Eigenvalues: {', '.join(which)}")
+        fs.title(ax, f"Eigenvalues: {', '.join(which)}")
         if len(models) > 1:
             ax.legend(
                 loc="lower left", fontsize=8.2, frameon=True, framealpha=0.92, edgecolor="none"
@@ -100,7 +90,7 @@ def plot_eigenvalues(models: Mapping[str, LinearModel], note: str = "") -> Figur
             "Named by the state that takes most part in the mode. Shaded: unstable. Dashed: "
             f"constant damping ratio. Both axes are logarithmic beyond ±{_LINEAR:g}."
         )
-        caption(fig, f"{text} {note}".strip())
+        fs.caption(fig, f"{text} {note}".strip())
         return fig
 
 
@@ -111,9 +101,9 @@ def _name_modes(ax: Any, modes: Any) -> None:
     for e in modes:
         first = next(iter(e.participation), "")
         if e.value.imag > 0:
-            remark(ax, first, (e.value.real, e.value.imag), (8, 4), fontsize=8.0, zorder=8)
+            fs.remark(ax, first, (e.value.real, e.value.imag), (8, 4), fontsize=8.0, zorder=8)
             continue
-        line = {"arrowstyle": "-", "color": MUTED, "lw": 0.6, "shrinkB": 3}
+        line = {"arrowstyle": "-", "color": fs.MUTED, "lw": 0.6, "shrinkB": 3}
         look = {"fontsize": 8.0, "ha": "center", "zorder": 8, "arrowprops": line}
-        remark(ax, first, (e.value.real, 0), (0, heights[real % len(heights)]), **look)
+        fs.remark(ax, first, (e.value.real, 0), (0, heights[real % len(heights)]), **look)
         real += 1

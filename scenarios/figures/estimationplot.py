@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import (
-    INK,
-    LINE_INK,
-    MUTED,
-    PATCH,
-    caption,
-    drawing,
-    new_figure,
-    remark,
-    title,
-)
+from scenarios.figures import figstyle as fs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,16 +40,16 @@ def plot_gain_of_a_sensor(
     """
 
     prior = np.asarray(prior, float)
-    if not 1 <= len(curves) <= len(LINE_INK):
-        raise SignalError(f"one to {len(LINE_INK)} curves can be drawn, got {len(curves)}")
+    if not 1 <= len(curves) <= len(fs.LINE_INK):
+        raise SignalError(f"one to {len(fs.LINE_INK)} curves can be drawn, got {len(curves)}")
     for label, c in curves.items():
         shapes = [np.shape(c[k]) for k in ("reduction", "null_before", "null_after")]
         if any(s != prior.shape for s in shapes):
             raise SignalError(f"{label}: shapes {shapes}, {prior.shape} expected")
     if set(aims) - set(curves):
         raise SignalError(f"aims of unknown curves: {', '.join(sorted(set(aims) - set(curves)))}")
-    with drawing():
-        fig = new_figure(4.6)
+    with fs.drawing():
+        fig = fs.new_figure(4.6)
         left, right = fig.subplots(1, 2)
         fig.subplots_adjust(left=0.065, right=0.985, top=0.90, bottom=0.255, wspace=0.2)
         ticks = [p for p in (0.5, 1, 2, 5, 10, 20) if 99 * prior[0] <= p <= 101 * prior[-1]]
@@ -69,18 +59,18 @@ def plot_gain_of_a_sensor(
             ax.minorticks_off()
             ax.set_xlabel("prior of each factor, 1 sigma, %")
         percent = 100 * prior
-        right.plot(percent, percent, color=MUTED, lw=1.2, ls="--", label="before any reading")
-        for (label, c), ink in zip(curves.items(), LINE_INK, strict=False):
+        right.plot(percent, percent, color=fs.MUTED, lw=1.2, ls="--", label="before any reading")
+        for (label, c), ink in zip(curves.items(), fs.LINE_INK, strict=False):
             for ax, key in ((left, "reduction"), (right, "null_after")):
                 ax.plot(percent, 100 * np.asarray(c[key]), color=ink, lw=1.8, label=label)
             if label in aims:
                 at, goal = aims[label]
                 left.plot(100 * at, 100 * goal, marker="^", ms=9, mfc="white", mec=ink, mew=1.8)
                 place, text = (100 * at, 100 * goal), f"aim {100 * goal:.0f} %"
-                remark(left, text, place, (-9, -3), ha="right", bbox=PATCH)
+                fs.remark(left, text, place, (-9, -3), ha="right", bbox=fs.PATCH)
         worst = max((c["null_before"] for c in curves.values()), key=lambda v: float(np.max(v)))
         without = f"without {sensor}"
-        right.plot(percent, 100 * np.asarray(worst), "o", color=INK, ms=3.5, label=without)
+        right.plot(percent, 100 * np.asarray(worst), "o", color=fs.INK, ms=3.5, label=without)
         left.set_ylim(0, 100)
         right.set_yscale("log")
         seen = [np.min(c["null_after"]) for c in curves.values()]
@@ -90,9 +80,9 @@ def plot_gain_of_a_sensor(
         right.minorticks_off()
         left.set_ylabel("reduction of the rms error, %")
         right.set_ylabel("1 sigma along the null direction, %")
-        title(left, f"What {sensor} takes off the error of the health factors")
-        title(right, "What remains along the null direction")
+        fs.title(left, f"What {sensor} takes off the error of the health factors")
+        fs.title(right, "What remains along the null direction")
         left.legend(frameon=False, fontsize=8.5, loc="upper left")
         right.legend(frameon=False, fontsize=8.5, loc="upper left")
-        caption(fig, note)
+        fs.caption(fig, note)
     return fig

@@ -7,18 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scenarios.figures.figstyle import (
-    DASHED,
-    INK,
-    LINE_INK,
-    MARKS,
-    MUTED,
-    above,
-    caption,
-    drawing,
-    margins,
-    new_figure,
-)
+from scenarios.figures import figstyle as fs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,39 +32,39 @@ def figure_exchange_error(
 
     cases = list(dict.fromkeys(case for case, _ in curves))
     exchanges = list(dict.fromkeys(ex for _, ex in curves))
-    dash = dict(zip(exchanges, ("-", DASHED, (0, (1, 1.5))), strict=False))
+    dash = dict(zip(exchanges, ("-", fs.DASHED, (0, (1, 1.5))), strict=False))
     steps = np.unique(np.concatenate([dt for dt, _ in curves.values()]))
-    with drawing():
-        fig = new_figure(7.4)
+    with fs.drawing():
+        fig = fs.new_figure(7.4)
         place = {"left": 0.085, "right": 0.985, "hspace": 0.3, "wspace": 0.2}
-        grid = fig.add_gridspec(2, 2, **place, **margins(fig, top=0.65, bottom=0.85))
+        grid = fig.add_gridspec(2, 2, **place, **fs.margins(fig, top=0.65, bottom=0.85))
         for k, (q, head) in enumerate(quantities.items()):
             ax = fig.add_subplot(grid[k // 2, k % 2])
             for (case, ex), (dt, errors) in curves.items():
                 c = cases.index(case)
-                inside = LINE_INK[c] if ex == exchanges[0] else "white"
-                look = {"color": LINE_INK[c], "marker": MARKS[c], "mfc": inside}
+                inside = fs.LINE_INK[c] if ex == exchanges[0] else "white"
+                look = {"color": fs.LINE_INK[c], "marker": fs.MARKS[c], "mfc": inside}
                 ax.loglog(1e3 * dt, errors[q], ls=dash[ex], ms=4.5, lw=1.5, **look)
             every = np.concatenate([errors[q] for _, errors in curves.values()])
             _slopes(ax, steps, every)
-            ax.axvline(1e3 * mark, color=MUTED, lw=0.9, zorder=0.5)
+            ax.axvline(1e3 * mark, color=fs.MUTED, lw=0.9, zorder=0.5)
             ax.xaxis.set_major_locator(FixedLocator(list(1e3 * steps)))
             ax.xaxis.set_minor_locator(NullLocator())
             ax.set_xticklabels([f"{1e3 * s:g}" for s in steps])
             ax.set_xlim(1e3 * steps[0] / 1.25, 1e3 * steps[-1] * 1.25)
             ax.set_ylim(every.min() / 2, every.max() * 2)
-            above(ax, head[0].upper() + head[1:], INK)
+            fs.above(ax, head[0].upper() + head[1:], fs.INK)
             if k % 2 == 0:
                 ax.set_ylabel("Largest relative error")
             if k >= len(quantities) - 2:
                 ax.set_xlabel("Exchange step [ms]")
         handles = []
         for c, case in enumerate(cases):
-            look = {"color": LINE_INK[c], "marker": MARKS[c], "label": case}
+            look = {"color": fs.LINE_INK[c], "marker": fs.MARKS[c], "label": case}
             handles.append(Line2D([], [], ms=4.5, lw=1.5, **look))
         for ex in exchanges:
-            inside = INK if ex == exchanges[0] else "white"
-            look = {"color": INK, "marker": "o", "mfc": inside, "label": f"exchange “{ex}”"}
+            inside = fs.INK if ex == exchanges[0] else "white"
+            look = {"color": fs.INK, "marker": "o", "mfc": inside, "label": f"exchange “{ex}”"}
             handles.append(Line2D([], [], ms=4.5, lw=1.5, ls=dash[ex], **look))
         where = {"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), "ncols": len(handles)}
         space = {"columnspacing": 1.2, "handlelength": 2.4}
@@ -84,7 +73,7 @@ def figure_exchange_error(
             "Error of the multi-rate exchange against the unit as one model with one solver. "
             "Grey: slopes 1 and 2. Vertical line: the paper's 20 ms."
         )
-        caption(fig, text)
+        fs.caption(fig, text)
     return fig
 
 

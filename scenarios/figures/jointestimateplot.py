@@ -8,18 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import (
-    DASHED,
-    INK,
-    LINE_INK,
-    MUTED,
-    OF_AXES,
-    caption,
-    drawing,
-    new_figure,
-    remark,
-    title,
-)
+from apu_casadi.gaspath.health import HEALTH_FACTORS
+from scenarios.figures import figstyle as fs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,10 +19,7 @@ __all__ = ["NAMES", "plot_joint_estimate"]
 
 SEVERITIES = ("h_a", "h_b", "h_c")
 _PANELS: tuple[tuple[str, str, str, float], ...] = (
-    ("f_eta_c", "compressor efficiency", "change [%]", 100.0),
-    ("f_W_c", "compressor flow", "change [%]", 100.0),
-    ("f_eta_t", "turbine efficiency", "change [%]", 100.0),
-    ("f_W_t", "turbine flow", "change [%]", 100.0),
+    *((n, f"{h.component} {h.quantity}", "change [%]", 100.0) for n, h in HEALTH_FACTORS.items()),
     ("N", "shaft speed", "r/min", 30 / np.pi),
     ("P_total", "mechanical power of both generators", "kW", 1e-3),
 )
@@ -52,7 +39,7 @@ def _curve(
     value, true, band = scale * (mean - offset), scale * (true - offset), scale * Z95 * sigma
     ax.fill_between(t, value - band, value + band, color=ink, alpha=0.2, lw=0, zorder=1)
     ax.plot(t, value, color=ink, lw=1.2, zorder=2)
-    ax.plot(t, true, color=INK, lw=1.1, ls=DASHED, zorder=3)
+    ax.plot(t, true, color=fs.INK, lw=1.1, ls=fs.DASHED, zorder=3)
     # a band that is wide for an instant, after a fault, need not fit into the picture
     usual = np.nanquantile(band, 0.98)
     slim = band <= usual
@@ -89,8 +76,8 @@ def plot_joint_estimate(
     wrong = [n for n in needed if np.shape(data[n]) != t.shape]
     if wrong:
         raise SignalError(f"{t.size} values expected of {', '.join(wrong)}")
-    with drawing():
-        fig = new_figure(8.9)
+    with fs.drawing():
+        fig = fs.new_figure(8.9)
         grid = fig.add_gridspec(
             4, 2, left=0.07, right=0.985, top=0.955, bottom=0.12, hspace=0.36, wspace=0.15
         )
@@ -98,37 +85,40 @@ def plot_joint_estimate(
         for k, (name, words, unit, scale) in enumerate(_PANELS):
             ax = fig.add_subplot(grid[k // 2, k % 2], sharex=axes[0] if axes else None)
             axes.append(ax)
-            seen = _curve(ax, t, data, name, scale, LINE_INK[0])
+            seen = _curve(ax, t, data, name, scale, fs.LINE_INK[0])
             _fit(ax, seen)
             ax.set_ylabel(unit)
-            title(ax, f"{words}, {name}")
+            fs.title(ax, f"{words}, {name}")
         ax = fig.add_subplot(grid[3, :], sharex=axes[0])
         axes.append(ax)
         every = [
-            _curve(ax, t, data, n, 1e3, ink) for n, ink in zip(SEVERITIES, LINE_INK, strict=False)
+            _curve(ax, t, data, n, 1e3, ink)
+            for n, ink in zip(SEVERITIES, fs.LINE_INK, strict=False)
         ]
-        for n, ink in zip(SEVERITIES, LINE_INK, strict=False):
+        for n, ink in zip(SEVERITIES, fs.LINE_INK, strict=False):
             ax.plot([], [], color=ink, lw=3, label=n)
         ax.legend(frameon=False, fontsize=8.5, ncols=3, loc="lower right", bbox_to_anchor=(1, 0.98))
         _fit(ax, np.concatenate(every), roof=True)
         ax.set_ylabel("h [1e-3]")
-        title(ax, "severity of a turn-to-turn short circuit, by phase")
+        fs.title(ax, "severity of a turn-to-turn short circuit, by phase")
         ax.set_xlim(t[0], t[-1])
         for ax in axes:
             for _, start in phases[1:]:
-                ax.axvline(start, color=MUTED, lw=0.9, ls=":", zorder=0.9)
+                ax.axvline(start, color=fs.MUTED, lw=0.9, ls=":", zorder=0.9)
             for when in alarms:
                 place = {"clip_on": False, "zorder": 5, "transform": ax.get_xaxis_transform()}
-                ax.plot(when, 0.0, marker="^", ms=6, color=LINE_INK[3], **place)
+                ax.plot(when, 0.0, marker="^", ms=6, color=fs.LINE_INK[3], **place)
         for ax in axes[:4]:
             ax.tick_params(labelbottom=False)
         axes[-1].set_xlabel("time [s]")
         for name, start in phases:
-            remark(axes[-1], name, (start, 1.0), (3, -3), xycoords=OF_AXES, va="top", color=MUTED)
+            fs.remark(
+                axes[-1], name, (start, 1.0), (3, -3), xycoords=fs.OF_AXES, va="top", color=fs.MUTED
+            )
         text = "Dashed: truth. Line and shade: estimate and its 95 % band. Dotted: phases."
         if len(alarms):
             text += " Triangles: a change of health was reported."
-        caption(fig, f"{text} {note}".strip())
+        fs.caption(fig, f"{text} {note}".strip())
     return fig
 
 

@@ -22,17 +22,7 @@ from apu_casadi.core.results import phases
 from apu_casadi.gaspath.maps.scaledmaps import map_function
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from scenarios.figures.figstyle import (
-    DASHED,
-    INK,
-    LINE_INK,
-    MUTED,
-    caption,
-    drawing,
-    new_figure,
-    remark,
-    title,
-)
+from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import scenario_of
 
 if TYPE_CHECKING:
@@ -105,10 +95,7 @@ def published_surge_line(cmap: ScaledMap) -> tuple[np.ndarray, np.ndarray]:
     if t.surge_W is None or t.surge_PR is None:
         raise MapError(f"map {t.name!r} is of a {t.kind}: it has no surge line")
     W, PR, _ = (float(o) for o in map_function(t)(cmap.N_map_des, cmap.beta_des))
-    return (
-        t.surge_W * cmap.W_des / W,
-        1 + (t.surge_PR - 1) * (cmap.PR_des - 1) / (PR - 1),
-    )
+    return (t.surge_W * cmap.W_des / W, 1 + (t.surge_PR - 1) * (cmap.PR_des - 1) / (PR - 1))
 
 
 def surge_line(cmap: ScaledMap, samples: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -229,8 +216,8 @@ def _draw(
     lines = default_lines(gg) if lines is None else lines
     run = None if trajectory is None else _trajectory(trajectory, needed, place)
     drawn = [place(_columns(points)) for points in lines.values()]
-    with drawing():
-        fig = new_figure(6.4)
+    with fs.drawing():
+        fig = fs.new_figure(6.4)
         place_ = {"left": 0.062, "right": 0.985, "wspace": 0.17, "top": 0.93, "bottom": 0.255}
         grid = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0], **place_)
         whole, near = (fig.add_subplot(grid[k]) for k in range(2))
@@ -250,19 +237,24 @@ def _draw(
             if surge is not None and published is not None:
                 _surge(ax, surge, published)
             for k, (label, (x, y)) in enumerate(zip(lines, drawn, strict=True)):
-                look = {"color": LINE_INK[k % len(LINE_INK)], "lw": 2.0, "ms": 3.2, "zorder": 5}
+                look = {
+                    "color": fs.LINE_INK[k % len(fs.LINE_INK)],
+                    "lw": 2.0,
+                    "ms": 3.2,
+                    "zorder": 5,
+                }
                 ax.plot(x, y, marker="o", label=f"operating line, {label}", **look)
             if run is not None and trajectory is not None:
                 _draw_run(ax, *run, trajectory)
-            star = {"ms": 13, "mfc": "white", "mec": INK, "mew": 1.2, "zorder": 8}
+            star = {"ms": 13, "mfc": "white", "mec": fs.INK, "mew": 1.2, "zorder": 8}
             ax.plot(*design, "*", label="design point", **star)
             ax.set_xlabel(labels[0] if not zoomed else labels[0].split(",")[0])
         whole.set_ylabel(labels[1])
-        title(whole, f"{what}: {m.table.name}, scaled and calibrated")
-        title(near, "Enlarged")
+        fs.title(whole, f"{what}: {m.table.name}, scaled and calibrated")
+        fs.title(near, "Enlarged")
         (x0, x1), (y0, y1) = box
         frame = [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0]
-        whole.plot(*frame, color=MUTED, lw=0.9, ls="--", zorder=6)
+        whole.plot(*frame, color=fs.MUTED, lw=0.9, ls="--", zorder=6)
         space = {"ncols": 4, "columnspacing": 1.6, "handlelength": 2.2}
         where = {"loc": "lower left", "bbox_to_anchor": (0.05, 0.075), "frameon": False}
         fig.legend(*whole.get_legend_handles_labels(), fontsize=7.8, **where, **space)
@@ -272,13 +264,13 @@ def _draw(
             words.append("Surge line: zero stability margin.")
         if run is not None:
             words.append(f"Trajectory{_name(trajectory)}: circle start, square end.")
-        caption(fig, " ".join(words))
+        fs.caption(fig, " ".join(words))
         return fig
 
 
 def _surge(ax: Axes, surge: Curve, published: Curve) -> None:
     ax.plot(*surge, color=SURGE_INK, lw=2.2, label="surge line", zorder=4)
-    look = {"color": SURGE_INK, "lw": 1.1, "ls": DASHED, "zorder": 4}
+    look = {"color": SURGE_INK, "lw": 1.1, "ls": fs.DASHED, "zorder": 4}
     ax.plot(*published, label="surge line as published, scaled", **look)
 
 
@@ -330,7 +322,7 @@ def _map(
     for v in np.asarray(t.N) / m.N_map_des:
         line = m.lookup(np.full(beta.shape, v), beta, 1.0)
         lx, ly = axes_of(v, line.W, line.PR)
-        ax.plot(lx, ly, color=MUTED, lw=1.0, zorder=2)
+        ax.plot(lx, ly, color=fs.MUTED, lw=1.0, zorder=2)
         seen = np.full(lx.shape, True)
         if zoomed:  # room for the label at the right
             x0, x1 = ax.get_xlim()
@@ -340,7 +332,7 @@ def _map(
             text = f"${symbol}$ = {v:.3g}" if zoomed else f"{v:.3g}"
             shift, va = ((3, -2), "top") if zoomed else ((3, 3), "bottom")
             look = {"fontsize": 7.4, "ha": "left", "va": va, "zorder": 7, "clip_on": True}
-            remark(ax, text, (lx[k], ly[k]), shift, **look)
+            fs.remark(ax, text, (lx[k], ly[k]), shift, **look)
 
 
 def _edges(m: ScaledMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -379,7 +371,9 @@ def _draw_run(ax: Axes, x: np.ndarray, y: np.ndarray, ds: xr.Dataset) -> None:
         ax.plot(*path, color="white", lw=3.4, zorder=5.5, **look)
         ax.plot(*path, color=ink, lw=1.7, zorder=6, label=f"run: {p['name']}", **look)
     for i, mark in ((0, "o"), (-1, "s")):
-        ax.plot(x[i], y[i], marker=mark, ms=6, mfc="white", mec=INK, mew=1.3, ls="none", zorder=9)
+        ax.plot(
+            x[i], y[i], marker=mark, ms=6, mfc="white", mec=fs.INK, mew=1.3, ls="none", zorder=9
+        )
 
 
 def _name(ds: xr.Dataset | None) -> str:

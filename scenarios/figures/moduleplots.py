@@ -8,24 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.results import RPM
-from scenarios.figures.figstyle import (
-    ABC,
-    INK,
-    LINE_INK,
-    NESTED,
-    PHASE_INK,
-    abc_legend,
-    above,
-    bands,
-    caption,
-    change,
-    drawing,
-    legend,
-    margins,
-    need,
-    new_figure,
-    roomy,
-)
+from scenarios.figures import figstyle as fs
 from scenarios.figures.threephase import cycle_rms
 
 if TYPE_CHECKING:
@@ -50,7 +33,7 @@ _GAS_PANELS = {
 
 
 def _note(fig: Figure, key: str, more: str) -> None:
-    caption(fig, f"Figure {key[3:5]}. {MODULE_FIGURES[key]}. {more}")
+    fs.caption(fig, f"Figure {key[3:5]}. {MODULE_FIGURES[key]}. {more}")
 
 
 def figure_gas_generator(
@@ -67,33 +50,33 @@ def figure_gas_generator(
     """
     panels = _GAS_PANELS[key]
     for ds in (*runs, *checks):
-        need(ds, [p[0] for p in panels])
+        fs.need(ds, [p[0] for p in panels])
     t_end = float(runs[0]["time"][-1])
     after = "fuel flow +10 %, load proportional to speed cubed"
     rows = [
         {"name": "degraded gas path, 230 kW", "start": 0.0, "end": t_step},
         {"name": after, "start": t_step, "end": t_end},
     ]
-    with drawing():
-        fig = new_figure(6.3)
+    with fs.drawing():
+        fig = fs.new_figure(6.3)
         place = {"left": 0.085, "right": 0.985, "hspace": 0.14}
-        grid = fig.add_gridspec(len(panels), 1, **place, **margins(fig, top=0.45, bottom=1.0))
+        grid = fig.add_gridspec(len(panels), 1, **place, **fs.margins(fig, top=0.45, bottom=1.0))
         for r, (name, label, scale) in enumerate(panels):
             ax = fig.add_subplot(grid[r])
-            bands(ax, rows, names=r == 0)
+            fs.bands(ax, rows, names=r == 0)
             every = []
-            for ds, check, ink in zip(runs, checks, LINE_INK, strict=False):
+            for ds, check, ink in zip(runs, checks, fs.LINE_INK, strict=False):
                 t, y = ds["time"].values, ds[name].values * scale
                 ax.plot(t, y, color=ink, lw=1.7, solid_joinstyle="round")
                 some = slice(None, None, max(t.size // 40, 1))
                 x, dots = check["time"].values[some], check[name].values[some] * scale
                 ax.plot(x, dots, "o", ms=3.6, mfc="white", mec=ink, mew=1.0)
                 every.append(y)
-            roomy(ax, np.concatenate(every), 0.1)
+            fs.roomy(ax, np.concatenate(every), 0.1)
             ax.set_ylabel(label)
             ax.tick_params(labelbottom=r == len(panels) - 1)
             if r == 0:
-                legend(ax, "lower right", _routes(runs))
+                fs.legend(ax, "lower right", _routes(runs))
         ax.set_xlabel("Time [s]")
         _note(
             fig,
@@ -111,15 +94,15 @@ def _routes(runs: Sequence[xr.Dataset]) -> list[Any]:
     flows = [f"turbine flow factor {float(ds.attrs['f_W_t']):g}" for ds in runs]
     lines = [
         Line2D([], [], color=ink, lw=1.7, label=flow)
-        for flow, ink in zip(flows, LINE_INK, strict=False)
+        for flow, ink in zip(flows, fs.LINE_INK, strict=False)
     ]
-    dots = {"color": INK, "marker": "o", "ls": "", "ms": 3.6, "mfc": "white"}
+    dots = {"color": fs.INK, "marker": "o", "ls": "", "ms": 3.6, "mfc": "white"}
     return [*lines, Line2D([], [], label="continuous model, CVODES", **dots)]
 
 
 def _ms(ax: Axes, lo: float, hi: float, *, xlabel: bool) -> None:
     """Shade before and after a change at 0 ms."""
-    change(ax, lo, 0, hi)
+    fs.change(ax, lo, 0, hi)
     ax.set_xlim(lo, hi)
     if xlabel:
         ax.set_xlabel("ms after the change", labelpad=1)
@@ -137,17 +120,17 @@ def figure_18(ds: xr.Dataset, check: xr.Dataset, origin: float) -> Figure:
     quantities = {"i": "Current [A]", "v": "Voltage [V]"}
     names = [f"{q}_{p}" for q in quantities for p in "abc"]
     for data in (ds, check):
-        need(data, names)
+        fs.need(data, names)
     t = (ds["time"].values - origin) * 1e3
     tc = (check["time"].values - origin) * 1e3
     late, apart = np.abs(t) > 0.5, 0.0
     for n in names:
         y, other = ds[n].values, np.interp(t, tc, check[n].values)
         apart = max(apart, float(np.abs(y - other)[late].max() / np.abs(y).max()))
-    with drawing():
-        fig = new_figure(6.6)
+    with fs.drawing():
+        fig = fs.new_figure(6.6)
         place = {"left": 0.08, "right": 0.985, "hspace": 0.26, "wspace": 0.2}
-        place |= margins(fig, top=0.5, bottom=0.95)
+        place |= fs.margins(fig, top=0.5, bottom=0.95)
         grid = fig.add_gridspec(2, 2, width_ratios=[1.7, 1.0], **place)
         for r, (q, label) in enumerate(quantities.items()):
             left, right = fig.add_subplot(grid[r, 0]), fig.add_subplot(grid[r, 1])
@@ -155,18 +138,18 @@ def figure_18(ds: xr.Dataset, check: xr.Dataset, origin: float) -> Figure:
             _ms(right, -10, float(t[-1]), xlabel=r == 1)
             for p in "abc":
                 y = ds[f"{q}_{p}"].values
-                left.plot(t, y, color=ABC[p], lw=1.2)
+                left.plot(t, y, color=fs.ABC[p], lw=1.2)
                 some = np.flatnonzero((tc >= -4) & (tc <= 10))[::8]
                 dots = check[f"{q}_{p}"].values[some]
-                left.plot(tc[some], dots, "o", ms=2.6, mfc="white", mec=ABC[p], mew=0.8)
+                left.plot(tc[some], dots, "o", ms=2.6, mfc="white", mec=fs.ABC[p], mew=0.8)
                 x, rms = cycle_rms(t, y)
-                right.plot(x, rms, color=ABC[p], lw=NESTED[p])
+                right.plot(x, rms, color=fs.ABC[p], lw=fs.NESTED[p])
             left.set_ylabel(label)
             right.set_ylabel(label.replace(" [", " rms ["))
             if r == 0:
-                above(left, "waveforms; dots: second solver", PHASE_INK[1])
-                above(right, "rms over each cycle", PHASE_INK[1])
-                abc_legend(left, "upper left")
+                fs.above(left, "waveforms; dots: second solver", fs.PHASE_INK[1])
+                fs.above(right, "rms over each cycle", fs.PHASE_INK[1])
+                fs.abc_legend(left, "upper left")
                 low, high = left.get_ylim()
                 left.set_ylim(low, high + 0.22 * (high - low))
         said = f"From 100 kW to 225 kW. CVODES and IDAS differ by at most {apart:.0e} of the peak"
@@ -187,11 +170,11 @@ def figure_19(runs: Mapping[str, xr.Dataset], origin: float, notes: Mapping[str,
     """
 
     for ds in runs.values():
-        need(ds, ["i_a", "i_b", "i_c", "i_fault"])
-    with drawing():
-        fig = new_figure(7.8)
+        fs.need(ds, ["i_a", "i_b", "i_c", "i_fault"])
+    with fs.drawing():
+        fig = fs.new_figure(7.8)
         place = {"left": 0.08, "right": 0.985, "hspace": 0.32, "wspace": 0.17}
-        place |= margins(fig, top=0.5, bottom=0.95)
+        place |= fs.margins(fig, top=0.5, bottom=0.95)
         grid = fig.add_gridspec(3, len(runs), height_ratios=[1.5, 1, 1], **place)
         for c, (name, ds) in enumerate(runs.items()):
             t = (ds["time"].values - origin) * 1e3
@@ -202,16 +185,16 @@ def figure_19(runs: Mapping[str, xr.Dataset], origin: float, notes: Mapping[str,
             inside = (t >= -4) & (t <= 10)
             for p in "abc":
                 y = ds[f"i_{p}"].values
-                waves.plot(t[inside], y[inside], color=ABC[p], lw=1.3)
+                waves.plot(t[inside], y[inside], color=fs.ABC[p], lw=1.3)
                 x, value = cycle_rms(t, y)
-                rms.plot(x, value, color=ABC[p], lw=1.8)
+                rms.plot(x, value, color=fs.ABC[p], lw=1.8)
             branch.plot(t[inside], ds["i_fault"].values[inside] * 1e-3, color="#7a3e9d", lw=1.4)
-            above(waves, notes.get(name, name), PHASE_INK[1])
+            fs.above(waves, notes.get(name, name), fs.PHASE_INK[1])
             if c == 0:
                 waves.set_ylabel("Phase currents [A]")
                 rms.set_ylabel("rms, each cycle [A]")
                 branch.set_ylabel("Fault branch [kA]")
-                abc_legend(waves, "upper left")
+                fs.abc_legend(waves, "upper left")
             low, high = waves.get_ylim()
             waves.set_ylim(low, high + 0.2 * (high - low))
         said = "Phase a, full coupling (κ = µ); the paper does not state $k_{rf}$. Current of the "

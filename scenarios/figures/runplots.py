@@ -9,20 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.results import RPM, phases
-from scenarios.figures.figstyle import (
-    LINE_INK,
-    WIDTH,
-    above,
-    bands,
-    change,
-    drawing,
-    fit,
-    margins,
-    need,
-    new_figure,
-    phase_colours,
-    roomy,
-)
+from apu_casadi.gaspath.health import HEALTH_FACTORS
+from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import SEVERITY, caption_of, scenario_of
 
 if TYPE_CHECKING:
@@ -31,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HOT = "#b91c1c"
-FACTORS = {"f_eta_c": "$η_c$", "f_W_c": "$W_c$", "f_eta_t": "$η_t$", "f_W_t": "$W_t$"}
 HEALTHY, HURT = ("#d8efe3", "#14532d"), ("#f8cfc8", "#7f1d1d")  # ground and ink
 LOADS = (("#bfd7ee", "#0b3c66"), ("#dbe8f5", "#0b3c66"))
 Lane = list[tuple[float, float, str, tuple[str, str]]]
@@ -52,25 +39,25 @@ def _quietest(rows: Sequence[dict[str, Any]], t: np.ndarray, y: np.ndarray) -> i
 
 def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str]]) -> Figure:
     """Draw quantities (name, label, scale, colour) over time, each with an enlargement."""
-    need(ds, [c[0] for c in curves])
+    fs.need(ds, [c[0] for c in curves])
     rows = phases(ds)
     t = ds["time"].values
-    with drawing():
-        fig = new_figure(6.3)
+    with fs.drawing():
+        fig = fs.new_figure(6.3)
         data = [ds[name].values * scale for name, _, scale, _ in curves]
         enlarged = [_quietest(rows, t, y) for y in data]
         two = any(k is not None for k in enlarged)
         widths = [3.1, 1.0] if two else [1.0]
         place = {"left": 0.085, "right": 0.985, "hspace": 0.27, "wspace": 0.2}
-        place |= margins(fig, top=0.55, bottom=0.9)
+        place |= fs.margins(fig, top=0.55, bottom=0.9)
         grid = fig.add_gridspec(len(curves), len(widths), width_ratios=widths, **place)
         for r, (y, k, (_, label, _, colour)) in enumerate(zip(data, enlarged, curves, strict=True)):
             last = r == len(curves) - 1
             ax = fig.add_subplot(grid[r, 0])
-            bands(ax, rows, names=r == 0)
+            fs.bands(ax, rows, names=r == 0)
             ax.plot(t, y, color=colour, lw=1.7, solid_joinstyle="round")
             ax.set_ylabel(label)
-            roomy(ax, y, 0.08)
+            fs.roomy(ax, y, 0.08)
             ax.tick_params(labelbottom=last)
             if last:
                 ax.set_xlabel("Time [s]")
@@ -80,11 +67,11 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
             p = rows[k]
             lo, hi = p["start"] - 0.25, min(p["end"], p["start"] + 2.5)
             inside = (t >= lo) & (t <= hi)
-            change(side, lo, p["start"], hi, k - 1)
+            fs.change(side, lo, p["start"], hi, k - 1)
             side.plot(t[inside], y[inside], color=colour, lw=1.7)
             side.set_xlim(lo, hi)
-            roomy(side, y[inside], 0.1)
-            above(side, fit(f"enlarged: {p['name']}", 30), phase_colours(k)[1])
+            fs.roomy(side, y[inside], 0.1)
+            fs.above(side, fs.fit(f"enlarged: {p['name']}", 30), fs.phase_colours(k)[1])
             if last:
                 side.set_xlabel("Time [s]")
         caption_of(fig, ds, key)
@@ -93,20 +80,20 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
 
 def figure_21(ds: xr.Dataset) -> Figure:
     """Draw shaft speed [r/min] and shaft power [kW]; DataError if a variable is missing."""
-    speed = ("N", "Shaft speed [r/min]", RPM, LINE_INK[0])
-    power = ("PW", "Shaft power [kW]", 1e-3, LINE_INK[1])
+    speed = ("N", "Shaft speed [r/min]", RPM, fs.LINE_INK[0])
+    power = ("PW", "Shaft power [kW]", 1e-3, fs.LINE_INK[1])
     return _trend(ds, "fig21_speed_power", [speed, power])
 
 
 def figure_22(ds: xr.Dataset) -> Figure:
     """Draw T3 [K] and P3 [kPa]; DataError if a variable is missing."""
-    T3, P3 = ("T3", "$T_3$ [K]", 1.0, HOT), ("P3", "$P_3$ [kPa]", 1e-3, LINE_INK[0])
+    T3, P3 = ("T3", "$T_3$ [K]", 1.0, HOT), ("P3", "$P_3$ [kPa]", 1e-3, fs.LINE_INK[0])
     return _trend(ds, "fig22_compressor_outlet", [T3, P3])
 
 
 def figure_23(ds: xr.Dataset) -> Figure:
     """Draw T4 [K] and the surge margin [%]; DataError if a variable is missing."""
-    T4, SM = ("T4", "$T_4$ [K]", 1.0, HOT), ("SM", "Surge margin [%]", 100.0, LINE_INK[2])
+    T4, SM = ("T4", "$T_4$ [K]", 1.0, HOT), ("SM", "Surge margin [%]", 100.0, fs.LINE_INK[2])
     return _trend(ds, "fig23_T4_surge_margin", [T4, SM])
 
 
@@ -166,10 +153,10 @@ def _load_words(x: dict[str, Any]) -> str:
 def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
     """Return the stretches of constant gas-path health."""
     t, lane = ds["time"].values, []
-    gas = np.column_stack([ds[f].values for f in FACTORS])
+    gas = np.column_stack([ds[f].values for f in HEALTH_FACTORS])
     for a, b, i in _segments(t, gas, rows):
-        factors = zip(FACTORS.values(), gas[i], strict=True)
-        off = [f"{s} {100 * (v - 1):+.3g} %" for s, v in factors if v != 1.0]
+        factors = zip(HEALTH_FACTORS.values(), gas[i], strict=True)
+        off = [f"{h.symbol} {100 * (v - 1):+.3g} %" for h, v in factors if v != 1.0]
         off = [x.replace(" -", " −").replace(" ", "\u00a0") for x in off]
         words = ", ".join(off[:2]) + "\n" + ", ".join(off[2:]) if off else "healthy"
         lane.append((a, b, words.strip(), HURT if off else HEALTHY))
@@ -213,18 +200,18 @@ def figure_20(ds: xr.Dataset) -> Figure:
     Raises:
         DataError: a variable is missing.
     """
-    need(ds, [*FACTORS, *SEVERITY, "P_e"])
+    fs.need(ds, [*HEALTH_FACTORS, *SEVERITY, "P_e"])
     rows = phases(ds)
     loads = [(a, b, w, LOADS[i % 2]) for i, (a, b, w) in enumerate(_load_lane(ds, rows))]
     gas, stator = _gas_lane(ds, rows), _stator_lane(ds, rows)
     lanes = {"Electrical load": loads, "Gas path": gas, "Stator": stator}
-    with drawing():
-        fig = new_figure(3.7)
-        m = margins(fig, top=0.45, bottom=0.8)
+    with fs.drawing():
+        fig = fs.new_figure(3.7)
+        m = fs.margins(fig, top=0.45, bottom=0.8)
         ax = fig.add_axes((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
-        bands(ax, rows, names=True)
+        fs.bands(ax, rows, names=True)
         span = rows[-1]["end"] - rows[0]["start"]
-        per_letter = 0.075 * span / (0.86 * WIDTH)
+        per_letter = 0.075 * span / (0.86 * fs.WIDTH)
         for y, items in enumerate(lanes.values()):
             for a, b, words, (ground, ink) in items:
                 box: dict[str, Any] = {"height": 0.7, "edgecolor": "white", "lw": 1.6, "zorder": 2}

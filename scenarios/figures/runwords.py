@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios.figures.figstyle import caption
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-SEVERITY = ("mu", "k_rf", "kappa")
+SEVERITY = tuple(s.name for s in Ttsc.severities)
 """Of a stator fault, as a run records it."""
 FIGURES = {
     "fig20_phases": "Phases of the run: load, gas-path health and stator fault",

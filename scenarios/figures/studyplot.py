@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from scenarios.figures.figstyle import (
-    INK,
-    LINE_INK,
-    MARKS,
-    MUTED,
-    OF_AXES,
-    caption,
-    drawing,
-    new_figure,
-    remark,
-    title,
-)
+from scenarios.figures import figstyle as fs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,8 +56,8 @@ def plot_consistency(
 
     if not 1 <= len(panels) <= 4:
         raise SignalError(f"one to four panels can be drawn, got {len(panels)}")
-    with drawing():
-        fig = new_figure(5.2)
+    with fs.drawing():
+        fig = fs.new_figure(5.2)
         grid = fig.subplots(2, len(panels), squeeze=False, sharex="col")
         heads = [textwrap.fill(head, 88 // len(panels)) for head, *_ in panels]
         roof = 0.88 if any("\n" in h for h in heads) else 0.925
@@ -77,25 +66,27 @@ def plot_consistency(
         for k, (head, t, ratios, limit, checks) in enumerate(panels):
             at = _same_length(head, t, {**ratios, **{n: v for n, (v, _) in checks.items()}})
             top, low = grid[:, k]
-            top.axhline(1, color=INK, lw=0.8)
+            top.axhline(1, color=fs.INK, lw=0.8)
             if limit is not None:
-                top.axhline(limit, color=MUTED, lw=1.2, ls="--")
-                look = {"color": MUTED, "bbox": _PATCH, "ha": "right"}
-                remark(top, f"goal {limit:g}", (at[-1], limit), (0, 2), fontsize=8, **look)
-            for (name, v), ink, mark in zip(ratios.items(), LINE_INK, MARKS, strict=False):
+                top.axhline(limit, color=fs.MUTED, lw=1.2, ls="--")
+                look = {"color": fs.MUTED, "bbox": _PATCH, "ha": "right"}
+                fs.remark(top, f"goal {limit:g}", (at[-1], limit), (0, 2), fontsize=8, **look)
+            for (name, v), ink, mark in zip(ratios.items(), fs.LINE_INK, fs.MARKS, strict=False):
                 top.plot(at, v, mark, ls="-", color=ink, lw=1.2, ms=2.6, label=name)
             reach = max(float(np.max(v)) for v in ratios.values())
             if reach > 5:
                 top.set_yscale("log")
             else:
                 top.set_ylim(0, 1.25 * max(reach, limit or 1.0))
-            title(top, heads[k])
-            for (name, (v, band)), ink, mark in zip(checks.items(), LINE_INK, MARKS, strict=False):
+            fs.title(top, heads[k])
+            for (name, (v, band)), ink, mark in zip(
+                checks.items(), fs.LINE_INK, fs.MARKS, strict=False
+            ):
                 low.axhspan(*band, color=ink, alpha=0.07, lw=0)
                 for edge in band:
                     low.axhline(edge, color=ink, lw=0.7, ls=":")
                 low.plot(at, v, mark, ls="-", color=ink, lw=1.2, ms=2.6, label=name)
-            low.axhline(1, color=INK, lw=0.8)
+            low.axhline(1, color=fs.INK, lw=0.8)
             if any(float(np.max(v)) > 5 for v, _ in checks.values()):
                 low.set_yscale("log")
             low.set_xlabel("time [s]")
@@ -105,7 +96,7 @@ def plot_consistency(
                 top.legend(frameon=False, fontsize=8, ncols=2, loc="lower left")
                 if checks:
                     low.legend(frameon=True, edgecolor="none", fontsize=8, ncols=2, loc="best")
-        caption(fig, note)
+        fs.caption(fig, note)
     return fig
 
 
@@ -125,20 +116,20 @@ def plot_null(
 
     if not 1 <= len(panels) <= 3:
         raise SignalError(f"one to three panels can be drawn, got {len(panels)}")
-    with drawing():
-        fig = new_figure(3.9)
+    with fs.drawing():
+        fig = fs.new_figure(3.9)
         axes = fig.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         fig.subplots_adjust(left=0.065, right=0.985, top=0.89, bottom=0.255, wspace=0.08)
         for ax, (head, t, curves) in zip(axes, panels, strict=True):
             at = _same_length(head, t, curves)
-            for (name, v), ink, mark in zip(curves.items(), LINE_INK, MARKS, strict=False):
+            for (name, v), ink, mark in zip(curves.items(), fs.LINE_INK, fs.MARKS, strict=False):
                 ax.plot(at, v, mark, ls="-", color=ink, lw=1.3, ms=3, label=name)
             ax.set_xlabel("time [s]")
             ax.set_ylim(bottom=0)
-            title(ax, head)
+            fs.title(ax, head)
         axes[0].set_ylabel(ylabel)
         axes[0].legend(frameon=False, fontsize=8.5, loc="lower left")
-        caption(fig, note)
+        fs.caption(fig, note)
     return fig
 
 
@@ -163,21 +154,21 @@ def plot_coverage(
     names = [list(g) for g in groups.values()]
     if not names or not names[0] or any(n != names[0] for n in names):
         raise SignalError(f"groups of the same quantities expected, got {names}")
-    with drawing():
-        fig = new_figure(3.6)
+    with fs.drawing():
+        fig = fs.new_figure(3.6)
         ax = fig.subplots()
         fig.subplots_adjust(left=0.085, right=0.985, top=0.89, bottom=0.235)
         ax.axhspan(100 * goal[0], 100 * goal[1], color=_BAND, lw=0)
-        ax.axhline(100 * level, color=INK, lw=0.8)
+        ax.axhline(100 * level, color=fs.INK, lw=0.8)
         width = len(names[0]) + 1
         for k, (head, group) in enumerate(groups.items()):
             for j, (name, (share, low, high)) in enumerate(group.items()):
                 ends = [[100 * (share - low)], [100 * (high - share)]]
-                look = {"fmt": MARKS[j % 4], "color": LINE_INK[j % 4], "ms": 5, "capsize": 3}
+                look = {"fmt": fs.MARKS[j % 4], "color": fs.LINE_INK[j % 4], "ms": 5, "capsize": 3}
                 label = name if k == 0 else None
                 ax.errorbar(k * width + j, 100 * share, ends, lw=1.2, label=label, **look)
-            place = {"ha": "center", "va": "top", "xycoords": OF_AXES}
-            remark(ax, head, (k * width + (width - 2) / 2, 0), (0, -14), fontsize=9, **place)
+            place = {"ha": "center", "va": "top", "xycoords": fs.OF_AXES}
+            fs.remark(ax, head, (k * width + (width - 2) / 2, 0), (0, -14), fontsize=9, **place)
         ax.set_xticks([])
         ax.set_xlim(-0.8, width * len(groups) - 1.2)
         ax.set_ylabel(f"{100 * level:.0f} % intervals that\nhold the truth [%]")
@@ -185,8 +176,8 @@ def plot_coverage(
         floor = min(lowest, goal[0]) - 0.12 * (1 - min(lowest, goal[0]))
         ax.set_ylim(100 * floor - 2, 101.5)  # room for the legend
         ax.legend(frameon=False, fontsize=8.5, ncols=4, loc="lower left")
-        title(ax, "Coverage")
-        caption(fig, note)
+        fs.title(ax, "Coverage")
+        fs.caption(fig, note)
     return fig
 
 
@@ -209,25 +200,27 @@ def plot_rate(
     c, e = np.asarray(counts, float), np.asarray(expected, float)
     if not hours > 0:
         raise SignalError(f"hours must be > 0, got {hours!r}")
-    with drawing():
-        fig = new_figure(3.7)
+    with fs.drawing():
+        fig = fs.new_figure(3.7)
         ax = fig.subplots()
         fig.subplots_adjust(left=0.075, right=0.985, top=0.89, bottom=0.255)
         fitted = "Rice's formula, one constant fitted"
-        ax.plot(z, e / hours, color=LINE_INK[0], lw=1.6, label=fitted)
+        ax.plot(z, e / hours, color=fs.LINE_INK[0], lw=1.6, label=fitted)
         seen = c > 0
         error = np.sqrt(c[seen])
         ends = [np.minimum(error, 0.999 * c[seen]) / hours, error / hours]
-        look = {"fmt": "o", "color": LINE_INK[1], "ms": 4.5, "capsize": 3, "lw": 1.2}
+        look = {"fmt": "o", "color": fs.LINE_INK[1], "ms": 4.5, "capsize": 3, "lw": 1.2}
         ax.errorbar(z[seen], c[seen] / hours, ends, label="counted", **look)
-        ax.axhline(goal, color=MUTED, lw=1.2, ls="--")
-        remark(ax, f"goal: {goal:g} an hour", (z[0], goal), (2, 3), color=MUTED)
-        ax.axvline(threshold, color=INK, lw=1.0)
-        remark(ax, "alarm", (threshold, 0.97), (4, 0), fontsize=8.5, va="top", xycoords=OF_AXES)
+        ax.axhline(goal, color=fs.MUTED, lw=1.2, ls="--")
+        fs.remark(ax, f"goal: {goal:g} an hour", (z[0], goal), (2, 3), color=fs.MUTED)
+        ax.axvline(threshold, color=fs.INK, lw=1.0)
+        fs.remark(
+            ax, "alarm", (threshold, 0.97), (4, 0), fontsize=8.5, va="top", xycoords=fs.OF_AXES
+        )
         ax.set_yscale("log")
         ax.set_xlabel("level of the largest h over its standard deviation")
         ax.set_ylabel("rises past it, per hour")
         ax.legend(frameon=False, fontsize=8.5, loc="lower left")
-        title(ax, "False alarms of a healthy machine")
-        caption(fig, note)
+        fs.title(ax, "False alarms of a healthy machine")
+        fs.caption(fig, note)
     return fig

@@ -9,22 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.results import phases
-from scenarios.figures.figstyle import (
-    ABC,
-    MUTED,
-    NESTED,
-    abc_legend,
-    above,
-    bands,
-    change,
-    drawing,
-    fit,
-    margins,
-    need,
-    new_figure,
-    phase_colours,
-    roomy,
-)
+from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import caption_of
 
 if TYPE_CHECKING:
@@ -71,7 +56,11 @@ def _waves(
     a, b = np.searchsorted(tw, (lo - 1e-9, hi + 1e-9))
     for name in names:
         ax.plot(
-            (tw[a:b] - origin) * 1e3, ds[name].values[a:b], color=ABC[name[-1]], lw=1.15, zorder=3
+            (tw[a:b] - origin) * 1e3,
+            ds[name].values[a:b],
+            color=fs.ABC[name[-1]],
+            lw=1.15,
+            zorder=3,
         )
     ax.set_xlim((lo - origin) * 1e3, (hi - origin) * 1e3)
 
@@ -83,16 +72,16 @@ def _envelopes(ax: Axes, ds: xr.Dataset, names: Sequence[str]) -> None:
     for name in names:
         p = name[-1]
         x, lo, hi = envelope(tw, ds[name].values, bins)
-        ax.fill_between(x, lo, hi, color=MUTED, alpha=0.09, lw=0)
+        ax.fill_between(x, lo, hi, color=fs.MUTED, alpha=0.09, lw=0)
         for edge in (lo, hi):
-            ax.plot(x, edge, color=ABC[p], lw=NESTED[p], solid_capstyle="butt")
+            ax.plot(x, edge, color=fs.ABC[p], lw=fs.NESTED[p], solid_capstyle="butt")
 
 
 def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str) -> Figure:
     names = [f"{symbol}_{p}" for p in "abc"]
     rms = [f"{symbol.upper()}_{p}_rms" for p in "abc"]
     waves = "time_w" in ds.coords
-    need(ds, names + rms if waves else rms)
+    fs.need(ds, names + rms if waves else rms)
     rows = phases(ds)
     events = rows[1:4]
     drawn: list[Callable[[Figure, Any], None]] = []
@@ -103,24 +92,24 @@ def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str) -> Figure:
     if events:
         drawn.append(partial(_rms_row, ds=ds, rms=rms, events=events))
     heights = [2.5] + [1.75] * len(drawn)
-    with drawing():
+    with fs.drawing():
         top, bottom, gap = 0.45, 0.95, 0.72
-        fig = new_figure(sum(heights) + gap * len(drawn) + top + bottom)
+        fig = fs.new_figure(sum(heights) + gap * len(drawn) + top + bottom)
         place = {"left": 0.08, "right": 0.985, "hspace": gap * len(heights) / sum(heights)}
-        place |= margins(fig, top=top, bottom=bottom)
+        place |= fs.margins(fig, top=top, bottom=bottom)
         outer = fig.add_gridspec(len(heights), 1, height_ratios=heights, **place)
         ax = fig.add_subplot(outer[0])
-        bands(ax, rows, names=True)
+        fs.bands(ax, rows, names=True)
         if waves:
             _envelopes(ax, ds, names)
             ax.set_ylabel(label.replace(" [", " envelope ["))
         else:
             for name, p in zip(rms, "abc", strict=True):
-                ax.plot(ds["time"].values, ds[name].values, color=ABC[p], lw=NESTED[p])
+                ax.plot(ds["time"].values, ds[name].values, color=fs.ABC[p], lw=fs.NESTED[p])
             ax.set_ylabel(f"{label}, rms")
         ax.margins(y=0.06)
         ax.set_xlabel("Time [s]", labelpad=2)
-        abc_legend(ax, "center right" if waves else "best")
+        fs.abc_legend(ax, "center right" if waves else "best")
         for row, draw in enumerate(drawn, 1):
             draw(fig, outer[row])
         told = "Envelope: extremes of all samples. Enlarged rms: of each exchange step."
@@ -138,12 +127,14 @@ def _steady_row(
     for k, p in enumerate(shown):
         ax = fig.add_subplot(grid[k], sharey=first)
         first = first or ax
-        ax.set_facecolor(phase_colours(k)[0])
+        ax.set_facecolor(fs.phase_colours(k)[0])
         hi = p["end"] - 0.0125
         lo = max(hi - 0.0075, p["start"])
         _waves(ax, ds, names, lo, hi, lo)
-        above(
-            ax, f"{fit(p['name'], 84 // len(shown) - 1, 1)}, from {lo:.3f} s", phase_colours(k)[1]
+        fs.above(
+            ax,
+            f"{fs.fit(p['name'], 84 // len(shown) - 1, 1)}, from {lo:.3f} s",
+            fs.phase_colours(k)[1],
         )
         ax.tick_params(labelleft=k == 0)
         ax.set_xlabel("ms", labelpad=1)
@@ -160,11 +151,13 @@ def _event_row(
     grid = spec.subgridspec(1, len(events), wspace=0.23)
     for k, p in enumerate(events):
         ax = fig.add_subplot(grid[k])
-        ink = phase_colours(k + 1)[1]
-        change(ax, -100, 0, 100, k)
+        ink = fs.phase_colours(k + 1)[1]
+        fs.change(ax, -100, 0, 100, k)
         _waves(ax, ds, names, p["start"] - 0.004, p["start"] + 0.008, p["start"])
         ax.margins(y=0.06)
-        above(ax, f"{fit(p['name'], 84 // len(events) - 6, 1)}: waveforms at {p['start']:g} s", ink)
+        fs.above(
+            ax, f"{fs.fit(p['name'], 84 // len(events) - 6, 1)}: waveforms at {p['start']:g} s", ink
+        )
         ax.xaxis.set_major_locator(MultipleLocator(2))
         ax.set_xlabel("ms after the change", labelpad=1)
         if k == 0:
@@ -177,18 +170,18 @@ def _rms_row(fig: Figure, spec: Any, *, ds: xr.Dataset, rms: Sequence[str], even
     t = ds["time"].values
     for k, p in enumerate(events):
         ax = fig.add_subplot(grid[k])
-        ink = phase_colours(k + 1)[1]
+        ink = fs.phase_colours(k + 1)[1]
         lo, hi = max(p["start"] - 0.2, t[0]), min(p["start"] + 1.6, p["end"])
         inside = (t >= lo - 1e-9) & (t <= hi + 1e-9)
-        change(ax, lo, p["start"], hi, k)
+        fs.change(ax, lo, p["start"], hi, k)
         drawn = []
         for name in rms:
             x, y = t[inside], ds[name].values[inside]
-            ax.plot(x, y, color=ABC[name[2]], lw=NESTED[name[2]], zorder=3)
+            ax.plot(x, y, color=fs.ABC[name[2]], lw=fs.NESTED[name[2]], zorder=3)
             drawn.append(y)
         ax.set_xlim(lo, hi)
-        roomy(ax, np.concatenate(drawn), 0.1)
-        above(ax, f"{fit(p['name'], 84 // len(events), 1)}: rms, enlarged", ink)
+        fs.roomy(ax, np.concatenate(drawn), 0.1)
+        fs.above(ax, f"{fs.fit(p['name'], 84 // len(events), 1)}: rms, enlarged", ink)
         ax.set_xlabel("Time [s]", labelpad=1)
         if k == 0:
             unit = ds[rms[0]].attrs.get("units", "")

@@ -26,9 +26,17 @@ from scenarios.shell.template import Template
 
 TEXT = Template.of("nomenclature.md")
 _WORDS = {"inductive": "R-L", "capacitive": "R-C", "constant_power": "constant-power"}
-_LOADS = {kind: _WORDS.get(kind, kind) for c in LOADS.classes for kind in c.examples()}
+
+
+def _shipped(classes: Iterable[type]) -> list[Any]:
+    """Return the classes of the package, by their files: others may be registered, in any order."""
+    own = (c for c in classes if c.__module__.startswith("apu_casadi."))
+    return sorted(own, key=lambda c: c.__module__)
+
+
+_LOADS = {kind: _WORDS.get(kind, kind) for c in _shipped(LOADS.classes) for kind in c.examples()}
 _FAULTS: dict[str | None, str] = {None: "no"}
-_FAULTS |= {kind: kind for c in FAULTS.classes for kind in c.examples()}
+_FAULTS |= {kind: kind for c in _shipped(FAULTS.classes) for kind in c.examples()}
 _NEUTRALS = {kind: kind for kind in NEUTRALS}
 
 

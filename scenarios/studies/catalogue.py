@@ -32,13 +32,13 @@ __all__ = ["STUDIES", "State", "get", "other_code", "pending", "read", "results"
 PACKAGES = ("apu-casadi", "casadi", "numpy", "scipy", "filterpy")
 
 
-def _studies() -> dict[str, Study]:
+def walk() -> dict[str, Study]:
     """Return the study of each file of the folder, in the order of the page."""
     found = (import_module(f"{estimation.__name__}.{n}").STUDY for n in estimation.files())
     return {s.name: s for s in sorted(found, key=lambda s: (s.order, s.name))}
 
 
-STUDIES: dict[str, Study] = _studies()
+STUDIES: dict[str, Study] = walk()
 """All studies by name, in the order of the page."""
 
 
@@ -138,13 +138,18 @@ def states(
 
 
 def _holds(made: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether all constants of a record are as they were; one that is new since says nothing."""
-    missing = object()
-    return made.keys() == now.keys() and all(
-        now.get(module, {}).get(name, missing) == value
-        for module, names in made.items()
-        for name, value in names.items()
-    )
+    """Whether no constant has another value.
+
+    A name that came or went is a change of code, which the filters' fingerprint is for; but a
+    module of which no name is left is another one.
+    """
+    if made.keys() != now.keys():
+        return False
+    for module, names in made.items():
+        common = names.keys() & now[module].keys()
+        if (names and not common) or any(names[n] != now[module][n] for n in common):
+            return False
+    return True
 
 
 def pending(study: Study, folder: str | Path, n_seeds: int) -> list[str]:

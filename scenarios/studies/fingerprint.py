@@ -59,7 +59,6 @@ def constants(*modules: str) -> dict[str, Any]:
         for name in TESTS:
             value = space.get(name)
             if dataclasses.is_dataclass(value) and not isinstance(value, type):
-                fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-                kinds = int | float | str | tuple
-                found[name] = {k: v for k, v in fields.items() if isinstance(v, kinds)}
+                fields = ((f.name, getattr(value, f.name)) for f in dataclasses.fields(value))
+                found[name] = {k: v for k, v in fields if isinstance(v, (int, float, str, tuple))}
     return found

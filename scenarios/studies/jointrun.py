@@ -19,6 +19,7 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.sharing import last
+from apu_casadi.gaspath.health import HEALTH_FACTORS
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT, HEALTH
@@ -111,8 +112,7 @@ _TOLD = (
     "warnings",
 )
 """What an estimate takes over from the truth, as it was recorded."""
-_PLACES = ("compressor efficiency", "compressor flow", "turbine efficiency", "turbine flow")
-HEALTH_WORDS = dict(zip(HEALTH, _PLACES, strict=True))
+HEALTH_WORDS = {n: f"{h.component} {h.quantity}" for n, h in HEALTH_FACTORS.items()}
 SHOWN = ("N", *HEALTH, "h_a", "h_b", "h_c", "P_total")
 
 

@@ -52,12 +52,7 @@ COMMON = 0.080  # s, where all of them meet
 T_EVENT, DURATION = 2 * COMMON, 22 * COMMON
 COMPARED = ("paper", "predicted", "corrected")
 """Exchanges of ``simulate_joint`` that are measured with every step."""
-QUANTITIES = {
-    "N": "speed, of its excursion",
-    "P": "power",
-    "V": "voltage",
-    "E": "energy",
-}
+QUANTITIES = {"N": "speed, of its excursion", "P": "power", "V": "voltage", "E": "energy"}
 """Short names and titles of the four errors."""
 _RTOL = 1e-8
 _HEALTH = {"f_eta_c": 0.99, "f_eta_t": 0.98, "f_W_c": 0.97, "f_W_t": 1.04}

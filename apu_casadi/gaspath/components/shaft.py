@@ -7,7 +7,7 @@ from typing import Any
 
 def power_balance(*, P_turb: Any, P_cpr: Any, eta_cpr: Any, P_acc: Any, PW: Any) -> Any:
     """Power left to accelerate the rotor, W.  P_turb - P_cpr/eta_cpr - P_acc - PW."""
-    return P_turb - P_cpr * (1 / eta_cpr) - P_acc - PW
+    return P_turb - P_cpr / eta_cpr - P_acc - PW
 
 
 def rotor_acceleration(*, P_acceleration: Any, N: Any, J: Any) -> Any:

@@ -158,11 +158,6 @@ def local_cubics(knots: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarr
     )
 
 
-def per(x: Any, number: Any) -> Any:
-    """x over a number of the engine, whose reciprocal is computed once for all derivatives."""
-    return x * (1 / number)
-
-
 def _held(x: Any, breaks: np.ndarray) -> Any:
     """Hold a query within the ends."""
     return ca.fmin(ca.fmax(x, float(breaks[0])), float(breaks[-1]))
@@ -411,6 +406,11 @@ class ScaledMap(Parametric):
         W, PR, eta = np.asarray(y).ravel().tolist()
         return W, PR, eta
 
+    @derived
+    def factors(self) -> tuple[float, float, float]:
+        """What scales speed, and table flow and surge line over the design's: made once."""
+        return scale_factors(self)
+
     def _scaled(
         self, N_held: Any, y: list[Any], RNI: Any, surge: Callable[[Any], Any] | None
     ) -> dict[str, Any]:
@@ -418,8 +418,8 @@ class ScaledMap(Parametric):
 
         ``surge`` gives the unscaled line's pressure ratio by the unscaled flow.
         """
-        des, cal = self.design_logs, self.cal
-        held = per(N_held, self.N_map_des)  # > 0, so that powers of it exist
+        des, cal, (per_N, _, per_line) = self.design_logs, self.cal, self.factors
+        held = N_held * per_N  # > 0, so that powers of it exist
         # powers are written as exponentials, which are cheaper when differentiated
         W = self.W_des * ca.exp(y[0] - des[0] + cal.a_W * ca.log(held))
         PR = 1 + (self.PR_des - 1) * ca.exp(y[1] - des[1])
@@ -429,7 +429,7 @@ class ScaledMap(Parametric):
         eta = 1 - loss * ca.exp(-cal.n_Re * ca.log(RNI))
         out = {"W": W, "PR": PR, "eta": eta}
         if surge is not None:
-            line = (surge(self._table_flow(W)) - 1) * per(self.PR_des - 1, ca.exp(des[1]))
+            line = (surge(self._table_flow(W)) - 1) * per_line
             # a tilt about n = 1 that saturates: a power law fitted above the design speed would
             # move the whole surge line at part speed, about which it knows nothing
             tilt = 1 + cal.a_SM * ca.tanh((held - 1) / TILT_WIDTH)
@@ -438,7 +438,7 @@ class ScaledMap(Parametric):
 
     def _table_flow(self, W: Any) -> Any:
         """Flow of the table that stands for a scaled flow."""
-        return W * per(ca.exp(self.design_logs[0]), self.W_des)
+        return W * self.factors[1]
 
     def at(self, n: Any, beta: Any, RNI: Any, cell: Any, surge: Any = None) -> tuple[MapPoint, Any]:
         """Read the map at a point of a known cell; plain expressions, also of SX.
@@ -482,6 +482,12 @@ class ScaledMap(Parametric):
         """Return the signed distance outside the table per axis, for messages; as in `lookup`."""
         _, off_N, off_beta = _call(off_function(self.table), n * self.N_map_des, beta)
         return OffMap(off_N, off_beta)
+
+
+def scale_factors(m: Any) -> tuple[Any, Any, Any]:
+    """Return 1/N_map_des, table flow over flow, and the factor of PR_surge - 1 of a scaled map."""
+    W, PR, _ = m.design_logs
+    return 1 / m.N_map_des, ca.exp(W) / m.W_des, (m.PR_des - 1) / ca.exp(PR)
 
 
 def scale_map(

@@ -20,7 +20,7 @@ from apu_casadi.gaspath.components.inlet import inlet
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.cycle import COLUMNS, N_ORDERED, Assembled, Cycle, Point, similar_z
 from apu_casadi.gaspath.health import HEALTH
-from apu_casadi.gaspath.stations import AMBIENT_STATE, EQUATIONS, UNKNOWNS, Y, Z
+from apu_casadi.gaspath.stations import AMBIENT_STATE, UNKNOWNS, Y, Z
 from apu_casadi.gaspath.unitnumbers import MAPS, NUMBERS, UnitParts
 
 NZ = len(Z)
@@ -54,8 +54,8 @@ class Output(NamedTuple):
 class System(NamedTuple):
     """The equations at one point, as SX.
 
-    r : residuals, in the order of ``TrimKernel.rows``.  J : their derivatives by the unknowns as
-    sought.  w : (z, N, Wf, PW), a list.  y : outputs.
+    r : residuals: of the cycle, of the power balance, and of what is fixed.  J : their derivatives
+    by the unknowns as sought.  w : (z, N, Wf, PW), a list.  y : outputs.
     """
 
     r: Any
@@ -81,8 +81,6 @@ class TrimKernel(Rebuilt):
         fixed = {DIRECT[n] for n in spec if n in DIRECT} | ({DIRECT["PW"]} & self._law_columns)
         self.free = [i for i in range(N_W) if i not in fixed]
         self.log = np.array([bool(k.follows) for k in UNKNOWNS] + [True, True, False])
-        more = [f"fixed {n}" for n in spec if n not in (*DIRECT, LAW)]
-        self.rows = (*EQUATIONS, "power balance", *more)
         self.n_p = N_FIRST + sum(3 if n == LAW else 1 for n in spec)
 
     @property

@@ -186,8 +186,12 @@ class Load(ABC):
         return cls(**values)
 
     def to_table(self) -> dict[str, Any]:
-        """Return the table that :meth:`from_table` reads."""
-        raise ScenarioError(f"a {type(self).__name__} has no words in a scenario file")
+        """Return the table that :meth:`from_table` reads; of one word whose keys are the fields."""
+        word, *more = self.tables or ("",)
+        keys = [k.name for k in self.tables.get(word, ())]
+        if more or not word or not all(hasattr(self, k) for k in keys):
+            raise ScenarioError(f"a {type(self).__name__} has no words in a scenario file")
+        return {"kind": word, **{k: getattr(self, k) for k in keys}}
 
     def is_told_by(self, table: Mapping[str, Any]) -> bool:
         """Whether the table, read, gives this very load."""

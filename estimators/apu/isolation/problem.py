@@ -10,14 +10,13 @@ import numpy as np
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.sharing import once
-from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.apu import Apu
 from estimators.apu.sensors import GAS_PATH, SensorSet
 
 __all__ = ["CLASSES", "DEFAULT", "FAULTS", "SNAPSHOT", "Hypothesis", "Protocol", "severity_of_loss"]
 
 DT = 0.02  # s
-HEALTH = GasGenerator.THETA.names
 GAINS = (*GAS_PATH.uncertain, "PW")
 OUTPUTS = (*GAS_PATH.outputs, "h")
 READ = tuple(n for n in GAS_PATH.outputs if n in GAINS)  # sensors of which a fault is told

@@ -16,6 +16,7 @@ from apu_casadi.core.measuring import measure
 from apu_casadi.core.sharing import kept
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.control import Governor, GovernorParameters
@@ -24,7 +25,6 @@ from estimators.apu.isolation.problem import (
     DEFAULT,
     DT,
     GAINS,
-    HEALTH,
     OUTPUTS,
     P_RATED,
     READ,

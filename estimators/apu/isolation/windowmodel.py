@@ -9,11 +9,11 @@ import casadi as ca
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gaspathmodel import gas_path_model
 from estimators.apu.isolation.problem import (
     FAULTS,
     GAINS,
-    HEALTH,
     P_RATED,
     Protocol,
     severity_of_loss,

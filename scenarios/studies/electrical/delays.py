@@ -27,12 +27,7 @@ from scenarios.studies.electrical.protocol import (
     WAIT,
 )
 from scenarios.studies.electrical.scores import alarm_times, h_covariance, statistics_of
-from scenarios.studies.electrical.truth import (
-    chances,
-    drawn_gains,
-    generator_truth,
-    samples_of,
-)
+from scenarios.studies.electrical.truth import chances, drawn_gains, generator_truth, samples_of
 
 __all__ = ["detection"]
 

@@ -40,9 +40,7 @@ STUDY = Study(
     goal="Healthy, four single gas faults, two pairs, a short circuit and three sensor faults of 1 "
     "to 4 %: Cohen's kappa of 0.8 or more, the information limit beside it.",
     tuned="chosen on seeds 1 to 99",
-    modules={
-        "isolation": ("estimators.apu.isolation", "scenarios.studies.estimation.isolation"),
-    },
+    modules={"isolation": ("estimators.apu.isolation", "scenarios.studies.estimation.isolation")},
     filters=_filters,
     text="""
 @intro

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.apu import identify
+from estimators.apu import identify, trials
 from scenarios.figures.estimationplot import plot_gain_of_a_sensor
 from scenarios.studies.gaspath.course import ETA_SIGMA, filters, fresh, modules
 from scenarios.studies.gaspath.powerworth import shaft_power, shaft_power_seeds
@@ -122,7 +122,7 @@ def _snapshot(n: int, seed0: int, tell: Tell) -> Any:
 @STUDY.part("trials", start=1, each=0.012)
 def _trials(n: int, seed0: int, tell: Tell) -> Any:
     seeds, variants = range(seed0, seed0 + n), identify.VARIANTS
-    made = {k: identify.snapshot_trials(seeds=seeds, **variants[k]) for k in identify.AIMS}
+    made = {k: trials.snapshot_trials(seeds=seeds, **variants[k]) for k in identify.AIMS}
     return {label: dataclasses.asdict(t) for label, t in made.items()}
 
 

@@ -234,7 +234,7 @@ def fuel_enthalpy(x: float, LHV: float) -> float:
     T = 298.15
     h = dict(zip(species.products, species.H0(np.array([T])) * 8.31446 * T, strict=True))
     M = (data.element_wts["C"] + x * data.element_wts["H"]) * 1e-3
-    return LHV + (h["CO2"] + x / 2 * h["H2O"] - (1 + x / 4) * h["O2"]) / M
+    return float(LHV + (h["CO2"] + x / 2 * h["H2O"] - (1 + x / 4) * h["O2"]) / M)
 
 
 def read(prob: om.Problem, pt: str) -> dict[str, float]:
