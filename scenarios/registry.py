@@ -127,8 +127,13 @@ def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
 
 
 @last(4)
-def unit_of(parameters: str = "{}", engine: str | None = None, content: str = "") -> Apu:
-    """Return the unit with some parameters changed, and another engine if one is given.
+def unit_of(
+    parameters: str = "{}",
+    engine: str | None = None,
+    content: str = "",
+    governor: str | None = None,
+) -> Apu:
+    """Return the unit with some parameters changed, and another engine or governor if given.
 
     The last few are kept, since building takes longer.
 
@@ -136,21 +141,28 @@ def unit_of(parameters: str = "{}", engine: str | None = None, content: str = ""
         parameters: values by dotted name, a JSON table.
         engine: file of the engine.
         content: its digest, so that a file that has changed is read again.
+        governor: name of the law.
 
     Raises:
         ParameterError: an unknown name or a value out of range.
     """
     from apu_casadi.unit.apu import Apu
 
-    unit = Apu() if engine is None else Apu(gas_generator=engine_of(engine))
-    return unit.change(json.loads(parameters))
+    parts: dict[str, Any] = {}
+    if engine is not None:
+        parts["gas_generator"] = engine_of(engine)
+    if governor is not None:
+        from apu_casadi.unit.control import GOVERNORS
+
+        parts["governor"] = GOVERNORS[governor]()
+    return Apu(**parts).change(json.loads(parameters))
 
 
 def unit_for(s: Scenario) -> Apu:
     """Return the unit that a scenario is about."""
-    law = {} if s.governor is None else {"governor.kind": s.governor}
-    parameters = json.dumps({**s.parameters, **law}, sort_keys=True)
-    return unit_of(parameters, *([s.engine, digest(s.engine, "engine file")] if s.engine else []))
+    parameters = json.dumps(dict(s.parameters), sort_keys=True)
+    content = digest(s.engine, "engine file") if s.engine else ""
+    return unit_of(parameters, s.engine, content, s.governor)
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:

@@ -68,7 +68,7 @@ class MyCapacitors(Load):
         return {"u_q": -i.d / (w_r * self.C), "u_d": i.q / (w_r * self.C)}
 
 
-# -- (b) a fault of another kind: shorted turns of the field winding --------
+# -- (b) a fault of another kind: shorted turns of the field winding ----
 
 
 @FAULTS.add("my_field")
@@ -103,14 +103,14 @@ class MyFieldShort(Fault):
         return {"my_field": cls(0.1)}
 
 
-# -- (c) a sensor: T41 by a thermocouple with a first-order lag --------
+# -- (c) a sensor: T41 by a thermocouple with a first-order lag ----
 
 register(
     Sensor("T41_mine", 0.005, True, 0.005, "K", "my thermocouple", (400.0, 1900.0),
            reads=("T41",), tau=0.8)
 )  # fmt: skip
 
-# -- (e) a governor with derivative action --------
+# -- (e) a governor with derivative action ----
 
 
 @GOVERNORS.add("my_PID")
@@ -137,7 +137,7 @@ class MyGovernor(Governor):
         return self.Ki * e + cut / self.T_aw, (e - x[1]) / self.T_d
 
 
-# -- (f) a filter step: the gain of the steady filter, which does not change --------
+# -- (f) a filter step: the gain of the steady filter, which does not change ----
 
 
 def constant_gain(K, S):

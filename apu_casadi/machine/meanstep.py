@@ -29,7 +29,7 @@ from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import exciter_step, leap
+from apu_casadi.machine.propagation import exciter_step, hoisted, leap
 from apu_casadi.machine.transition import SPEED_RANGE, cached_table, parity, symmetry
 from apu_casadi.machine.weights import end_weights, through
 
@@ -204,13 +204,15 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     for _ in range(4):
         xk, Vk = step(xk, Vk, P, u, th, h)
         states.append(xk)
-    panel = ca.Function("panel", [x, V, P, u, th, h], [ca.horzcat(*states), Vk], {"cse": True})
+    outputs = [ca.horzcat(*states), Vk]
+    panel, before = hoisted("panel", [x, V, P], ca.vertcat(u, th, h), outputs)
     x_k, V_k = X0, ca.vertcat(*V_of(X0, U, TH), 0)
     samples = [X0]
     for k, (number, share) in enumerate(PANELS):
         P_k = ca.mtimes(ca.reshape(series[k * 4 * n_P : (k + 1) * 4 * n_P], n_P, 4), powers)
+        d = before(ca.vertcat(U, TH, dt * share / 4))
         for _ in range(number):
-            four, V_k = panel(x_k, V_k, P_k, U, TH, dt * share / 4)
+            four, V_k = panel(x_k, V_k, P_k, d)
             x_k = four[:, 3]
             samples.append(four)
     X = ca.horzcat(*samples)
@@ -219,13 +221,11 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     rows = _constant_weights(d_, w_, t_, highest)
     weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
     W, share = ca.SX.sym("W", 2 * highest + 1), ca.SX.sym("share")
-    means = ca.Function(
-        "harmonics", [x, W, share, u, th], [_harmonics(ss, (x, u, th), quad, W, share)],
-        {"cse": True},
-    )  # fmt: skip
+    terms = _harmonics(ss, (x, u, th), quad, W, share)
+    means, before = hoisted("harmonics", [x, W, share], ca.vertcat(u, th), [terms])
     shares = ranges[2] + ranges[3] * ca.DM(_shares()).T
-    each = means.map("each", "serial", X.shape[1], [3, 4], [])
-    sampled = each(X, weights(dt, w, X0[at]), shares, U, TH)
+    each = means.map("each", "serial", X.shape[1], [3], [])
+    sampled = each(X, weights(dt, w, X0[at]), shares, before(ca.vertcat(U, TH)))
     return ca.Function(
         f"means_{ss.name}",
         [X0, ca.vertcat(series, ranges), U, TH, dt],
@@ -369,13 +369,13 @@ def _periodic_step(
     sign[ss.x.indices(ss.linear), 0] = kinds.sign[: len(ss.linear)]
     xk = xk * sign
     xk[at] = x[at]
-    half = ca.Function(
-        "half", [x, V, Pe, Po, u, th, h], [xk, Vk, ca.horzcat(*states)], {"cse": True}
-    )
+    outputs = [xk, Vk, ca.horzcat(*states)]
+    half, before = hoisted("half", [x, V, Pe, Po], ca.vertcat(u, th, h), outputs)
     h_now = stride / w
     x_k, V_k, samples = X0, ca.vertcat(V_of(X0, U, TH)[0], 0, 0), [X0]
+    d = before(ca.vertcat(U, TH, h_now))
     for _ in range(turn.halves):
-        x_k, V_k, X = half(x_k, V_k, *P, U, TH, h_now)
+        x_k, V_k, X = half(x_k, V_k, *P, d)
         samples.append(X)
     X = ca.horzcat(*samples)
     length = DT / h_now
@@ -383,10 +383,10 @@ def _periodic_step(
     outputs, share = ss.g(x, u, th), ca.SX.sym("share")
     terms = [Term.of(q).expression(ss, x, outputs, share) for q in quad]
     terms.append(outputs[ss.y.index("V_t")])
-    y = ca.Function("y", [x, share, u, th], [ca.vertcat(*terms)], {"cse": True})
+    y, before = hoisted("y", [x, share], ca.vertcat(u, th), [ca.vertcat(*terms)])
     # beyond the end of the step the weight goes on as the polynomial that it is
     shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
-    Y = y.map("ys", "serial", turn.samples, [2, 3], [])(X, shares, U, TH)
+    Y = y.map("ys", "serial", turn.samples, [2], [])(X, shares, before(ca.vertcat(U, TH)))
     mean = ca.mtimes(Y[:-1, :], weights[0, :].T) / length
     # the end of the step, with the phases as they are after so many half turns
     tail = np.arange(turn.first, turn.samples)

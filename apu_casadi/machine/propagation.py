@@ -213,18 +213,37 @@ def _fold(step: ca.Function, steps: int, n_P: Sequence[int], constant: bool,
         X, Vk = step(xk, Vk, ca.vertcat(*(p if constant else p[:, k] for p in P)), u, th, h)
         xk = X[:, -1]
         states.append(X)
-    fixed = [u, th, h, *(P if constant else [])]
+    outputs = [xk, Vk, ca.horzcat(*states)]
+    inner, before = hoisted("group", [x, V, *P], ca.vertcat(u, th, h), outputs)
+    d = ca.SX.sym("d", before.numel_out(0))
+    fixed = [d, *(P if constant else [])]
+    xk, Vk, X = inner(x, V, *P, d)
     group = ca.Function(
         "group",
         [ca.vertcat(x, V, *fixed), *([] if constant else P)],
-        [ca.vertcat(xk, Vk, *fixed), ca.horzcat(*states)],
+        [ca.vertcat(xk, Vk, *fixed), X],
         {"cse": True},
     )
     run = group.mapaccum("run", steps // size, 1)
     S = ca.MX.sym("S", nx + 3 + nu + nt + 1)
     PP = [ca.MX.sym("P", n, 1 if constant else steps) for n in n_P]
-    last, X_all = run(ca.vertcat(S, *PP)) if constant else run(S, *PP)
-    return ca.Function("fold", [S, *PP], [last[: S.numel(), steps // size - 1], X_all])
+    start = ca.vertcat(S[: nx + 3], before(S[nx + 3 :]))
+    last, X_all = run(ca.vertcat(start, *PP)) if constant else run(start, *PP)
+    end = ca.vertcat(last[: nx + 3, steps // size - 1], S[nx + 3 :])
+    return ca.Function("fold", [S, *PP], [end, X_all])
+
+
+def hoisted(
+    name: str, varying: Sequence[Any], fixed: Any, outputs: Sequence[Any]
+) -> tuple[ca.Function, ca.Function]:
+    """Take out of a loop what follows from its fixed inputs alone.
+
+    Returns:
+        Function (*varying, d) -> outputs, and Function fixed -> d.
+    """
+    new, d, by = ca.extract_parametric(ca.cse(list(outputs)), fixed, {"extract_trivial": True})
+    inner = ca.Function(name, [*varying, ca.vertcat(*d)], new, {"cse": True})
+    return inner, ca.Function(f"{name}_fixed", [fixed], [ca.vertcat(*by)], {"cse": True})
 
 
 @kept
@@ -268,10 +287,11 @@ def _advance(
     y, share = ss.g(xo, uo, to), ca.SX.sym("share")
     terms = [Term.of(q).expression(ss, xo, y, share) for q in quad]
     wanted = ca.vertcat(*(y[ss.y.index(k)] for k in outputs), *terms)
-    out = ca.Function("out", [xo, share, uo, to], [wanted], {"cse": True})
+    out, before = hoisted("out", [xo, share], ca.vertcat(uo, to), [wanted])
+    D = before(ca.vertcat(U, TH))
     w, shares = gregory(n_out), ca.DM(np.arange(1, n_out + 1) / n_out).T
-    y0 = out(X0, 0.0, U, TH)
-    Y = out.map("outs", "serial", n_out, [2, 3], [])(X_all, shares, U, TH)
+    y0 = out(X0, 0.0, D)
+    Y = out.map("outs", "serial", n_out, [2], [])(X_all, shares, D)
     k = len(outputs)
     means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
     return ca.Function(

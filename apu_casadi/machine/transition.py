@@ -25,7 +25,7 @@ import numpy as np
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.sharing import keep, kept
+from apu_casadi.core.sharing import keep, kept, once
 from apu_casadi.machine.generatormodel import GeneratorModel
 
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
@@ -78,6 +78,7 @@ def coefficients(ss: GeneratorModel) -> ca.Function:
     return ca.Function("M", [x[s.angle], u, th], [ca.densify(M)], {"cse": True})
 
 
+@once
 def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes in (0, 1], the last one 1, and Butcher matrix of a Radau IIA method."""
     c = np.array(ca.collocation_points(stages, "radau"))
@@ -97,32 +98,68 @@ def _transition(
     Returns:
         One array for each leap, shape (angles, n, n + EXTRA): the rows of the windings.
     """
-    c, a = _radau(STAGES)
+    c, _ = _radau(STAGES)
     hs, out = h / steps, []
     X = np.empty(0)
     for k in range(leaps * steps):
         t = hs[:, None] * (k + c)
         angles = theta0[:, None] + w[:, None] * t
         M = M_of(angles.ravel(), np.repeat(w, STAGES))
-        n = M.shape[1] - EXTRA
-        M = M.reshape(theta0.size, STAGES, n + EXTRA, n + EXTRA)[:, :, :n]
-        drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
-        drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
-        drive[..., -1, -1] = 1.0
-        if k == 0:
-            X = np.broadcast_to(np.eye(n, n + EXTRA), (theta0.size, n, n + EXTRA))
-        by_h = hs[:, None, None]
-        G = -a[None, :, None, :, None] * M[:, None, :, :, :n].transpose(0, 1, 3, 2, 4)
-        G = G.reshape(theta0.size, STAGES, n, STAGES, n).reshape(theta0.size, STAGES * n, -1)
-        G = by_h * G + np.eye(STAGES * n)
-        rhs = np.repeat(X[:, None], STAGES, axis=1)
-        forced = M[..., n:] @ drive
-        forced = by_h * (a @ forced.reshape(theta0.size, STAGES, -1))
-        rhs[..., n:] += forced.reshape(*t.shape, n, EXTRA)
-        X = np.linalg.solve(G, rhs.reshape(theta0.size, STAGES * n, n + EXTRA))[:, -n:]
+        M = M.reshape(theta0.size, STAGES, *M.shape[1:])
+        X = _radau_step(M, t, hs, X if k else None)
         if (k + 1) % steps == 0:
             out.append(X)
     return out
+
+
+def _radau_step(
+    M: np.ndarray, t: np.ndarray, hs: np.ndarray, X: np.ndarray | None = None
+) -> np.ndarray:
+    """Advance transition matrices by one step of the Radau method.
+
+    Args:
+        M: coefficients at the nodes, shape (angles, STAGES, n + EXTRA, n + EXTRA).
+        t, hs: instants of the nodes, (angles, STAGES), and length of the step, (angles,), s.
+        X: matrices before it, (angles, n, n + EXTRA); None at the start.
+    """
+    _, a = _radau(STAGES)
+    N, n = hs.size, M.shape[2] - EXTRA
+    M = M[:, :, :n]
+    drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
+    drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
+    drive[..., -1, -1] = 1.0
+    if X is None:
+        X = np.broadcast_to(np.eye(n, n + EXTRA), (N, n, n + EXTRA))
+    by_h = hs[:, None, None]
+    G = -a[None, :, None, :, None] * M[:, None, :, :, :n].transpose(0, 1, 3, 2, 4)
+    G = by_h * G.reshape(N, STAGES * n, STAGES * n) + np.eye(STAGES * n)
+    rhs = np.repeat(X[:, None], STAGES, axis=1)
+    forced = by_h * (a @ (M[..., n:] @ drive).reshape(N, STAGES, -1))
+    rhs[..., n:] += forced.reshape(*t.shape, n, EXTRA)
+    return np.linalg.solve(G, rhs.reshape(N, STAGES * n, n + EXTRA))[:, -n:]
+
+
+def _constant_transition(M: np.ndarray, h: np.ndarray, steps: int, leaps: int = 1) -> np.ndarray:
+    """Do what :func:`_transition` does where M, of one angle for each speed, does not depend on it.
+
+    All steps are then the same: a power of one, with E and its derivatives among the states.
+
+    Returns:
+        Shape (leaps, angles, n, n + EXTRA).
+    """
+    c, _ = _radau(STAGES)
+    hs, n = h / steps, M.shape[1] - EXTRA
+    one = np.zeros(M.shape)
+    for i in range(EXTRA - 1):
+        for j in range(i, EXTRA - 1):
+            one[:, n + i, n + j] = hs ** (j - i) / math.factorial(j - i)
+    one[:, -1, -1] = 1.0
+    one[:, :n] = _radau_step(np.repeat(M[:, None], STAGES, axis=1), hs[:, None] * c, hs)
+    leap = np.linalg.matrix_power(one, steps)
+    powers = [leap]
+    for _ in range(leaps - 1):
+        powers.append(powers[-1] @ leap)
+    return np.stack(powers)[:, :, :n]
 
 
 @kept
@@ -264,25 +301,36 @@ def transition_table(
     def length(w: np.ndarray) -> np.ndarray:
         return angle / w if angle is not None else np.full(w.shape, h)
 
+    if constant:
+        M = M_of(np.zeros(NODES), nodes)
+
+    def trial(steps: int) -> np.ndarray:
+        """Transition matrices that tell whether the steps suffice."""
+        if constant:
+            slow = [int(nodes.argmin())]
+            return _constant_transition(M[slow], length(nodes)[slow], steps)[0]
+        slowest = np.full(_PROBE.size, nodes.min())
+        return _transition(M_of, _PROBE, slowest, length(slowest), steps)[0]
+
     # the number of steps is doubled until the probes agree, then used for all angles
-    steps, error = 1, math.inf
-    probe = _PROBE[:1] if constant else _PROBE
-    slowest = np.full(probe.size, nodes.min())
-    last = _transition(M_of, probe, slowest, length(slowest), steps)[0]
+    steps, error, last = 1, math.inf, trial(1)
     while error > STEP_TOL:
         if steps >= 64:
             raise NotApplicable(
-                f"{ss.name}: transition matrices over {length(slowest)[0]:.3g} s do not converge "
+                f"{ss.name}: transition matrices over {length(nodes).max():.3g} s do not converge "
                 f"(error {error:.1e} with {steps} steps)"
             )
-        new = _transition(M_of, probe, slowest, length(slowest), 2 * steps)[0]
+        new = trial(2 * steps)
         error = float(np.abs(new - last).max())
         steps, last = 2 * steps, new
 
     def sampled(angles: np.ndarray) -> np.ndarray:
         """Entries in nominal units, column by column, leap after leap: (nodes, angles, entries)."""
         a, w = np.tile(angles, NODES), np.repeat(nodes, angles.size)
-        P = np.stack(_transition(M_of, a, w, length(w), steps, leaps), axis=1)
+        if constant:
+            P = _constant_transition(M, length(nodes), steps, leaps).swapaxes(0, 1)
+        else:
+            P = np.stack(_transition(M_of, a, w, length(w), steps, leaps), axis=1)
         return P.transpose(0, 1, 3, 2).reshape(NODES, angles.size, -1)
 
     units = np.tile((1 / _scale(ss)[:n]).T.ravel(), leaps)
