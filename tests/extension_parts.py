@@ -19,7 +19,7 @@ from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc, speed_volt
 from apu_casadi.unit.control import GOVERNORS, Governor
 from estimators.apu.sensors import Sensor, register
 
-# -- (a) a load: R and C in series in each phase, voltages of the capacitors on the rotor's axes --
+# -- (a) a load: R and C in series in each phase; capacitors on the rotor axes ----
 
 
 @LOADS.add("my_RC")

@@ -261,6 +261,29 @@ def test_a_register_refuses_a_name_twice_and_an_unknown_one():
         register["unu"]
 
 
+def test_parts_share_equations_with_the_class_that_wrote_them():
+    """A subclass with other words shares the model; one with other equations does not."""
+
+    class Heater(SeriesLoad):
+        label = "heater"
+
+    class Doubled(SeriesLoad):
+        def drop(self, at):
+            return type(at.v)(*(2 * v for v in super().drop(at)))
+
+    class Bolted(Ttsc):
+        word = "bolted"
+
+    R = (1.0, 1.0, 1.0)
+    plain = GEN.variant(SeriesLoad(R))
+    assert GEN.variant(Heater(R)) is plain is GEN.variant(OpenLoad())
+    twice = GEN.variant(Doubled(R))
+    assert twice is not plain
+    x, u = GEN.steady_state(SeriesLoad(R)).x, GEN.inputs(SeriesLoad(R))
+    assert_allclose(twice.g(x, u, [])[:3], 2 * plain.g(x, u, [])[:3].full(), rtol=1e-12)
+    assert GEN.variant(KW100, Bolted(0.05, 1.0)) is GEN.variant(KW100, Ttsc(0.05, 1.0))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

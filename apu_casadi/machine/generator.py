@@ -285,34 +285,11 @@ class Generator(Parametric):
                 "and switch"
             )
 
-        def at(V: float) -> tuple[float, Windings, ac5a.ExciterState, float]:
-            V_fd, i = self._field(V, load.impedance(w_r, V), w_r)
-            E_fd = V_fd / p.V_fd_base
-            states, ref = ac5a.exciter_steady(e, E_fd=E_fd, V_t=V / p.V_rated_rms)
-            return V_fd, i, states, ref
-
         if V_t is None:
-            wanted = self.V_ref_default if V_ref is None else V_ref
-            # V_t = V_ref - V_R / K_A with 0 <= V_R <= V_R_max at rest, so the root is bracketed
-            low = max((wanted - e.V_R_max / e.K_A) * p.V_rated_rms, 1e-6 * p.V_rated_rms)
-            high = wanted * p.V_rated_rms
-            excess = [at(low)[3] - wanted, at(high)[3] - wanted] if high > low else [0.0, 0.0]
-            if not excess[0] <= 0 <= excess[1]:
-                raise OperatingPointError(
-                    f"no regulated steady state for {load!r} at V_ref = {wanted:.5g}, "
-                    f"w_r = {w_r:.5g} rad/s: even at {low:.4g} V the regulator would need "
-                    f"V_R = {at(low)[2].V_R:.4g}, ceiling {e.V_R_max:g}"
-                )
-            import scipy.optimize
-
-            V_t = float(
-                scipy.optimize.brentq(
-                    lambda V: at(V)[3] - wanted, low, high, xtol=1e-12, rtol=1e-15
-                )
-            )
+            V_t = self._regulated(load, w_r, self.V_ref_default if V_ref is None else V_ref)
         if not V_t > 0:
             raise OperatingPointError(f"terminal voltage must be > 0, got {V_t!r} V")
-        _, i, states, ref = at(V_t)
+        i, states, ref = self._at_rest(load, w_r, V_t)
         if not e.V_R_min <= states.V_R <= e.V_R_max:
             raise OperatingPointError(
                 f"holding {V_t:.5g} V with {load!r} at w_r = {w_r:.5g} rad/s needs "
@@ -337,6 +314,36 @@ class Generator(Parametric):
             )
         y = ss.y.unpack(ss.g(x, u, []).full().ravel())
         return GeneratorPoint(ss, x, u, ref, V_t, y, float(abs(rate[worst])))
+
+    def _at_rest(
+        self, load: Load, w_r: float, V_t: float
+    ) -> tuple[Windings, ac5a.ExciterState, float]:
+        """Return currents, exciter and V_ref at rest with a terminal voltage, V rms."""
+        p = self.machine
+        V_fd, i = self._field(V_t, load.impedance(w_r, V_t), w_r)
+        E_fd = V_fd / p.V_fd_base
+        return i, *ac5a.exciter_steady(self.exciter, E_fd=E_fd, V_t=V_t / p.V_rated_rms)
+
+    def _regulated(self, load: Load, w_r: float, V_ref: float) -> float:
+        """Return the terminal voltage, V rms, that the regulator holds with ``V_ref``.
+
+        V_t = V_ref - V_R / K_A with 0 <= V_R <= V_R_max at rest, so the root is bracketed.
+        """
+        import scipy.optimize
+
+        rated, e = self.machine.V_rated_rms, self.exciter
+
+        def excess(V: float) -> float:
+            return self._at_rest(load, w_r, V)[2] - V_ref
+
+        low, high = max((V_ref - e.V_R_max / e.K_A) * rated, 1e-6 * rated), V_ref * rated
+        if high > low and not excess(low) <= 0 <= excess(high):
+            raise OperatingPointError(
+                f"no regulated steady state for {load!r} at V_ref = {V_ref:.5g}, "
+                f"w_r = {w_r:.5g} rad/s: even at {low:.4g} V the regulator would need "
+                f"V_R = {self._at_rest(load, w_r, low)[1].V_R:.4g}, ceiling {e.V_R_max:g}"
+            )
+        return float(scipy.optimize.brentq(excess, low, high, xtol=1e-12, rtol=1e-15))
 
     # -- standalone studies -----------------------------------------------------------------
 
@@ -421,10 +428,10 @@ class _Transfer:
     told: list[str]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
+        now = {"u_target": self.u_target, "theta_target": self.theta_target}
         after = self.generator.transfer(
-            x, self.source, self.target, u=self.u, theta=self.theta, u_target=self.u_target,
-            theta_target=self.theta_target,
-        )  # fmt: skip
+            x, self.source, self.target, u=self.u, theta=self.theta, **now
+        )
         text = self.generator.spike(
             self.target, after, self.u_target, self.theta_target, t=self.t, load=self.load
         )

@@ -181,8 +181,8 @@ def _parts(ss: GeneratorModel, x: Any, u: Any, th: Any, terms: ca.Function) -> l
         parts = [sum(f) / _PHASES]
         for k in (1, 2):
             for trig in (np.cos, np.sin):
-                parts.append(sum(2 / _PHASES * float(trig(k * p)) * v
-                                 for p, v in zip(phi, f, strict=True)))  # fmt: skip
+                weights = (2 / _PHASES * float(trig(k * p)) for p in phi)
+                parts.append(sum(a * v for a, v in zip(weights, f, strict=True)))
         found.append(parts)
     return found
 
@@ -334,6 +334,35 @@ def _end_weights(turn: Turn) -> ca.Function:
     return ca.Function("end_weights", [r], [ca.densify(ca.vertcat(*rows))], {"cse": True})
 
 
+def _signs(ss: GeneratorModel) -> np.ndarray:
+    """-1 for the states that half a turn reverses, 1 for the others, shape (nx, 1)."""
+    sign = np.ones((len(ss.x), 1))
+    sign[ss.x.indices(ss.reversing), 0] = -1.0
+    return sign
+
+
+def _half_turn(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
+    """Half a turn, after which the phases are reversed instead of the angle going on.
+
+    First: (x, V, even and odd entries, d) -> (x, V, x at the strides).  Second: (u, theta, length
+    of a stride) -> d.
+    """
+    nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
+    step, _ = leap(ss, PACE, False, chained=True)
+    x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
+    P = [ca.SX.sym("P", part.size, STRIDES // 2) for part in (kinds.even, kinds.odd)]
+    h, at = ca.SX.sym("h"), ss.x.index("theta_e")
+    xk, Vk, states = x, V, []
+    for k in range(0, STRIDES // 2, PACE):
+        these = [ca.vec(p[:, k : k + PACE]) for p in P]
+        X, Vk = step(xk, Vk, ca.vertcat(*these), u, th, h)
+        xk = X[:, -1]
+        states.append(X)
+    xk = xk * _signs(ss)
+    xk[at] = x[at]
+    return hoisted("half", [x, V, *P], ca.vertcat(u, th, h), [xk, Vk, ca.horzcat(*states)])
+
+
 def _periodic_step(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn, harmonics: int
 ) -> ca.Function:
@@ -354,23 +383,8 @@ def _periodic_step(
         entry = _matrices(pairs[i], half_turn, odd=bool(i)).map("all", "serial", rows, [1, 2], [])
         trig = _trig(pairs[i], half_turn, odd=bool(i))(theta0)
         P.append(entry(series, s, trig).T)
-    # half a turn; then the phases are reversed instead of the angle going on
-    step, V_of = leap(ss, PACE, False, chained=True)
-    x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
-    Pe, Po = ca.SX.sym("P", n_even, half_turn), ca.SX.sym("Q", n_odd, half_turn)
-    h = ca.SX.sym("h")
-    xk, Vk, states = x, V, []
-    for k in range(0, half_turn, PACE):
-        these = [ca.vec(p[:, k : k + PACE]) for p in (Pe, Po)]
-        X, Vk = step(xk, Vk, ca.vertcat(*these), u, th, h)
-        xk = X[:, -1]
-        states.append(X)
-    sign = np.ones((nx, 1))
-    sign[ss.x.indices(ss.linear), 0] = kinds.sign[: len(ss.linear)]
-    xk = xk * sign
-    xk[at] = x[at]
-    outputs = [xk, Vk, ca.horzcat(*states)]
-    half, before = hoisted("half", [x, V, Pe, Po], ca.vertcat(u, th, h), outputs)
+    half, before = _half_turn(ss)
+    _, V_of = leap(ss, PACE, False, chained=True)
     h_now = stride / w
     x_k, V_k, samples = X0, ca.vertcat(V_of(X0, U, TH)[0], 0, 0), [X0]
     d = before(ca.vertcat(U, TH, h_now))
@@ -380,6 +394,7 @@ def _periodic_step(
     X = ca.horzcat(*samples)
     length = DT / h_now
     weights = _end_weights(turn)(length)
+    x, u, th = (ca.SX.sym(k, n) for k, n in zip("xut", (nx, nu, nt), strict=True))
     outputs, share = ss.g(x, u, th), ca.SX.sym("share")
     terms = [Term.of(q).expression(ss, x, outputs, share) for q in quad]
     terms.append(outputs[ss.y.index("V_t")])
@@ -391,16 +406,14 @@ def _periodic_step(
     # the end of the step, with the phases as they are after so many half turns
     tail = np.arange(turn.first, turn.samples)
     turned = np.maximum(0, (tail - 1) // (STRIDES // 2)) % 2 == 1
-    reversed_ = np.where(turned, sign, 1.0)
+    reversed_ = np.where(turned, _signs(ss), 1.0)
     X_tail = X[:, turn.first :] * reversed_
     ends = ca.mtimes(X_tail, weights[1:, turn.first :].T)
     linear = np.zeros((nx, 1))
     linear[ss.x.indices(ss.linear), 0] = 1
     # the exciter's last step is as long as it must be
     V_tail = Y[-1, turn.first :]
-    V_end, V_middle, V_start = (
-        ca.mtimes(V_tail, weights[k, turn.first :].T) for k in (1, 3, 4)
-    )  # fmt: skip
+    V_end, V_middle, V_start = (ca.mtimes(V_tail, weights[k, turn.first :].T) for k in (1, 3, 4))
     rest = DT - h_now * PACE * ca.floor(length / PACE)
     _, exciter = exciter_step(ss)
     slow = [i for i in range(nx) if i != at and not linear[i, 0]]

@@ -195,8 +195,13 @@ def leap(
     return one, V_of
 
 
-def _fold(step: ca.Function, steps: int, n_P: Sequence[int], constant: bool,
-          sizes: tuple[int, int, int]) -> ca.Function:  # fmt: skip
+def _fold(
+    step: ca.Function,
+    steps: int,
+    n_P: Sequence[int],
+    constant: bool,
+    sizes: tuple[int, int, int],
+) -> ca.Function:
     """``steps`` steps of the exciter: (start, P) -> (start of the next, x at all samples).
 
     ``start`` holds x, V and what stays; ``P`` is one matrix of even entries where ``constant``,

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -36,6 +37,9 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import wrsg
 from apu_casadi.machine.faults import ttsc
+from apu_casadi.machine.generatormodel import ANGLE, DRIVES
+from apu_casadi.machine.generatormodel import FLUXES as _ALL_FLUXES
+from apu_casadi.machine.generatormodel import OUTPUTS as GENERATOR
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import (
     PHASE_ANGLE,
@@ -51,54 +55,38 @@ FAULTS = ("shunts", "leaky")
 #: Of the voltages, beside the fundamental: what saliency and an unbalance make together.
 HARMONICS = (3, 5)
 
-FLUXES = Signals(
-    [
-        Signal("lam_sq", "Wb", "stator flux linkage, q axis", nominal=0.1),
-        Signal("lam_sd", "Wb", "stator flux linkage, d axis", nominal=0.1),
-        Signal("lam_s0", "Wb", "stator flux linkage, zero sequence", nominal=0.01),
-        Signal("lam_fd", "Wb", "field flux linkage", nominal=0.1),
-        Signal("lam_kd", "Wb", "d damper flux linkage", nominal=0.1),
-        Signal("lam_kq", "Wb", "q damper flux linkage", nominal=0.1),
-    ]
-)
-ANGLE = Signal("theta_e", "rad", "rotor angle, phase-a axis to q axis, unwrapped")
-I_FAULT = Signal("i_fault", "A", "current of the fault branch", nominal=1e3)
-INPUTS = Signals(
-    [
-        Signal("w_r", "rad/s", "electrical rotor speed", nominal=2500.0),
-        *(Signal(f"v_{k}", "V", f"terminal voltage of phase {k} to the machine's neutral",
-                 nominal=300.0) for k in "abc"),
-        Signal("V_fd", "V", "field voltage, referred to the stator", nominal=50.0),
-    ]
-)  # fmt: skip
+#: Those of the generator; the zero sequence is small where the terminals are given.
+FLUXES = Signals([replace(s, nominal=0.01) if s.name == "lam_s0" else s for s in _ALL_FLUXES])
+I_FAULT = GENERATOR["i_fault"]
+INPUTS = Signals([DRIVES[0], *(GENERATOR[n] for n in ("v_a", "v_b", "v_c", "V_fd"))])
 #: Of the variant ``"shunts"``: one severity for each phase, zero where there is no fault.
 SHUNTS = Signals(
     [
-        Signal(f"h_{k}", "1", f"severity mu/(k_rf + 1 - mu) of phase {k}", default=0.0,
-               nominal=1e-3) for k in "abc"
-    ]
-)  # fmt: skip
-#: Of the variant ``"leaky"``, in the order of the generator's variant of that name.
-LEAKY = Signals(
-    [
-        Signal("mu", "1", "fraction of the phase's turns that is shorted", nominal=0.05),
-        Signal("k_rf", "1", "fault over shorted-turn resistance (4)"),
-        Signal("kappa", "1", "leakage partition, mu < kappa <= 1"),
-        Signal("phase_angle", "rad", "axis of the faulty phase; 0 for phase a"),
+        Signal(
+            f"h_{k}", "1", f"severity mu/(k_rf + 1 - mu) of phase {k}", default=0.0, nominal=1e-3
+        )
+        for k in "abc"
     ]
 )
+#: Of the variant ``"leaky"``, in the order of the generator's variant of that name.
+LEAKY = Signals(ttsc.Ttsc.examples()["leaky"].own("leaky", "grounded").theta)
 OUTPUTS = Signals(
     [
-        *(Signal(f"i_{k}", "A", f"terminal current of phase {k}", nominal=300.0) for k in "abc"),
-        Signal("i_fd", "A", "field current, referred to the stator", nominal=1e3),
-        Signal("i_kd", "A", "d damper current", nominal=100.0),
-        Signal("i_kq", "A", "q damper current", nominal=100.0),
-        Signal("T_e", "N m", "electromagnetic torque of one machine", nominal=200.0),
-        Signal("P_e", "W", "electrical output of one machine", nominal=2e5),
-        Signal("P_loss_fault", "W", "extra loss of the fault in (8), one machine", nominal=1e4),
-        Signal("P_total", "W", "mechanical power of both machines (8)", nominal=4e5),
+        GENERATOR[n]
+        for n in [
+            "i_a",
+            "i_b",
+            "i_c",
+            "i_fd",
+            "i_kd",
+            "i_kq",
+            "T_e",
+            "P_e",
+            "P_loss_fault",
+            "P_total",
+        ]
     ]
-)  # fmt: skip
+)
 
 
 class Terminals(NamedTuple):
@@ -372,8 +360,8 @@ def terminal_model(p: MachineParameters, fault: str = "shunts") -> StateSpace:
     (xv, x), (uv, u), (tv, th) = X.sx(), INPUTS.sx(), TH.sx()
     at = Terminals(u["w_r"], Abc(u["v_a"], u["v_b"], u["v_c"]), u["V_fd"])
     lam = Windings(*(x[n] for n in FLUXES.names))
-    ode, y = terminal_equations(p, lam=lam, theta_e=x["theta_e"], at=at, fault=th,
-                                i_fault=x.get("i_fault"))  # fmt: skip
+    machine = {"lam": lam, "theta_e": x["theta_e"], "at": at}
+    ode, y = terminal_equations(p, **machine, fault=th, i_fault=x.get("i_fault"))
     z, none = Signals(), ca.SX(0, 1)
     ode_v, y_v = X.stack(ode), OUTPUTS.stack(y)
     return StateSpace.of(

@@ -16,6 +16,7 @@ no equation is written again.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -312,17 +313,9 @@ def transition_table(
         slowest = np.full(_PROBE.size, nodes.min())
         return _transition(M_of, _PROBE, slowest, length(slowest), steps)[0]
 
-    # the number of steps is doubled until the probes agree, then used for all angles
-    steps, error, last = 1, math.inf, trial(1)
-    while error > STEP_TOL:
-        if steps >= 64:
-            raise NotApplicable(
-                f"{ss.name}: transition matrices over {length(nodes).max():.3g} s do not converge "
-                f"(error {error:.1e} with {steps} steps)"
-            )
-        new = trial(2 * steps)
-        error = float(np.abs(new - last).max())
-        steps, last = 2 * steps, new
+    steps, error = _enough(
+        trial, f"{ss.name}: transition matrices over {length(nodes).max():.3g} s"
+    )
 
     def sampled(angles: np.ndarray) -> np.ndarray:
         """Entries in nominal units, column by column, leap after leap: (nodes, angles, entries)."""
@@ -343,20 +336,8 @@ def transition_table(
         P = sampled(np.zeros(1))
         none = np.zeros((NODES, 0, kinds.odd.size))
         return Table(centre, half, powers(P[:, :, kinds.even], kinds.even), none, 0, error)
-    turn = np.ones(kinds.even.size + kinds.odd.size)
-    turn[kinds.odd] = -1.0
-    for resolved in HARMONICS:
-        P = sampled(np.pi * np.arange(resolved) / resolved)
-        F = np.fft.rfft(np.concatenate([P, P * turn], axis=1), axis=1) / (2 * resolved)
-        size = np.abs(F).max(axis=(0, 2))
-        highest = int(np.nonzero(size > TAIL * size.max())[0][-1])
-        if highest < resolved - 1:
-            break
-    else:
-        raise NotApplicable(
-            f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s has over {highest} "
-            f"harmonics of the rotor angle above {TAIL:g}: the load is too light for this step"
-        )
+    what = f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s"
+    F, highest = _fourier(sampled, kinds, what)
 
     def series(first: int, which: np.ndarray) -> np.ndarray:
         part = F[:, first : highest + 1 : 2, which]
@@ -367,6 +348,41 @@ def transition_table(
 
     even, odd = series(0, kinds.even), series(1, kinds.odd)
     return Table(centre, half, even, odd, highest, error)
+
+
+def _enough(trial: Callable[[int], np.ndarray], what: str) -> tuple[int, float]:
+    """Return how many steps suffice, doubled until trials agree, and the last change."""
+    steps, error, last = 1, math.inf, trial(1)
+    while error > STEP_TOL:
+        if steps >= 64:
+            raise NotApplicable(f"{what} do not converge (error {error:.1e} with {steps} steps)")
+        new = trial(2 * steps)
+        error = float(np.abs(new - last).max())
+        steps, last = 2 * steps, new
+    return steps, error
+
+
+def _fourier(
+    sampled: Callable[[np.ndarray], np.ndarray], kinds: Parity, what: str
+) -> tuple[np.ndarray, int]:
+    """Return Fourier coefficients of entries sampled over half a turn, and the highest that counts.
+
+    The other half follows from the parity.
+    """
+    turn = np.ones(kinds.even.size + kinds.odd.size)
+    turn[kinds.odd] = -1.0
+    highest = 0
+    for resolved in HARMONICS:
+        P = sampled(np.pi * np.arange(resolved) / resolved)
+        F = np.fft.rfft(np.concatenate([P, P * turn], axis=1), axis=1) / (2 * resolved)
+        size = np.abs(F).max(axis=(0, 2))
+        highest = int(np.nonzero(size > TAIL * size.max())[0][-1])
+        if highest < resolved - 1:
+            return F, highest
+    raise NotApplicable(
+        f"{what} has over {highest} harmonics of the rotor angle above {TAIL:g}: the load is too "
+        "light for this step"
+    )
 
 
 def cached_table(
@@ -384,8 +400,8 @@ def cached_table(
     key_u[ss.u.indices(["w_r", "V_ref"])] = 0.0
     length = (None if h is None else round(h, 15), angle)
     key = (key_u.tobytes(), theta.tobytes(), *length, w_rated, leaps)
-    return keep(
-        ss, Table, key,
-        lambda: transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps),
-        locked=False,
-    )  # fmt: skip
+
+    def make() -> Table:
+        return transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps)
+
+    return keep(ss, Table, key, make, locked=False)

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.register import Key, Register, read_table
 from apu_casadi.core.signals import Signal
-from apu_casadi.machine.loads.load import Load
+from apu_casadi.machine.loads.load import Load, writer
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import Abc
 
@@ -195,7 +195,7 @@ class FaultStructure:
 
     Args:
         kind: of the equations.
-        owner: class of the fault.
+        owner: the class that writes the equations.
         fault: any fault of that class.
     """
 
@@ -206,4 +206,5 @@ class FaultStructure:
     @classmethod
     def of(cls, fault: Fault, kind: str) -> FaultStructure:
         """Return the structure of a fault in the equations of a kind."""
-        return cls(kind, type(fault), fault)
+        names = ["own", "machine", "branch", "residuals", "rates", "loss", "outputs", "reversing"]
+        return cls(kind, writer(type(fault), tuple(names)), fault)

@@ -59,10 +59,9 @@ class CapacitorLoad(Load):
     R: tuple[float, float, float]
     C: tuple[float, float, float]
 
-    tables = MappingProxyType({
-        "RC": (POWER, _LEADING, UNBALANCE),
-        "series_RC": (RESISTANCE, _CAPACITY),
-    })  # fmt: skip
+    tables = MappingProxyType(
+        {"RC": (POWER, _LEADING, UNBALANCE), "series_RC": (RESISTANCE, _CAPACITY)}
+    )
     reversing = ("v_C0",)
 
     def __post_init__(self) -> None:

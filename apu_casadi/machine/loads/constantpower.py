@@ -93,8 +93,9 @@ class ConstantPowerLoad(Load):
         """Return G."""
         return {"G_load": 1.0 / self.impedance(w_r, V_t).real}
 
-    def start(self, before: Mapping[str, float], u: Mapping[str, float], V_rated: float
-              ) -> dict[str, float]:  # fmt: skip
+    def start(
+        self, before: Mapping[str, float], u: Mapping[str, float], V_rated: float
+    ) -> dict[str, float]:
         """Return the G that was there, or the one that draws the power at once."""
         if "G_load" in before:
             return {"G_load": before["G_load"]}

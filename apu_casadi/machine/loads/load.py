@@ -141,8 +141,9 @@ class Load(ABC):
         """Return the own states of a balanced load at rest, with its current ``i``, A."""
         return {}
 
-    def start(self, before: Mapping[str, float], u: Mapping[str, float], V_rated: float
-              ) -> dict[str, float]:  # fmt: skip
+    def start(
+        self, before: Mapping[str, float], u: Mapping[str, float], V_rated: float
+    ) -> dict[str, float]:
         """Return the own states just after a switch; equal names are continued, others zero.
 
         Args:
@@ -225,7 +226,7 @@ class LoadStructure:
 
     Args:
         kind: of the load.
-        owner: the class that writes ``drop``.
+        owner: the class that writes the equations.
         load: any load of that kind.
     """
 
@@ -236,8 +237,13 @@ class LoadStructure:
     @classmethod
     def of(cls, load: Load) -> LoadStructure:
         """Return the structure of a load."""
-        owner = next(c for c in type(load).__mro__ if "drop" in vars(c))
-        return cls(load.kind, owner, load)
+        names = ("own", "drop", "rates", "residuals", "linear", "reversing")
+        return cls(load.kind, writer(type(load), names), load)
+
+
+def writer(cls: type, names: tuple[str, ...]) -> type:
+    """Return the class that writes one of the names anew, the last to do so: itself or a base."""
+    return next(c for c in cls.__mro__ if any(n in vars(c) for n in names))
 
 
 def by_phase(name: str, unit: str, doc: str, nominal: float = 1.0) -> tuple[Signal, ...]:

@@ -31,10 +31,8 @@ from apu_casadi.machine.park import Abc
 R_MAX = 1e6
 
 POWER = Key("power_kW", "kW", "power at rated voltage", 0.1, 500.0)
-UNBALANCE = Key(
-    "unbalance", "1", "power of the phases relative to the balanced load", 0.05, 3.0,
-    default=None, phases=True,
-)  # fmt: skip
+_SHARES = "power of the phases relative to the balanced load"
+UNBALANCE = Key("unbalance", "1", _SHARES, 0.05, 3.0, default=None, phases=True)
 FACTOR = Key("power_factor", "1", "power factor", 0.1, 1.0, default=0.85)
 RESISTANCE = Key("R_ohm", "ohm", "resistance by phase", 0.0, open_lo=True, phases=True)
 INDUCTANCE = Key("L_mH", "mH", "inductance by phase", 0.0, phases=True)
@@ -90,11 +88,13 @@ class SeriesLoad(Impedance):
     R: tuple[float, float, float]
     L: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    tables = MappingProxyType({
-        "R": (POWER, UNBALANCE),
-        "RL": (POWER, FACTOR, UNBALANCE),
-        "series": (RESISTANCE, INDUCTANCE),
-    })  # fmt: skip
+    tables = MappingProxyType(
+        {
+            "R": (POWER, UNBALANCE),
+            "RL": (POWER, FACTOR, UNBALANCE),
+            "series": (RESISTANCE, INDUCTANCE),
+        }
+    )
 
     def __post_init__(self) -> None:
         three("SeriesLoad.R [ohm]", self.R)
