@@ -127,13 +127,8 @@ def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
 
 
 @last(4)
-def unit_of(
-    parameters: str = "{}",
-    engine: str | None = None,
-    content: str = "",
-    governor: str | None = None,
-) -> Apu:
-    """Return the unit with some parameters changed, and another engine or governor if given.
+def unit_of(parameters: str = "{}", engine: str | None = None, content: str = "") -> Apu:
+    """Return the unit with some parameters changed, and another engine if one is given.
 
     The last few are kept, since building takes longer.
 
@@ -141,28 +136,21 @@ def unit_of(
         parameters: values by dotted name, a JSON table.
         engine: file of the engine.
         content: its digest, so that a file that has changed is read again.
-        governor: name of the law.
 
     Raises:
         ParameterError: an unknown name or a value out of range.
     """
     from apu_casadi.unit.apu import Apu
 
-    parts: dict[str, Any] = {}
-    if engine is not None:
-        parts["gas_generator"] = engine_of(engine)
-    if governor is not None:
-        from apu_casadi.unit.control import GOVERNORS
-
-        parts["governor"] = GOVERNORS[governor]()
-    return Apu(**parts).change(json.loads(parameters))
+    unit = Apu() if engine is None else Apu(gas_generator=engine_of(engine))
+    return unit.change(json.loads(parameters))
 
 
 def unit_for(s: Scenario) -> Apu:
     """Return the unit that a scenario is about."""
-    parameters = json.dumps(dict(s.parameters), sort_keys=True)
-    content = digest(s.engine, "engine file") if s.engine else ""
-    return unit_of(parameters, s.engine, content, s.governor)
+    law = {} if s.governor is None else {"governor.kind": s.governor}
+    parameters = json.dumps({**s.parameters, **law}, sort_keys=True)
+    return unit_of(parameters, *([s.engine, digest(s.engine, "engine file")] if s.engine else []))
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:

@@ -222,7 +222,8 @@ class Scenario(_Plain):
         seed: seed of the noise.
         parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
         engine: file of another engine than the paper's, seen from the scenario's file.
-        governor: name of another law than the PI law; its numbers are parameters ``governor.*``.
+        governor: name of another law than the PI law, short for the parameter ``governor.kind``;
+            its numbers are parameters ``governor.*``.
         extensions: Python files that register parts which the scenario names, seen from its file.
 
     Raises:
@@ -284,6 +285,9 @@ class Scenario(_Plain):
         if self.governor is not None:
             hint = f"unknown {self.governor!r} {nearest(str(self.governor), GOVERNORS)}"
             require(self.governor in GOVERNORS, "governor", hint)
+            kind = checked.get("governor.kind", self.governor)
+            hint = f"{self.governor!r}, but parameters.governor.kind is {kind!r}; keep one"
+            require(kind == self.governor, "governor", hint)
         put(self, "phases", _each("phase", Phase, self.phases))
         put(self, "changes", _each("event", Change, self.changes))
         self._check_phases()

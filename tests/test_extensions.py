@@ -254,6 +254,10 @@ def test_a_governor_of_ones_own(files, capsys):
         assert Scenario.from_dict(s.to_dict()) == s
         lowest[name] = float(registry.run(s)["N"].min())
     assert lowest["PID"] > lowest["PI"] + 1.0  # the derivative catches the drop
+    both = own.replace("parameters.governor.Kd", "parameters.governor.kind = 'PI'\n# ")
+    path.write_text(both)
+    with pytest.raises(ScenarioError, match=r"governor: 'PID', but parameters.governor.kind is"):
+        registry.get(path)
     path.write_text(own.replace('"PID"', '"PIDD"'))
     with pytest.raises(ScenarioError, match=r"governor: unknown 'PIDD' \(did you mean 'PID'\?\)"):
         registry.get(path)

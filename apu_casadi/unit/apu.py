@@ -15,7 +15,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator, GeneratorPoint
-from apu_casadi.unit.control import Governor, GovernorParameters
+from apu_casadi.unit.control import GOVERNORS, Governor, GovernorParameters, word_of
 from apu_casadi.unit.events import Ambient
 from apu_casadi.unit.exchange import Link
 
@@ -113,6 +113,7 @@ class Apu(Parametric):
             for f in dataclasses.fields(p):
                 table[f"{s}.{f.name}"] = getattr(p, f.name)
         table["generator.neutral"] = self.generator.neutral
+        table["governor.kind"] = word_of(self.governor)
         return table
 
     def change(self, values: Mapping[str, Any]) -> Apu:
@@ -121,16 +122,23 @@ class Apu(Parametric):
         >>> Apu().change({"governor.Kp": 0.5, "machine.r_s": 0.005}).governor.Kp
         0.5
 
+        ``governor.kind`` puts another governor of ``GOVERNORS`` in its place, with its defaults.
+
         Raises:
             ParameterError: unknown name (the nearest valid one is named) or value out of range.
         """
+        kind = values.get("governor.kind")
+        if kind is not None and kind != word_of(self.governor):
+            other = dataclasses.replace(self, governor=GOVERNORS[kind]())
+            return other.change(values)
         groups: dict[str, dict[str, Any]] = {}
         known = self.parameters()
         for key, value in values.items():
             if key not in known:
                 raise ParameterError(f"unknown parameter {key!r} {nearest(key, known)}")
             s, _, name = key.partition(".")
-            groups.setdefault(s, {})[name] = value
+            if key != "governor.kind":
+                groups.setdefault(s, {})[name] = value
         new: dict[str, Any] = {s: p.change(**groups.get(s, {})) for s, p in self._sets().items()}
         gg, gen = self.gas_generator, self.generator
         touched = {"gas_generator", "compressor_map", "turbine_map"} & set(groups)

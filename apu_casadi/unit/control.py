@@ -6,8 +6,8 @@ limits fuel; no temperature is limited, and a run that gets too hot says so
 (:mod:`apu_casadi.unit.validity`).
 
 Another law is another subclass of :class:`Governor`, with numbers, states, ``demand`` and
-``rates``; ``Apu(governor=...)`` takes it, and runs, linear models and filters follow it.
-:data:`GOVERNORS` gives it a name for scenarios and commands.
+``rates``; ``Apu(governor=...)`` takes it, and runs, linear models and filters follow it.  Entered
+in ``GOVERNORS`` it has a word, which ``Apu.change`` and scenarios take as ``governor.kind``.
 """
 
 from __future__ import annotations
@@ -104,16 +104,15 @@ class Governor(Parameters):
         return new
 
 
-GOVERNORS: Register[type[Governor]] = Register("governor")
-"""Laws by the name that a scenario and the commands use."""
-
-
 def _limited(value: Any, low: Any, high: Any) -> Any:
     if isinstance(value, float):
         return max(low, min(high, value))
     if isinstance(value, np.ndarray):
         return np.clip(value, low, high)
     return ca.fmax(low, ca.fmin(high, value))
+
+
+GOVERNORS: Register[type[Governor]] = Register("governor")
 
 
 @GOVERNORS.add("PI")
@@ -172,6 +171,12 @@ class GovernorParameters(Governor):
     def rates(self, e: Any, x: Sequence[Any], cut: Any) -> tuple[Any, ...]:
         """Rate of the integrator, which tracks the limits."""
         return (self.Ki * e + cut / self.T_aw,)
+
+
+def word_of(governor: Governor) -> str:
+    """Return the word of a governor in ``GOVERNORS``; its class's name if it has none."""
+    kinds = (word for word, kind in GOVERNORS.items() if kind is type(governor))
+    return next(kinds, type(governor).__name__)
 
 
 class GovernorOut(NamedTuple):

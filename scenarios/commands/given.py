@@ -6,6 +6,7 @@ What a command assumed, it prints; the defaults of the day are those of
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -103,7 +104,8 @@ def unit(args: Namespace) -> Apu:
     from scenarios import registry
 
     parts(args)
-    return registry.unit_of(engine=args.engine, governor=args.governor)
+    law = {} if args.governor is None else {"governor.kind": args.governor}
+    return registry.unit_of(json.dumps(law), args.engine)
 
 
 def load(args: Namespace) -> Load:
