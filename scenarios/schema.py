@@ -56,6 +56,7 @@ from apu_casadi.unit.events import (
     LoadChange,
     health_factors,
 )
+from apu_casadi.unit.exchange import OFFERED
 from scenarios import extensions
 from scenarios.reading import (
     PlacedError,
@@ -77,7 +78,7 @@ if TYPE_CHECKING:
 
 LARGEST_FILE = 1 << 24
 """Largest scenario file, bytes."""
-EXCHANGES = ("paper", "predicted", "corrected")
+EXCHANGES = OFFERED
 """Exchanges of speed and fuel that a scenario may ask for."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")

@@ -48,6 +48,8 @@ EXCHANGES = {
 """What ``simulate_joint(exchange=...)`` takes; the last two tell two parts of the error apart."""
 
 PAPER = EXCHANGES["paper"]
+OFFERED = tuple(EXCHANGES)[:3]
+"""Those that scenarios and commands offer."""
 
 
 @dataclass(frozen=True)

@@ -388,7 +388,7 @@ def _ramp(ramp: dict[str, Identifiability]) -> list[str]:
 
 
 def _severity_row(s: Severity) -> dict[str, Any]:
-    row = {k: getattr(s.fault, k) for k in ("mu", "k_rf", "kappa")}
+    row = {k: getattr(s.fault, k) for k in (x.name for x in s.fault.severities)}
     row |= {"h": s.h, "periods": s.periods, "sigma_log_mu": s.sigma_mu}
     row |= {"sigma_log_k_rf": s.sigma_k_rf, "sigma_log_h": s.sigma_h}
     row |= {"correlation": s.correlation, "rank": s.rank, "rank_with_kappa": s.rank_with_kappa}

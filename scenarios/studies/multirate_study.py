@@ -36,6 +36,7 @@ from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Event, FaultChange, HealthChange, LoadChange
+from apu_casadi.unit.exchange import OFFERED
 from apu_casadi.unit.monolithic import simulate_monolithic
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios.shell.markdown import fill
@@ -50,7 +51,7 @@ STEPS = (0.002, 0.005, 0.010, 0.020, 0.040, 0.080)
 PAPER_STEP = 0.020  # s
 COMMON = 0.080  # s, where all of them meet
 T_EVENT, DURATION = 2 * COMMON, 22 * COMMON
-COMPARED = ("paper", "predicted", "corrected")
+COMPARED = OFFERED
 """Exchanges of ``simulate_joint`` that are measured with every step."""
 QUANTITIES = {"N": "speed, of its excursion", "P": "power", "V": "voltage", "E": "energy"}
 """Short names and titles of the four errors."""

@@ -129,7 +129,7 @@ T_SWITCH, T_MACHINE = 0.02, 0.10  # s
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)
 FAULTS = {"k_rf = 20": Ttsc(0.05, 20.0), "k_rf = 1": Ttsc(0.05, 1.0)}
 """The paper's 5 % short circuit; it states no k_rf: 20 as in the joint run, and a severe 1."""
-WAVES = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c")
+WAVES = tuple(f"{quantity}_{k}" for quantity in "vi" for k in "abc")
 
 
 def machine_transient(kind: str = "healthy", solver: str = "cvodes") -> xr.Dataset:

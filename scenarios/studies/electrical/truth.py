@@ -135,8 +135,7 @@ def unit_truth(duration: float, events: tuple[Any, ...], *, load: Load = FULL) -
     t = ds["time_w"].values
     grid = np.arange(round(duration / DT) + 1) * DT
     k = np.minimum(np.searchsorted(t, grid - 1e-9), t.size - 1)
-    names = ("v_a", "v_b", "v_c", "V_fd", "i_a", "i_b", "i_c", "i_fd")
-    values = {n: ds[n].values[k] for n in names}
+    values = {n: ds[n].values[k] for n in ELECTRICAL.names if n in ds}
     values["P_total"] = ds["P_inst"].values[k]
     values["w_r"] = np.interp(grid, ds["time"].values, apu.w_r(ds["N"].values))
     return Truth(grid, values)
