@@ -27,6 +27,10 @@ DEFAULT_FAULT = "ttsc"
 class PlacedError(ScenarioError):
     """A scenario error that knows its place, so that the callers can prefix theirs."""
 
+    place: str
+    message: str
+    note: str
+
     def __init__(self, place: str, message: str, note: str = "") -> None:
         super().__init__(f"{place}: {message}{note}")
         self.place, self.message, self.note = place, message, note

@@ -13,10 +13,11 @@ from scipy.stats import chi2
 
 from apu_casadi.core.errors import DataError, EstimationError, ParameterError
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu import gaspath
 from estimators.apu.gaspath import gas_path_filter, null_direction, samples, window_means
-from estimators.apu.gaspathmodel import DT, GOVERNOR, HEALTH, OUTPUTS, gas_path_model
+from estimators.apu.gaspathmodel import DT, GOVERNOR, OUTPUTS, gas_path_model
 from estimators.apu.healthjumps import JumpTest, track_jumps, whitened
 from estimators.filters.filtering import FilterResult
 from scenarios.studies.gaspath import course, enginetruth, montecarlo

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.gaspathmodel import HEALTH
 from estimators.apu.joint import (
     electrical_samples,
     estimate_joint,

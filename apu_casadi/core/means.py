@@ -174,7 +174,10 @@ def _squares(
     own = 1 - gain_c * c2 - gain_s * s2
 
     def constant(n: str) -> np.ndarray:
-        return (means[n] - gain_c * means[f"{n}*cos2"] - gain_s * means[f"{n}*sin2"]) / own
+        made: np.ndarray = (
+            means[n] - gain_c * means[f"{n}*cos2"] - gain_s * means[f"{n}*sin2"]
+        ) / own
+        return made
 
     return np.array([constant(n) for n in RMS.values()])
 

@@ -93,6 +93,11 @@ class Stepper(Rebuilt):
         max_steps: solver steps allowed between two outputs.
     """
 
+    grid: np.ndarray
+    quad: tuple[str, ...]
+    rtol: float
+    atol: float
+
     @building
     def __init__(
         self,

@@ -309,7 +309,8 @@ class _Trials:
     def errors(self, p: np.ndarray) -> np.ndarray:
         """Return (model - measured)/sigma."""
         try:
-            return (self.model(p) - self.measured) / self.sigma
+            made: np.ndarray = (self.model(p) - self.measured) / self.sigma
+            return made
         except ApuError:
             if len(self.built) == 0:  # at the start there is nowhere to go back to
                 raise
@@ -322,7 +323,8 @@ class _Trials:
         for t, point in zip(trims, self.points, strict=True):
             S = sensitivity(engine, t, tuple(point.fixed))[:, self.columns]
             rows += [S[engine.Y.index(n)] for n in point.measured]
-        return np.array(rows) / self.sigma[:, None]
+        made: np.ndarray = np.array(rows) / self.sigma[:, None]
+        return made
 
 
 def _check_free(names: tuple[str, ...], points: tuple[CalibrationPoint, ...]) -> None:

@@ -86,6 +86,14 @@ class DesignEquations:
         point: Function (w, p) -> A3, A8, W_t, PR_t, temperatures z, and ``values`` by name.
     """
 
+    names: tuple[str, ...]
+    equations: tuple[str, ...]
+    residual: Any
+    start: Any
+    values: tuple[str, ...]
+    point: Any
+    newton: Newton
+
     def __init__(self, data: str) -> None:
         n_p = len(number_signals(GasGeneratorParameters, "p"))
         self.names = tuple("Wf" if n == "T4" else n for n in TEMPERATURES)  # T4 is given

@@ -116,7 +116,8 @@ def _per_kg(moles: dict[str, Any], mass: Any, data: str) -> Any:
 @once
 def used(data: str) -> np.ndarray:
     """Return which coefficients some species has, shape (2, 9): nasa7 has two fewer."""
-    return np.any([c != 0 for c in _coefficients(data).values()], axis=0)
+    made: np.ndarray = np.any([c != 0 for c in _coefficients(data).values()], axis=0)
+    return made
 
 
 @once

@@ -370,7 +370,8 @@ class GasGenerator(Parametric):
         return y, z
 
     def _similar(self, x: np.ndarray, u: np.ndarray, full: np.ndarray) -> np.ndarray:
-        return self.family.similar(x, u, full).full().ravel()
+        made: np.ndarray = self.family.similar(x, u, full).full().ravel()
+        return made
 
     def _check_exit(self, y: np.ndarray) -> None:
         Mach8 = float(y[_MACH8])

@@ -480,12 +480,14 @@ def _variant(gen: Generator, structure: Structure) -> GeneratorModel:
 
 def load_of_kind(kind: str) -> Load:
     """Return a typical load of a kind."""
-    return _of_kind("load", LOADS.classes, kind)
+    made: Load = _of_kind("load", LOADS.classes, kind)
+    return made
 
 
 def fault_of_kind(kind: str) -> Fault:
     """Return a typical fault of a kind."""
-    return _of_kind("fault", FAULTS.classes, kind)
+    made: Fault = _of_kind("fault", FAULTS.classes, kind)
+    return made
 
 
 def _of_kind(what: str, classes: Sequence[Any], kind: str, more: str = "") -> Any:

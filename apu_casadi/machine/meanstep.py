@@ -468,6 +468,16 @@ class MeanStep(Rebuilt):
             more than ``HARMONICS``, or the step is so short that samples cannot be spared.
     """
 
+    ss: GeneratorModel
+    dt: float
+    quad: tuple[str, ...]
+    theta: np.ndarray
+    constant: bool
+    parameters: np.ndarray
+    layout: tuple[Any, ...]
+    advance: Any
+    limits: np.ndarray
+
     outputs: tuple[str, ...] = ()
     n_out = 0
 

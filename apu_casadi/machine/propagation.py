@@ -42,6 +42,7 @@ from apu_casadi.machine.transition import (
     EXTRA,
     NODES,
     SPEED_RANGE,
+    Table,
     cached_table,
     parity,
     split,
@@ -342,6 +343,20 @@ class Propagator(Rebuilt):
         NotApplicable: the model is not linear in its windings, or the series does not converge;
             use :func:`apu_casadi.core.simulation.stepper` there.
     """
+
+    ss: GeneratorModel
+    n_out: int
+    dt: float
+    outputs: tuple[str, ...]
+    quad: tuple[str, ...]
+    h: float
+    theta: np.ndarray
+    constant: bool
+    table: Table
+    layout: tuple[Any, ...]
+    function: Any
+    tol: float
+    limits: np.ndarray
 
     def __init__(
         self,

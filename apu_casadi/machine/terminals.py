@@ -327,7 +327,8 @@ def _moving_mean(x: np.ndarray, good: np.ndarray, n: int) -> np.ndarray:
     start = np.maximum(stop - n, 0)
     counted = np.maximum(count[stop] - count[start], 1)
     # few good ones say little: what is missing counts as zero
-    return (total[:, stop] - total[:, start]) / np.maximum(counted, n // 2)
+    made: np.ndarray = (total[:, stop] - total[:, start]) / np.maximum(counted, n // 2)
+    return made
 
 
 def voltage_weight(w_r: Any, dt: Any) -> Any:

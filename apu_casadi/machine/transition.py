@@ -214,7 +214,10 @@ def _scaled(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray) -> Any:
         U[iw] = w
         TH = np.repeat(full, angle.size, axis=1)
         out = _coefficients_at(ss.shared, angle.size)(angle.reshape(1, -1), U, TH)[0]
-        return np.asarray(out.reshape(-1, angle.size, n + EXTRA).transpose(1, 0, 2)) * scale
+        made: np.ndarray = (
+            np.asarray(out.reshape(-1, angle.size, n + EXTRA).transpose(1, 0, 2)) * scale
+        )
+        return made
 
     return M_of
 
@@ -309,7 +312,8 @@ def transition_table(
         """Transition matrices that tell whether the steps suffice."""
         if constant:
             slow = [int(nodes.argmin())]
-            return _constant_transition(M[slow], length(nodes)[slow], steps)[0]
+            made: np.ndarray = _constant_transition(M[slow], length(nodes)[slow], steps)[0]
+            return made
         slowest = np.full(_PROBE.size, nodes.min())
         return _transition(M_of, _PROBE, slowest, length(slowest), steps)[0]
 
@@ -330,7 +334,8 @@ def transition_table(
 
     def powers(series: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Polynomials in speed from values at the nodes, shape (nodes, terms, entries); in SI."""
-        return np.tensordot(to_powers, series, 1) * units[which]
+        made: np.ndarray = np.tensordot(to_powers, series, 1) * units[which]
+        return made
 
     if constant:
         P = sampled(np.zeros(1))

@@ -183,6 +183,10 @@ F = TypeVar("F", MeanStep, Propagator)
 class _Exact(Integrator, Generic[F]):
     """Exact propagation, prepared when it is first asked for."""
 
+    phase: Phase
+    settings: Settings
+    quad: tuple[str, ...]
+
     otherwise: ClassVar[str]
 
     def __init__(self, phase: Phase, settings: Settings, means: StepMeans) -> None:
@@ -256,6 +260,9 @@ class Samples(_Exact[Propagator]):
     Coarse waveforms are every k-th of samples fine enough for 1e-5 of peak.
     """
 
+    n: int
+    stored: slice
+
     otherwise = "exact propagation not used, CVODES instead"
 
     def __init__(
@@ -315,6 +322,11 @@ class Samples(_Exact[Propagator]):
 class Stepwise(Integrator):
     """CVODES or IDAS, over any step."""
 
+    phase: Phase
+    settings: Settings
+    means: StepMeans
+    model: StateSpace
+
     def __init__(self, phase: Phase, settings: Settings, means: StepMeans) -> None:
         self.phase, self.settings, self.means = phase, settings, means
         self.model = ramped(phase.ss) if settings.way.ramp else phase.ss
@@ -351,6 +363,10 @@ class Stepwise(Integrator):
 
 class Follow(Integrator):
     """A step right after a switch: integrated until the windings have settled, then propagated."""
+
+    first: Stepwise
+    rest: Means
+    settings: Settings
 
     def __init__(self, first: Stepwise, rest: Means, settings: Settings) -> None:
         self.first, self.rest, self.settings = first, rest, settings

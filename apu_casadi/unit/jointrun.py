@@ -17,7 +17,7 @@ import numpy as np
 from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.unit import validity
-from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Ambient, Event, Holding
 from apu_casadi.unit.exchange import PAPER, governed_step
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
@@ -59,6 +59,19 @@ class JointRun:
         apu, asked, settings: the unit, what is to happen, and how it is integrated.
         rng: for the noise.
     """
+
+    apu: Apu
+    asked: Asked
+    settings: Settings
+    now: Holding
+    point: JointPoint
+    machine: MachineStep
+    x: np.ndarray
+    u: np.ndarray
+    theta: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+    governor: tuple[float, ...]
 
     def __init__(
         self, apu: Apu, asked: Asked, settings: Settings, rng: np.random.Generator

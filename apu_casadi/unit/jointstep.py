@@ -119,6 +119,9 @@ def block_function(
 class JointBlock(Rebuilt):
     """Blocks of exchange steps with one load and fault."""
 
+    apu: Apu
+    machine: Propagator | MeanStep
+
     def __init__(self, apu: Apu, machine: Propagator | MeanStep) -> None:
         """Build or fetch the compiled block; a ``Propagator`` must have constant coefficients."""
         self.apu, self.machine = apu, machine

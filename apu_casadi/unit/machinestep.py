@@ -7,13 +7,13 @@ integrators that can be asked in it (:mod:`apu_casadi.unit.integrators`).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
-from apu_casadi.machine.generator import GeneratorPoint
+from apu_casadi.machine.generator import Generator, GeneratorPoint
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.integrators import (
     SETTLED,
@@ -56,6 +56,17 @@ class MachineStep:
         settings: how it is integrated.
         phasors: whether phasors are wanted too.
     """
+
+    apu: Apu
+    gen: Generator
+    settings: Settings
+    V_ref: float
+    w_r: Any
+    x: np.ndarray
+    u: np.ndarray
+    means: StepMeans
+    nsteps: int
+    propagated: int
 
     def __init__(
         self,

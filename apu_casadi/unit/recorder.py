@@ -65,6 +65,13 @@ class Recorder:
         severities: what is kept of the severity of faults.
     """
 
+    gg: GasGenerator
+    grid: np.ndarray
+    means: np.ndarray
+    held: np.ndarray
+    t_w: np.ndarray
+    waves: np.ndarray
+
     def __init__(
         self,
         gg: GasGenerator,

@@ -56,6 +56,10 @@ class StepMeans:
         phasors: whether phasors are wanted too.
     """
 
+    gen: Generator
+    phasors: bool
+    kept: tuple[str, ...]
+
     def __init__(self, gen: Generator, phasors: bool) -> None:
         self.gen, self.phasors = gen, phasors
         self.kept = (*MEANS, *RMS, *(PARTS if phasors else ()))

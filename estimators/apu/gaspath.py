@@ -30,11 +30,11 @@ from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.control import Governor
 from estimators.apu.gaspathmodel import (
     DT,
     GOVERNOR,
-    HEALTH,
     OUTPUTS,
     engine_function,
     gas_path_model,

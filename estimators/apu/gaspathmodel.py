@@ -33,7 +33,6 @@ __all__ = [
     "DT",
     "GAINED",
     "GOVERNOR",
-    "HEALTH",
     "OUTPUTS",
     "engine_function",
     "gas_path_model",

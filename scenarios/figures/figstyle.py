@@ -39,12 +39,12 @@ ABC = {"a": "#d55e00", "b": "#0072b2", "c": "#009e73"}
 NESTED = {"a": 3.4, "b": 2.2, "c": 1.0}
 """Line widths of the three phases: curves that coincide all stay visible."""
 DASHED = (0, (4, 2))
-PATCH = {"fc": "white", "ec": "none", "pad": 0.8}
+PATCH: dict[str, str | float] = {"fc": "white", "ec": "none", "pad": 0.8}
 """Ground of words that stand on curves."""
 OF_AXES = ("data", "axes fraction")
 """Coordinates ``xycoords`` of a point whose height is a fraction of the axes."""
 
-STYLE = {
+STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
     "axes.edgecolor": MUTED,

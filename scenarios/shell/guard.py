@@ -82,6 +82,8 @@ class Guard:
             back.
     """
 
+    raising: bool
+
     def __init__(self, own: bool) -> None:
         self.own = own
         self.raising = not own

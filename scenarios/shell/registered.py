@@ -22,6 +22,10 @@ class Registry(Generic[T]):
         scripts: modules that are no part of the package, but run by others.
     """
 
+    package: str
+    what: str
+    scripts: tuple[str, ...]
+
     def __init__(self, package: str, what: str, scripts: tuple[str, ...] = ()) -> None:
         self.package, self.what, self.scripts = package, what, scripts
         self._found: dict[str, tuple[float, T]] = {}

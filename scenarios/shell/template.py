@@ -49,6 +49,8 @@ class Template:
         source: the text of all blocks.
     """
 
+    blocks: dict[str, str]
+
     def __init__(self, source: str) -> None:
         parts = re.split(r"^@(.+)\n", source, flags=re.MULTILINE)
         self.blocks = {n: b.strip("\n") for n, b in zip(parts[1::2], parts[2::2], strict=True)}

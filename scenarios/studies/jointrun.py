@@ -19,10 +19,10 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.sharing import last
-from apu_casadi.gaspath.health import HEALTH_FACTORS
+from apu_casadi.gaspath.health import HEALTH, HEALTH_FACTORS
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
-from estimators.apu.gaspathmodel import DT, HEALTH
+from estimators.apu.gaspathmodel import DT
 from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
 from estimators.apu.sensors import gas_path_table
 from scenarios import registry

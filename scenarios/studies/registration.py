@@ -163,7 +163,7 @@ class Study:
     report: Report = field(default_factory=Report)
 
     def __post_init__(self) -> None:
-        self.template = Template(self.text)
+        self.template: Template = Template(self.text)
 
     def part(
         self, name: str, *, start: float, each: float = 0.0, share: float | None = 1.0

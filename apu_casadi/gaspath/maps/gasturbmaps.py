@@ -52,7 +52,8 @@ class _Block:
 
     def where(self, i: int, j: int) -> int:
         """Return the file line of the number in row i, column j."""
-        return self.lines[i * self.array.shape[1] + j]
+        made: int = self.lines[i * self.array.shape[1] + j]
+        return made
 
 
 _NEEDED = {

@@ -280,7 +280,8 @@ def off_speed(gg: GasGenerator, spec: tuple[str, str], y: np.ndarray) -> np.ndar
     t = gg.compressor_map.table
     n = y[gg.Y.index("n_c")] * gg.compressor_map.N_map_des
     span = float(t.N[-1] - t.N[0])
-    return np.maximum(0.0, np.maximum(n - t.N[-1], t.N[0] - n) / span)
+    made: np.ndarray | float = np.maximum(0.0, np.maximum(n - t.N[-1], t.N[0] - n) / span)
+    return made
 
 
 def speed_text(gg: GasGenerator, y: np.ndarray, off: float, limits: Limits) -> str:

@@ -64,7 +64,8 @@ def on_design_side(
     origin, s0 = origin_of(solver)
     design = float(solver.one("side", s0, origin)[0][0])
     s = solver.sought(w)
-    return solver.many("side", s, p, n_threads=1, compile=compile)[0][0] * design > 0
+    made: np.ndarray = solver.many("side", s, p, n_threads=1, compile=compile)[0][0] * design > 0
+    return made
 
 
 def settle(
@@ -167,8 +168,10 @@ class _March:
         Y, asked = self.solver.gg.Y, self.p[self.at[self.open]][:, i]
         if self.open == LAW:
             ref, N_ref, k = asked
-            return y[Y.index("PW")] / (ref * (y[Y.index("N")] / N_ref) ** k) - 1
-        return (y[Y.index(self.open)] - asked[0]) / Y[self.open].nominal
+            made: np.ndarray = y[Y.index("PW")] / (ref * (y[Y.index("N")] / N_ref) ** k) - 1
+            return made
+        made = (y[Y.index(self.open)] - asked[0]) / Y[self.open].nominal
+        return made
 
     def run(self) -> Roots:
         """March until the gap changes its sign, the range ends or there is no solution."""

@@ -75,6 +75,12 @@ class TrimKernel(Rebuilt):
     Functions take c, the numbers of the engine, as last argument.
     """
 
+    cycle: Cycle
+    spec: tuple[str, str]
+    free: list[int]
+    log: np.ndarray
+    n_p: int
+
     def __init__(self, cycle: Cycle, spec: tuple[str, str]) -> None:
         """Choose the unknowns; expressions are built when first needed."""
         self.cycle, self.spec = cycle, spec
@@ -324,7 +330,8 @@ class TrimKernel(Rebuilt):
         """Return s from w, by columns, with the magnitudes of an engine."""
         s = (w.T / nominal).T
         s[self.log] = np.log(s[self.log])
-        return s[self.free]
+        made: np.ndarray = s[self.free]
+        return made
 
     def design_start(self, c: np.ndarray) -> np.ndarray:
         """Return s at the design point of an engine with the numbers c, shape (n,)."""

@@ -33,6 +33,8 @@ HOT = (("N", "PW"), ("N", "Wf"), ("N", "T4"), ("N", "T5"), ("PW", "Wf"), (LAW, "
 class TrimCode(Rebuilt):
     """The kernel of a structure and a pair of fixed quantities, in the backend in use."""
 
+    kernel: TrimKernel
+
     @building
     def __init__(self, cycle: Cycle, spec: tuple[str, str]) -> None:
         """Compile nothing yet; functions are made or loaded when first called."""
@@ -86,6 +88,11 @@ def code_of(cycle: Cycle, spec: tuple[str, str]) -> TrimCode:
 
 class Solver(Rebuilt):
     """The steady points of one engine with one pair of fixed quantities."""
+
+    gg: GasGenerator
+    code: TrimCode
+    kernel: TrimKernel
+    nominal: np.ndarray
 
     def __init__(self, gg: GasGenerator, spec: tuple[str, str]) -> None:
         """Take the code that all engines of this structure share."""
@@ -176,7 +183,8 @@ def _design_output(gg: GasGenerator) -> np.ndarray:
 def on_the_way(solver: Solver, p: np.ndarray, t: float) -> np.ndarray:
     """Return the parameters at share ``t`` of the way from the design point to ``p``."""
     origin, _ = origin_of(solver)
-    return origin + t * (p - origin)
+    made: np.ndarray = origin + t * (p - origin)
+    return made
 
 
 def continue_one(
@@ -203,7 +211,8 @@ def continue_one(
 def explained(gg: GasGenerator, limits: Limits, y: np.ndarray) -> np.ndarray:
     """Whether the outputs tell why the way ends there: a limit is broken, or a map left."""
     off = np.maximum(y[gg.Y.index("off_c")], y[gg.Y.index("off_t")]) > 0
-    return off | (limit_status(gg, limits, y) != Status.SOLVED)
+    made: np.ndarray = off | (limit_status(gg, limits, y) != Status.SOLVED)
+    return made
 
 
 def continue_many(

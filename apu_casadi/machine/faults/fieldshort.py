@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError
@@ -53,8 +53,10 @@ class FieldShort(Fault):
     mu_f: float
 
     word = "field"
-    keys = (Key("mu_f", "1", "shorted fraction of the field's turns", 0.0, 0.9, open_lo=True),)
-    severities = (
+    keys: ClassVar[tuple[Key, ...]] = (
+        Key("mu_f", "1", "shorted fraction of the field's turns", 0.0, 0.9, open_lo=True),
+    )
+    severities: ClassVar[tuple[Signal, ...]] = (
         Signal("mu_f", "1", "shorted fraction of the field's turns (0: healthy)", default=0.0),
     )
 

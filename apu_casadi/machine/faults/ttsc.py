@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from apu_casadi.core.checked import bounded, number
 from apu_casadi.core.errors import ParameterError
@@ -69,14 +69,14 @@ class Ttsc(Fault):
     phase: str = "a"
 
     word = "ttsc"
-    keys = (
+    keys: ClassVar[tuple[Key, ...]] = (
         Key("mu", "1", "shorted fraction of the turns of the phase", 0.0, 0.99, open_lo=True),
         Key("k_rf", "1", "fault resistance over that of the shorted turns", 0.0),
         Key("kappa", "1", "leakage partition, mu (full coupling) to 1", 0.0, 1.0, default=None),
         Key("phase", "1", "faulty phase", default="a", choices=tuple(PHASE_ANGLE)),
     )
-    reversing = ("i_fault",)
-    severities = tuple(
+    reversing: ClassVar[tuple[str, ...]] = ("i_fault",)
+    severities: ClassVar[tuple[Signal, ...]] = tuple(
         Signal(name, *CHANNELS[name], default=healthy)
         for name, healthy in (("mu", 0.0), ("k_rf", math.nan), ("kappa", math.nan))
     )

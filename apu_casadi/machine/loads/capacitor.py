@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from apu_casadi.core.register import Key
 from apu_casadi.core.signals import Signal
@@ -59,10 +59,10 @@ class CapacitorLoad(Load):
     R: tuple[float, float, float]
     C: tuple[float, float, float]
 
-    tables = MappingProxyType(
+    tables: ClassVar[Mapping[str, tuple[Key, ...]]] = MappingProxyType(
         {"RC": (POWER, _LEADING, UNBALANCE), "series_RC": (RESISTANCE, _CAPACITY)}
     )
-    reversing = ("v_C0",)
+    reversing: ClassVar[tuple[str, ...]] = ("v_C0",)
 
     def __post_init__(self) -> None:
         three("CapacitorLoad.R [ohm]", self.R)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 
@@ -39,11 +39,13 @@ class ConstantPowerLoad(Load):
     tau: float = 2e-3
     kind: str = field(default="constant_power", init=False)
 
-    tables = MappingProxyType(
+    tables: ClassVar[Mapping[str, tuple[Key, ...]]] = MappingProxyType(
         {"constant_power": (POWER, Key("lag_ms", "ms", "lag", 0.1, 1000.0, default=2.0))}
     )
     linear = False
-    caveat = f"a constant-power load is a conductance below {V_MIN:g} of rated voltage"
+    caveat: ClassVar[str] = (
+        f"a constant-power load is a conductance below {V_MIN:g} of rated voltage"
+    )
 
     def __post_init__(self) -> None:
         in_range("ConstantPowerLoad.P [W] (an open generator is OpenLoad)", self.P, above=0.0)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
+from apu_casadi.core.register import Key
 from apu_casadi.machine.loads.load import LOADS, Load, stiffness
 from apu_casadi.machine.loads.series import Impedance, check_R
 
@@ -26,7 +28,7 @@ class OpenLoad(Impedance):
     R: float = 1e4
     kind: str = field(default="resistive", init=False)
 
-    tables = MappingProxyType({"open": ()})
+    tables: ClassVar[Mapping[str, tuple[Key, ...]]] = MappingProxyType({"open": ()})
 
     def __post_init__(self) -> None:
         check_R("OpenLoad.R [ohm]", self.R)

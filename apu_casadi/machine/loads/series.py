@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.register import Key
@@ -88,7 +89,7 @@ class SeriesLoad(Impedance):
     R: tuple[float, float, float]
     L: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    tables = MappingProxyType(
+    tables: ClassVar[Mapping[str, tuple[Key, ...]]] = MappingProxyType(
         {
             "R": (POWER, UNBALANCE),
             "RL": (POWER, FACTOR, UNBALANCE),

@@ -44,10 +44,10 @@ import casadi as ca
 
 from apu_casadi.core.sharing import remade
 from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.machine.generatormodel import ANGLE
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES, Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.terminals import (
-    ANGLE,
     FLUXES,
     INPUTS,
     OUTPUTS,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.apu.gaspathmodel import HEALTH
+from apu_casadi.gaspath.health import HEALTH
 from scenarios.figures.studyplot import plot_consistency, plot_null
 from scenarios.studies.gaspath.course import filters, fresh, modules
 from scenarios.studies.gaspath.methods import compare_filters

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.gaspathmodel import HEALTH
 from estimators.apu.joint import cross_talk
 from estimators.apu.monolithic_filter import compare_monolithic
 from scenarios.studies import jointrun

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError
+from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gaspath import JUMP, GasPathFilter
-from estimators.apu.gaspathmodel import HEALTH, OUTPUTS
+from estimators.apu.gaspathmodel import OUTPUTS
 from estimators.information import consistency
 from estimators.information.bounds import linearisations, snapshot_bound
 from estimators.models.recording import Recording

@@ -62,7 +62,10 @@ def variant(gg: GasGenerator, change: Mapping[str, Mapping[str, Any]]) -> GasGen
     return dataclasses.replace(gg, **new) if new else gg
 
 
-modules = {"gaspath": ("estimators.apu.gaspath",), "gaspath_study": ("scenarios.studies.gaspath",)}
+modules: dict[str, tuple[str, ...]] = {
+    "gaspath": ("estimators.apu.gaspath",),
+    "gaspath_study": ("scenarios.studies.gaspath",),
+}
 """Whose constants the studies depend on."""
 fresh: dict[str, Any] = {
     "seeds": len(FRESH),

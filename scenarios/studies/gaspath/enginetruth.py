@@ -15,12 +15,13 @@ from apu_casadi.core.errors import EstimationError
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.exchange import EXCHANGES, PAPER, Link, governed_step
 from estimators.apu.gaspath import HEALTH_WALK, N_SIGMA, N_WALK, GasPathFilter
-from estimators.apu.gaspathmodel import DT, HEALTH, OUTPUTS, gas_path_model
+from estimators.apu.gaspathmodel import DT, OUTPUTS, gas_path_model
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from scenarios.studies.gaspath.course import FAULT, FINE, Case
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError
+from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gaspath import gas_path_filter
-from estimators.apu.gaspathmodel import DT, HEALTH
+from estimators.apu.gaspathmodel import DT
 from estimators.batch.smoother import rts_smoother
 from estimators.filters.ukf import unscented_kalman_filter
 from estimators.information import consistency

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.sharing import kept
+from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gaspath import GasPathFilter, gas_path_filter, null_direction
-from estimators.apu.gaspathmodel import DT, HEALTH, OUTPUTS
+from estimators.apu.gaspathmodel import DT, OUTPUTS
 from estimators.apu.healthjumps import track_jumps
 from estimators.filters.filtering import FilterResult
 from estimators.information import consistency

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gaspath import (
     HEALTH_SIGMA,
     MODEL_ERROR,
@@ -17,7 +18,7 @@ from estimators.apu.gaspath import (
     gas_path_filter,
     null_direction,
 )
-from estimators.apu.gaspathmodel import DT, HEALTH
+from estimators.apu.gaspathmodel import DT
 from estimators.apu.sensors import GAS_PATH
 from estimators.filters.filtering import FilterResult
 from scenarios.studies.gaspath.course import (

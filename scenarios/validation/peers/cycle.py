@@ -47,7 +47,7 @@ SMOOTH, LINEAR = "akima", "slinear"  # pyCycle's names; the second is its defaul
 
 _GIVEN = (1e-7, "given to both")
 _DISSOCIATION = "equilibrium gas binds 0.04 % of cp T at T4 in NO: 0.08 % of the fuel's heat"
-DESIGN_TOLERANCE = {
+DESIGN_TOLERANCE: dict[str, tuple[float, str]] = {
     "T3": (5e-5, "same data, no reaction in the compressor; printed digits"),
     "P3": (1e-5, "given to both; digits of pyCycle's table of the atmosphere"),
     "T4": (1e-6, "given to both; solver tolerance"),

@@ -91,8 +91,8 @@ def run(case: dict[str, Any], dt: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    given = json.load(sys.stdin)
-    keep = os.dup(1)
+    given: dict[str, Any] = json.load(sys.stdin)
+    keep: int = os.dup(1)
     os.dup2(2, 1)  # dpsim prints to the C++ standard output, which is for the JSON alone
     answer = [[run(case, dt) for dt in given["steps"]] for case in given["cases"]]
     sys.stdout.flush()
