@@ -349,6 +349,7 @@ def test_clear_cache_counts_libraries(fresh):
 @needs_compiler
 def test_level_is_part_of_the_name(monkeypatch):
     """A function compiled at another level is another library; results are the same."""
+    monkeypatch.delenv("APU_OPTIMISE", raising=False)
     runs = count_compilations(monkeypatch)
     f = pendulum()
     first, again, hard = (backend.compiled(f, level=k) for k in (1, 1, 3))
@@ -360,6 +361,11 @@ def test_level_is_part_of_the_name(monkeypatch):
     )
     with pytest.raises(BackendError, match=r"level must be one of \(1, 2, 3\), got 4"):
         backend.compiled(f, level=4)
+    monkeypatch.setenv("APU_OPTIMISE", "1")
+    assert backend.compiled(f, level=3) is first
+    monkeypatch.setenv("APU_OPTIMISE", "0")
+    with pytest.raises(BackendError, match=r"APU_OPTIMISE = '0': one of \(1, 2, 3\)"):
+        backend.compiled(f)
 
 
 def test_an_input_buffer_filled_in_place_is_taken_as_it_is():

@@ -8,7 +8,8 @@ itself comes back, with one line in the log ``apu_casadi``.
 
 Environment: ``APU_BACKEND`` is ``auto`` (default), ``vm`` or ``c`` (refuse to fall back);
 ``APU_CACHE_DIR`` is the folder of the libraries, by default ``$XDG_CACHE_HOME/apu_casadi`` or
-``~/.cache/apu_casadi``; ``CC`` is the compiler, by default ``cc``, ``gcc`` or ``clang``.
+``~/.cache/apu_casadi``; ``CC`` is the compiler, by default ``cc``, ``gcc`` or ``clang``;
+``APU_OPTIMISE`` (1 to 3, default 3) is the highest level of its optimisation.
 
 Failures inside a function become NaN or a large residual in C as in the virtual machine, and must
 be looked for by the caller: ``error_on_fail`` has no effect in generated code.
@@ -216,18 +217,27 @@ def compiled(
 
     Raises:
         BackendError: ``backend="c"`` was demanded and there is no compiler, no folder for the
-            library, or the compiler failed; no such level.
+            library, or the compiler failed; no such level, also in ``$APU_OPTIMISE``, the highest.
     """
     if level not in LEVELS:
         raise BackendError(f"{fun.name()}: level must be one of {LEVELS}, got {level!r}")
     wanted = _wanted(backend)
     if wanted == "vm":
         return fun
+    level = min(level, _ceiling())
     known = _compiled.get(fun, {}).get((wanted, level))
     if known is not None:
         return known
     with BUILDING:
         return _find_or_make(fun, wanted, build, level)
+
+
+def _ceiling() -> int:
+    """Return the highest level that ``$APU_OPTIMISE`` leaves: 1 compiles twice as fast as 3."""
+    text = os.environ.get("APU_OPTIMISE", str(LEVELS[-1]))
+    if text not in map(str, LEVELS):
+        raise BackendError(f"$APU_OPTIMISE = {text!r}: one of {LEVELS} is expected")
+    return int(text)
 
 
 def _find_or_make(fun: ca.Function, wanted: str, build: bool, level: int) -> ca.Function:
