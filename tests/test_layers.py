@@ -6,6 +6,7 @@ or under TYPE_CHECKING: a dependency is a dependency.
 """
 
 import ast
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib.util import find_spec
 from pathlib import Path
@@ -77,15 +78,23 @@ def folder_of(dotted: str) -> str:
     return ".".join(dotted.split(".")[:2])
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Return all modules of the three packages by dotted name."""
     return {name_of(p): p for top in PACKAGES for p in sorted((ROOT / top).rglob("*.py"))}
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """Return the syntax tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports(path: Path) -> list[tuple[int, str]]:
     """Return (line, dotted module) of every import; ``from package import module`` is resolved."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found += [(node.lineno, a.name) for a in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -148,7 +157,7 @@ def test_no_private_name_leaves_its_module():
     """Who needs a name of another module needs a public one."""
     known, wrong = modules(), []
     for name, path in known.items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = tree_of(path)
         inner = {m.split(".")[-1] for _, m in imports(path) if m in known}
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
@@ -176,7 +185,7 @@ def test_inner_packages_hold_no_code():
     assert ROOT / "estimators" / "detection" / "__init__.py" in inner
     assert ROOT / "apu_casadi" / "machine" / "faults" / "__init__.py" in inner
     for path in inner:
-        body = ast.parse(path.read_text(encoding="utf-8")).body
+        body = tree_of(path).body
         code = [node for node in body if not isinstance(node, ast.Expr)]
         assert not code, f"{path} must hold no code, line {code[0].lineno} does"
 

@@ -7,6 +7,7 @@ make a list, four where the table has more than five.  What is a choice of its o
 """
 
 import ast
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -47,8 +48,10 @@ CHOSEN: dict[tuple[str, str], str] = {
 }
 
 
+@cache
 def groups(path):
-    """Yield (line, names) of the literal tuples, lists, sets and dictionaries of a file."""
+    """Return (line, names) of the literal tuples, lists, sets and dictionaries of a file."""
+    found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         parts = getattr(node, "elts", [])
         if isinstance(node, ast.Dict):
@@ -56,7 +59,8 @@ def groups(path):
             parts = node.keys if all(texts) else []
         names = [p.value for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, str)]
         if len(set(names)) >= 3:
-            yield node.lineno, set(names)
+            found.append((node.lineno, set(names)))
+    return found
 
 
 def written_again(group, names):
