@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("apu_casadi", "estimators", "scenarios")
 BOXES = """
 apu_casadi.core         0.00 0 0.98 signals, state spaces, solvers, compiled code, results, files
-apu_casadi.gaspath      0.00 1 0.30 gas, components, maps, cycle, steady points, engines
+apu_casadi.gaspath      0.00 1 0.30 gas, components, maps, cycle, steady/, engines
 apu_casadi.machine      0.34 1 0.30 machine, exciter, loads/, faults/, exact propagation
 estimators.models       0.70 1 0.28 what a filter must know; recordings
 apu_casadi.unit         0.00 2 0.64 governor, events, exchange (1)-(3), one run loop, linear models
@@ -31,7 +31,8 @@ scenarios.pages         0.34 7 0.30 pages and templates
 scenarios.bench         0.70 7 0.28 times and targets
 scenarios.commands      0.00 8 0.98 the command line: parse, call, print
 """
-TOP = {"scenarios.schema", "scenarios.campaigns", "scenarios.campaign_records"}
+_TOP = ("schema", "campaigns", "campaign_records", "extensions", "reading", "fileschema")
+TOP = {f"scenarios.{n}" for n in _TOP}
 
 
 def folder_of(dotted: str) -> str:
