@@ -105,7 +105,7 @@ class MyFieldShort(Fault):
 
 # -- (c) a sensor: T41 by a thermocouple with a first-order lag ----
 
-register(
+T41_MINE = register(
     Sensor("T41_mine", 0.005, True, 0.005, "K", "my thermocouple", (400.0, 1900.0),
            reads=("T41",), tau=0.8)
 )  # fmt: skip

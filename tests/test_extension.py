@@ -75,11 +75,12 @@ def mine():
     from apu_casadi.machine.faults.fault import FAULTS
     from apu_casadi.machine.loads.load import LOADS
     from apu_casadi.unit.control import GOVERNORS
-    from estimators.apu.sensors import unregister
+    from estimators.apu.sensors import register, unregister
 
     extensions.load([PARTS])
     names = vars(__import__("sys").modules[LOADS["my_RC"].__module__])
     assert (names["MyFieldShort"], names["MyGovernor"]) == (FAULTS["my_field"], GOVERNORS["my_PID"])
+    register(names["T41_MINE"])  # again: a file is run once, tests of other files come between
     yield names
     unregister("T41_mine")
 
