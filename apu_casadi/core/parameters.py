@@ -64,12 +64,15 @@ class Parameters:
                 raise ParameterError(f"{type(self).__name__} has no {n!r} {nearest(n, names)}")
         return dataclasses.replace(self, **values)
 
-    def signals(self, prefix: str, names: Iterable[str] | None = None) -> Signals:
+    def signals(
+        self, prefix: str, names: Iterable[str] | None = None, *, defaults: bool = False
+    ) -> Signals:
         """Return the values as signals with dotted names, as ``machine.r_s``.
 
         Args:
             prefix: what stands before the dot.
             names: which, and in which order; default all.
+            defaults: whether the signals have the defaults of the class.
         """
         by_name = {f.name: f for f in dataclasses.fields(self) if "unit" in f.metadata}
         signals = []
@@ -77,7 +80,13 @@ class Parameters:
             size: Any = f.default
             meta = f.metadata
             signals.append(
-                Signal(f"{prefix}.{f.name}", meta["unit"], meta["doc"], nominal=abs(size) or 1.0)
+                Signal(
+                    f"{prefix}.{f.name}",
+                    meta["unit"],
+                    meta["doc"],
+                    default=float(size) if defaults else None,
+                    nominal=abs(size) or 1.0,
+                )
             )
         return Signals(signals)
 

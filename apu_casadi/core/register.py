@@ -66,6 +66,17 @@ class Register(Mapping[str, T], Generic[T]):
             text = f"unknown {self.what} {name!r} {nearest(str(name), self._entries)}"
             raise ParameterError(text) from None
 
+    def of_kind(self, kind: str) -> T:
+        """Return what the ``kind`` of a file's table stands for.
+
+        Raises:
+            ScenarioError: an unknown one; the text starts with the key.
+        """
+        try:
+            return self[kind]
+        except ParameterError as error:
+            raise ScenarioError(f"kind: {error}") from None
+
     def __contains__(self, name: object) -> bool:
         return name in self._entries
 

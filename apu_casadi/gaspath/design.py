@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -12,7 +12,6 @@ from apu_casadi.core.errors import OperatingPointError
 from apu_casadi.core.parameters import Parameters
 from apu_casadi.core.rootfinding import Newton
 from apu_casadi.core.sharing import once
-from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.atmosphere import ambient
 from apu_casadi.gaspath.components.shaft import power_balance
 from apu_casadi.gaspath.conditions import AMBIENT
@@ -44,33 +43,10 @@ class DesignPoint:
     residual: float
 
 
-def number_signals(cls: type[Parameters], prefix: str) -> Signals:
-    """Return the numbers of a parameter set as signals ``prefix.name``."""
-    fields = [f for f in cls.__dataclass_fields__.values() if "unit" in f.metadata]
-    return Signals(
-        [
-            Signal(
-                f"{prefix}.{f.name}",
-                f.metadata["unit"],
-                f.metadata["doc"],
-                default=float(f.default),  # type: ignore[arg-type]
-                nominal=abs(float(f.default)) or 1.0,  # type: ignore[arg-type]
-            )
-            for f in fields
-        ]
-    )
-
-
 def of_symbols(cls: type[P], values: Any, **others: Any) -> P:
-    """Return a parameter set whose numbers are symbols, in the order of its fields.
-
-    Nothing is checked: symbols have no range.
-    """
-    names = [f.name for f in cls.__dataclass_fields__.values() if "unit" in f.metadata]
-    made = object.__new__(cls)
-    made.__dict__.update(zip(names, ca.vertsplit(values), strict=True))
-    made.__dict__.update(others)
-    return made
+    """Return a parameter set whose numbers are symbols, in the order of its fields."""
+    names = [f.name for f in fields(cls) if "unit" in f.metadata]
+    return cls().symbolic(**dict(zip(names, ca.vertsplit(values), strict=True)), **others)
 
 
 class DesignEquations:
@@ -95,7 +71,7 @@ class DesignEquations:
     newton: Newton
 
     def __init__(self, data: str) -> None:
-        n_p = len(number_signals(GasGeneratorParameters, "p"))
+        n_p = len(GasGeneratorParameters().signals("p"))
         self.names = tuple("Wf" if n == "T4" else n for n in TEMPERATURES)  # T4 is given
         w, ps = ca.SX.sym("w", len(self.names)), ca.SX.sym("p", n_p)
         v = dict(zip(self.names, ca.vertsplit(w), strict=True))

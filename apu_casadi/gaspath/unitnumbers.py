@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.signals import Signal, Signals
-from apu_casadi.gaspath.design import DesignPoint, design_equations, number_signals, of_symbols
+from apu_casadi.gaspath.design import DesignPoint, design_equations, of_symbols
 from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas, fuel_burning, used
 from apu_casadi.gaspath.maps.maptable import MapTable
@@ -36,11 +36,11 @@ _PLACE = (
 
 def _map_signals(name: str) -> Signals:
     place = [Signal(f"{name}.{n}", "1", doc) for n, doc in _PLACE]
-    return Signals(place) + number_signals(MapCalibration, name)
+    return Signals(place) + MapCalibration().signals(name, defaults=True)
 
 
-_N_CALIBRATION = len(number_signals(MapCalibration, "map"))
-OWN = number_signals(GasGeneratorParameters, "gas_generator")
+_N_CALIBRATION = len(MapCalibration().signals("map", defaults=True))
+OWN = GasGeneratorParameters().signals("gas_generator", defaults=True)
 GIVEN = OWN + _map_signals("compressor_map") + _map_signals("turbine_map")
 """The parameters: design data, then each map's place of the design point and calibration."""
 

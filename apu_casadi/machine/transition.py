@@ -312,8 +312,7 @@ def transition_table(
         """Transition matrices that tell whether the steps suffice."""
         if constant:
             slow = [int(nodes.argmin())]
-            made: np.ndarray = _constant_transition(M[slow], length(nodes)[slow], steps)[0]
-            return made
+            return np.asarray(_constant_transition(M[slow], length(nodes)[slow], steps)[0])
         slowest = np.full(_PROBE.size, nodes.min())
         return _transition(M_of, _PROBE, slowest, length(slowest), steps)[0]
 

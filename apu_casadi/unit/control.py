@@ -13,9 +13,9 @@ in ``GOVERNORS`` it has a word, which ``Apu.change`` and scenarios take as ``gov
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -96,12 +96,6 @@ class Governor(Parameters):
         """Its numbers by name."""
         fields = dataclasses.fields(self)
         return {f.name: getattr(self, f.name) for f in fields if "unit" in f.metadata}
-
-    def with_numbers(self, values: Mapping[str, Any]) -> Self:
-        """Return the same law with other numbers or symbols, which are not checked."""
-        new = object.__new__(type(self))
-        new.__dict__.update({**self.__dict__, **values})
-        return new
 
 
 def _limited(value: Any, low: Any, high: Any) -> Any:

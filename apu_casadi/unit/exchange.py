@@ -103,9 +103,8 @@ class Link:
     def with_numbers(self, values: Sequence[Any]) -> Link:
         """Return the same link with other numbers, or symbols."""
         names = self.governor.numbers
-        return Link(
-            self.governor.with_numbers(dict(zip(names, values[4:], strict=True))), *values[:4]
-        )
+        law = self.governor.symbolic(**dict(zip(names, values[4:], strict=True)))
+        return Link(law, *values[:4])
 
 
 def moved(x: Sequence[Any], h: Any, rates: Sequence[Any]) -> tuple[Any, ...]:

@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
-from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.register import Key, Register, read_table
 from apu_casadi.core.signals import Signal
 from apu_casadi.machine.loads.load import Load, writer
@@ -182,11 +181,7 @@ def fault_from_table(table: Mapping[str, Any], default: str = "ttsc") -> Fault:
         ScenarioError: an unknown kind, or a wrong key or value; the text starts with the key.
     """
     rest = {k: v for k, v in table.items() if k != "kind"}
-    try:
-        cls = FAULTS[table.get("kind", default)]
-    except ParameterError as error:
-        raise ScenarioError(f"kind: {error}") from None
-    return cls.from_table(rest)
+    return FAULTS.of_kind(table.get("kind", default)).from_table(rest)
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,14 @@ from apu_casadi.machine.loads.load import (
     LOADS,
     W_RATED,
     AtLoad,
+    Branches,
     Load,
     Own,
     all_equal,
     by_phase,
     in_range,
     power_keys,
-    power_words,
     split_power,
-    stiffness,
     three,
 )
 from apu_casadi.machine.loads.series import POWER, R_INPUTS, RESISTANCE, UNBALANCE, check_R
@@ -43,7 +42,7 @@ _CAPACITY = Key("C_uF", "uF", "capacitance by phase", 0.0, open_lo=True, phases=
 
 @LOADS.add("RC", "series_RC")
 @dataclass(frozen=True)
-class CapacitorLoad(Load):
+class CapacitorLoad(Branches):
     """A resistance and a capacitor in series in each phase.
 
     Switched to, the capacitors are uncharged, unless the load before had such capacitors.
@@ -142,11 +141,12 @@ class CapacitorLoad(Load):
         """The balanced load of equal mean admittance at 400 Hz."""
         if self.balanced:
             return self
-        Z = 3 / sum(1 / z for z in self._Z)
+        Z = self.Z_mean
         return CapacitorLoad(R=(Z.real,) * 3, C=(-1.0 / (W_RATED * Z.imag),) * 3)
 
     @property
-    def _Z(self) -> list[complex]:
+    def Z_rated(self) -> list[complex]:
+        """Impedance of each phase at 400 Hz, ohm."""
         return [complex(R, -1.0 / (W_RATED * C)) for R, C in zip(self.R, self.C, strict=True)]
 
     def impedance(self, w_r: float, V_t: float) -> complex:
@@ -157,16 +157,6 @@ class CapacitorLoad(Load):
         """Return the voltages V_C = I/(j w_r C), with phasors q - j d."""
         X_C = 1.0 / (w_r * self.C[0])
         return {"v_Cq": -X_C * i.d, "v_Cd": X_C * i.q, "v_C0": 0.0}
-
-    @property
-    def fineness(self) -> float:
-        """By the largest resistance."""
-        return stiffness(max(self.R))
-
-    @property
-    def label(self) -> str:
-        """Power, power factor and unbalance at 230 V and 400 Hz."""
-        return power_words(self._Z, self.balanced)
 
     @classmethod
     def from_keys(cls, word: str, values: dict[str, Any]) -> Self:
@@ -179,7 +169,7 @@ class CapacitorLoad(Load):
 
     def to_table(self) -> dict[str, Any]:
         """Return the power where it says the same, else R and C."""
-        table: Mapping[str, Any] = {"kind": "RC", **power_keys(self._Z)}
+        table: Mapping[str, Any] = {"kind": "RC", **power_keys(self.Z_rated)}
         if self.is_told_by(table):
             return dict(table)
         C = [1e6 * c for c in self.C]

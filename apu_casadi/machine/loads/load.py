@@ -202,6 +202,32 @@ class Load(ABC):
             return False
 
 
+class Branches(Load):
+    """An impedance in each phase, of resistances ``R``, ohm, and something in series with them."""
+
+    R: tuple[float, float, float]
+
+    @property
+    @abstractmethod
+    def Z_rated(self) -> list[complex]:
+        """Impedance of each phase at 400 Hz, ohm."""
+
+    @property
+    def Z_mean(self) -> complex:
+        """Impedance of the mean admittance at 400 Hz, ohm."""
+        return 3 / sum(1 / z for z in self.Z_rated)
+
+    @property
+    def fineness(self) -> float:
+        """By the largest resistance."""
+        return stiffness(max(self.R))
+
+    @property
+    def label(self) -> str:
+        """Power, power factor and unbalance at 230 V and 400 Hz, as in ``'225 kW'``."""
+        return power_words(self.Z_rated, self.balanced)
+
+
 LOADS: Register[type[Load]] = Register("load", "apu_casadi.machine.loads")
 
 
@@ -213,11 +239,7 @@ def load_from_table(table: Mapping[str, Any]) -> Load:
     """
     if "kind" not in table:
         raise ScenarioError(f"kind: missing: one of {', '.join(LOADS)}")
-    try:
-        cls = LOADS[table["kind"]]
-    except ParameterError as error:
-        raise ScenarioError(f"kind: {error}") from None
-    return cls.from_table(table)
+    return LOADS.of_kind(table["kind"]).from_table(table)
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,14 @@ from apu_casadi.machine.loads.load import (
     LOADS,
     W_RATED,
     AtLoad,
+    Branches,
     Load,
     Own,
     all_equal,
     by_phase,
     in_range,
     power_keys,
-    power_words,
     split_power,
-    stiffness,
     three,
 )
 from apu_casadi.machine.park import Abc
@@ -75,7 +74,7 @@ class Impedance(Load):
 
 @LOADS.add("R", "RL", "series")
 @dataclass(frozen=True)
-class SeriesLoad(Impedance):
+class SeriesLoad(Branches, Impedance):
     """A resistance and an inductance in series in each phase.
 
     Args:
@@ -159,26 +158,17 @@ class SeriesLoad(Impedance):
         """The balanced load of equal mean admittance at 400 Hz."""
         if self.balanced:
             return self
-        Z = 3 / sum(1 / z for z in self._Z)
+        Z = self.Z_mean
         return SeriesLoad(R=(Z.real,) * 3, L=(max(Z.imag, 0.0) / W_RATED,) * 3)
 
     @property
-    def _Z(self) -> list[complex]:
+    def Z_rated(self) -> list[complex]:
+        """Impedance of each phase at 400 Hz, ohm."""
         return [complex(R, W_RATED * L) for R, L in zip(self.R, self.L, strict=True)]
 
     def impedance(self, w_r: float, V_t: float) -> complex:
         """Return R + j w_r L."""
         return complex(self.R[0], w_r * self.L[0])
-
-    @property
-    def fineness(self) -> float:
-        """By the largest resistance."""
-        return stiffness(max(self.R))
-
-    @property
-    def label(self) -> str:
-        """Power, power factor and unbalance at 230 V and 400 Hz, as in ``'225 kW'``."""
-        return power_words(self._Z, self.balanced)
 
     @classmethod
     def from_keys(cls, word: str, values: dict[str, Any]) -> Self:
@@ -193,7 +183,7 @@ class SeriesLoad(Impedance):
 
     def to_table(self) -> dict[str, Any]:
         """Return the power where it says the same, else R and L."""
-        keys = power_keys(self._Z)
+        keys = power_keys(self.Z_rated)
         if self.kind == "resistive":
             del keys["power_factor"]
         table = {"kind": "R" if self.kind == "resistive" else "RL", **keys}
