@@ -158,6 +158,11 @@ class GasGenerator(Parametric):
         """
         return solve_design(self.parameters)
 
+    @property
+    def rated_power(self) -> float:
+        """Shaft power at the design point in whole kilowatts, W."""
+        return 1e3 * round(float(self.design.values["PW"]) / 1e3)
+
     @derived
     def maps(self) -> tuple[ScaledMap, ScaledMap]:
         """The compressor and turbine maps scaled to the design point."""
