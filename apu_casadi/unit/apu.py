@@ -222,7 +222,8 @@ class Apu(Parametric):
 
     # -- parameters ---------------------------------------------------------------------------
 
-    def _sets(self) -> dict[str, Parameters]:
+    def parameter_sets(self) -> dict[str, Parameters]:
+        """Return the parameter sets by the words that stand before the dot."""
         gg, gen = self.gas_generator, self.generator
         return {
             "gas_generator": gg.parameters,
@@ -241,7 +242,7 @@ class Apu(Parametric):
         has different follows as ``"generator2.machine.r_s"``.
         """
         table: dict[str, float | str] = {}
-        for s, p in self._sets().items():
+        for s, p in self.parameter_sets().items():
             table |= _values(s, p)
         table["generator.neutral"] = self.generator.neutral
         table["generator.count"] = len(self.machines)
@@ -286,7 +287,9 @@ class Apu(Parametric):
             if key not in ("governor.kind", "generator.count"):
                 by_set.setdefault(s, {})[name] = value
         new: dict[str, Any] = {
-            s: p.change(**by_set.get(s, {})) for s, p in self._sets().items() if s not in _EACH
+            s: p.change(**by_set.get(s, {}))
+            for s, p in self.parameter_sets().items()
+            if s not in _EACH
         }
         gg = self.gas_generator
         touched = {"gas_generator", "compressor_map", "turbine_map"} & set(by_set)
