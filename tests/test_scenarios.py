@@ -282,6 +282,7 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     monkeypatch.setitem(sys.modules, "apu_casadi.unit.multirate", multirate)
     # units are kept between runs: this stand-in must not stay
     monkeypatch.setattr(registry, "unit_of", registry.unit_of.__wrapped__)
+    monkeypatch.setattr(registry, "_engine_file", registry._engine_file.__wrapped__)
     ds = registry.run(
         "joint",
         waveform_dt=None,
