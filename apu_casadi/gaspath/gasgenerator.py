@@ -177,6 +177,11 @@ class GasGenerator(Parametric):
         """All numbers of this engine, by :data:`~apu_casadi.gaspath.unitnumbers.NUMBERS`."""
         return unitnumbers.vector(self.parameters, self.gas, self.design, self.maps)
 
+    @property
+    def held(self) -> dict[str, float]:
+        """The same by name."""
+        return dict(zip(unitnumbers.NUMBERS.names, self.numbers.tolist(), strict=True))
+
     def full(self, theta: Any) -> np.ndarray:
         """Return the family's theta: the health factors, shape (4,), and this engine's numbers."""
         full = self._healthy.copy()
