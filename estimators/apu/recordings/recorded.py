@@ -491,7 +491,7 @@ def _fits(own: tuple[str, str], taken: Sequence[str], mapping: Mapping[str, Any]
     """Whether a name with a unit at its end is that of a quantity in that unit."""
     name, unit = own
     si = "s" if is_time_name(name) else si_of(name)
-    base = UNITS[unit][0]
+    base = UNITS[unit][0] if unit in UNITS else "Pa"
     fit = si in (None, base) or (si == "rad/s" and (unit == "%" or base == "1/s"))
     return fit and name not in taken and name not in mapping
 

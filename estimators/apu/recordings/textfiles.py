@@ -165,11 +165,13 @@ _NAME = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 
 def _rows(path: Path, kept: list[tuple[int, str]], delimiter: str) -> list[Row]:
     if delimiter == " ":
-        return [
-            (k, x.split() if like_number(x.split()[0]) or len(x.split()) == len(kept[-1][1].split())
-             else _NAME.findall(x))
-            for k, x in kept
-        ]  # fmt: skip
+        width = len(kept[-1][1].split())
+
+        def cut_at_blanks(x: str) -> list[str]:
+            cells = x.split()
+            return cells if like_number(cells[0]) or len(cells) == width else _NAME.findall(x)
+
+        return [(k, cut_at_blanks(x)) for k, x in kept]
     reader = csv.reader((x for _, x in kept), delimiter=delimiter)
     try:
         rows = list(reader)
@@ -340,7 +342,7 @@ def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
     if stripped and (h.known(header(stripped)[0]) or is_time_name(header(stripped)[0])):
         cells = [stripped, *cells[1:]]
     pairs = [header(c) for c in cells]
-    row = [_bare(c) for c in below[1]] if below else []
+    row = ["" if _bare(c) == "-" else _bare(c) for c in below[1]] if below else []
     units = [u or ((row[i] or None) if i < len(row) else None) for i, (_, u) in enumerate(pairs)]
     return named[0], [n for n, _ in pairs], units, body
 

@@ -132,7 +132,7 @@ def split_unit(name: str, known: Callable[[str], bool]) -> tuple[str, str] | Non
     for k in (i for i, c in enumerate(name) if c in "_/ ,;-:"):
         head, tail = name[:k].strip(), name[k + 1 :].strip(" ,;-_:").removeprefix("in ")
         # no slash in many exports: kg_h, lb_hr, rad_s
-        unit = unit_of(tail) or unit_of(tail.replace("_", "/"))
+        unit = unit_of(tail) or unit_of(tail.replace("_", "/")) or (gauge_of(tail) and tail)
         if known(head) and unit not in (None, "1", "-"):
             return head, unit
     return None
