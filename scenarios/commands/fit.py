@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     from estimators.apu.recordings.runfiles import recorded_ambient
 
     gg = given.engine(args)
-    reading, mapping = _reading(args)
+    reading, mapping = _reading(args, gg)
     mapping |= parse_mapping(args.column)
     _known_targets(mapping, gg)
     notes: list[str] = []
@@ -114,13 +114,17 @@ def run(args: argparse.Namespace) -> int:
     how |= {"prior": _priors(args.prior), "consider": given.numbers(args.consider, "--consider")}
     fit = fitting.fit_engine(data, given.names(args.estimate), gg=gg, **how)
     profiles = _profiles(fit, args) if args.profile else []
-    figures = _draw(fit, args.figure, steady, [d.ambient for d in data]) if args.figure else []
+    figures = []
+    if args.figure:
+        ambients = [d.ambient for d in data]
+        figures = _draw(fit, args.figure, steady, ambients, given.program(args))
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["read_as"] = [*notes, *_unheeded(tables, times, args)]
     days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
     found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
     found |= {"apu_casadi_version": installed(), **given.own(args)}
+    found |= given.assumed(args)
     if args.json:
         jsontext.show(found)
         return 0
@@ -148,21 +152,23 @@ def _profiles(fit: EngineFit, args: argparse.Namespace) -> list[Profile]:
 # ------------------------------------------------------------------------------ options
 
 
-def _reading(args: argparse.Namespace) -> tuple[Reading, dict[str, tuple[str, str | None]]]:
+def _reading(
+    args: argparse.Namespace, gg: GasGenerator
+) -> tuple[Reading, dict[str, tuple[str, str | None]]]:
     """Return how files are read that leave a question, and their columns by --columns."""
     from estimators.apu.recordings.layout import Reading, merged, pressure, read_layout
     from estimators.apu.recordings.plausible import parse_limits
 
     base, mapping = read_layout(args.columns) if args.columns else (Reading(), {})
     own: dict[str, Any] = {n: tuple(_blanks(getattr(args, n))) for n in ("names", "units")}
-    own |= {
-        n: getattr(args, n) for n in ["encoding", "decimal", "time_format", "time_zone", "time"]
-    }
-    own |= {"rate": args.rate, "sort": args.sort, "exclude": args.exclude_implausible}
+    own |= {"encoding": args.encoding, "decimal": args.decimal, "time": args.time}
+    own |= {"time_format": args.time_format, "time_zone": args.time_zone, "rate": args.rate}
+    own |= {"sort": args.sort, "exclude": args.exclude_implausible}
     own |= {"missing": tuple(map(_number_or_word, given.names(args.missing)))}
     own |= {"barometer": pressure(args.barometer) if args.barometer else None}
     limits = {**base.ranges, **parse_limits(args.range)}
-    return dataclasses.replace(merged(base, Reading(**own)), ranges=limits), mapping
+    how = merged(base, Reading(**own))
+    return dataclasses.replace(how, ranges=limits, engine=gg), mapping
 
 
 def _blanks(text: str | None) -> list[str]:
@@ -213,7 +219,7 @@ def _deviation(p: given.Pair, unit: str) -> tuple[float, bool]:
     """Return a standard deviation in SI, and whether it is relative to the reading."""
     import numpy as np
 
-    from estimators.apu.recordings.units import UNITS, convert
+    from apu_casadi.core.units import UNITS, convert
 
     # the longest ending that is a unit: 3K, 1.5 kPa, 0.5%, 3 K
     endings = [u for u in UNITS if p.value.endswith(u) and not u[0].isdigit() and u != "-"]
@@ -517,7 +523,9 @@ def _day(ambient: Mapping[str, Any]) -> str:
     return day_words(fixed) + (f", but {' and '.join(moving)} as recorded" if moving else "")
 
 
-def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]]) -> list[Path]:
+def _draw(
+    fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]], program: str
+) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
     from apu_casadi.core import files
     from apu_casadi.gaspath.gasgenerator import GasGenerator
@@ -535,7 +543,7 @@ def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, A
         target = first if len(fit.names) == 1 else first.with_stem(f"{first.stem}_{k + 1}")
         t = fit.recordings[k].t + (1 if steady else 0)
         how["heading"] = f"{name}: measured and fitted"
-        how["note"] = f"95 %: {note}. Ambient: {_day(days[k])}; {given.program()}."
+        how["note"] = f"95 %: {note}. Ambient: {_day(days[k])}; {program}."
         fig = plot_fit(t, fit.series(k), units, **how)
         made.append(files.save_figure(fig, target))
     return made

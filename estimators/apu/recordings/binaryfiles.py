@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.units import header, unit_of
 from estimators.apu.recordings.columns import Column, Tell, cut, parsed
-from estimators.apu.recordings.units import header, unit_of
 
 __all__ = [
     "dataset_columns",

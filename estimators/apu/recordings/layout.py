@@ -28,10 +28,11 @@ from pathlib import Path
 from typing import Any
 
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.units import UNITS, gauge_of, unit_of
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.recordings.columns import cut
 from estimators.apu.recordings.numbertext import DECIMALS
-from estimators.apu.recordings.plausible import PLAUSIBLE, Limits
-from estimators.apu.recordings.units import UNITS, gauge_of, unit_of
+from estimators.apu.recordings.plausible import PLAUSIBLE, Limits, plausible_for
 
 __all__ = ["Reading", "merged", "parse_mapping", "pressure", "read_layout"]
 
@@ -56,6 +57,8 @@ class Reading:
         names_line, units_line, data_line: of a text file, from 1; data_line is the first of it.
         barometer: pressure of the surrounding air, Pa, for gauge pressures.
         sort: put the rows in the order of time.
+        engine: the engine that the readings are of; 100 % speed is its design speed, and the ranges
+            of flows, powers and speeds are those of its size.
     """
 
     encoding: str | None = None
@@ -75,6 +78,7 @@ class Reading:
     data_line: int | None = None
     barometer: float | None = None
     sort: bool = False
+    engine: GasGenerator = field(default_factory=GasGenerator)
 
     def __post_init__(self) -> None:
         if self.decimal is not None and self.decimal not in DECIMALS:
@@ -98,7 +102,9 @@ class Reading:
     @property
     def limits(self) -> Limits:
         """The table of ranges with those given."""
-        return Limits({**PLAUSIBLE, **self.ranges}, self.exclude, tuple(self.ranges))
+        return Limits(
+            {**plausible_for(self.engine), **self.ranges}, self.exclude, tuple(self.ranges)
+        )
 
     @property
     def gaps(self) -> tuple[float, ...]:
@@ -238,6 +244,6 @@ def merged(first: Reading, second: Reading) -> Reading:
     own = {
         f.name: getattr(second, f.name)
         for f in dataclasses.fields(Reading)
-        if getattr(second, f.name) != getattr(plain, f.name)
+        if f.name == "engine" or getattr(second, f.name) != getattr(plain, f.name)
     }
     return dataclasses.replace(first, **own)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.units import header
 from estimators.apu.recordings.binaryfiles import dataset_columns, frame_columns, typed
 from estimators.apu.recordings.columns import Column, Tell
-from estimators.apu.recordings.units import header
 
 __all__ = ["memory_columns"]
 

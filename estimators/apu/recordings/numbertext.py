@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.units import gauge_of, unit_of
 from estimators.apu.recordings.columns import (
     COMMA,
     EITHER,
@@ -20,7 +21,6 @@ from estimators.apu.recordings.columns import (
     is_word,
     point,
 )
-from estimators.apu.recordings.units import gauge_of, unit_of
 
 __all__ = ["DECIMALS", "numbers_as", "ungrouped", "without_unit"]
 

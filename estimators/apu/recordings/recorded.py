@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.units import GAUGE, UNITS, convert, gauge_of, split_unit, unit_of
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.recordings.binaryfiles import netcdf_columns, parquet_columns
 from estimators.apu.recordings.columns import Column
@@ -37,7 +38,6 @@ from estimators.apu.recordings.timestamps import (
     may_be_time,
     to_seconds,
 )
-from estimators.apu.recordings.units import GAUGE, UNITS, convert, gauge_of, split_unit, unit_of
 from estimators.apu.sensors import KNOWN
 
 __all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_mapping"]
@@ -147,7 +147,7 @@ class Table:
         what = f"{self.source}, column {c.name}"
         known = unit_of(unit) if isinstance(unit, str) else None
         if known == "%" and si == "rad/s":
-            design = GasGenerator().parameters.N
+            design = self.reading.engine.parameters.N
             self._tell(
                 f"{what}: 100 % is taken as the design speed, {design * 30 / np.pi:.0f} r/min"
             )

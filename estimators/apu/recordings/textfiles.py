@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.units import gauge_of, header, unit_of
 from estimators.apu.recordings.columns import (
     PLAIN,
     Column,
@@ -28,7 +29,6 @@ from estimators.apu.recordings.columns import (
 from estimators.apu.recordings.layout import Reading
 from estimators.apu.recordings.numbertext import numbers_as, ungrouped, without_unit
 from estimators.apu.recordings.timestamps import is_time_name, looks_like_time
-from estimators.apu.recordings.units import gauge_of, header, unit_of
 
 __all__ = ["text_columns"]
 
