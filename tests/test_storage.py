@@ -250,10 +250,12 @@ def test_the_last_instant_is_at_hand_wherever_results_are(storage, tmp_path, mon
     gg, K = Apu().gas_generator, 25
     n = len(gg.Y)
     where = "memory" if storage == "memory" else tmp_path
-    book = recorder.Recorder(gg, np.arange(K) * 0.02, 0, StepMeans(Apu().generator, False), where)
+    means = StepMeans(Apu().generator, False)
+    book = recorder.Recorder(gg, np.arange(K) * 0.02, 0, means, where)
     for k in range(K):
         y, factors = np.arange(n) + 100.0 * k, dict.fromkeys("abcd", 1.0)
-        row = recorder.Row(y, np.full(9, 4.0 * k), factors, None, np.zeros(1), np.zeros((11, 1)))
+        values = np.full(len(means.kept), 4.0 * k)
+        row = recorder.Row(y, values, factors, None, np.zeros(1), np.zeros((11, 1)))
         book.put(k, 1, row)
         assert book.last().tolist() == (np.arange(n) + 100.0 * k).tolist()
     rows = book.instants()
