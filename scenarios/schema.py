@@ -66,6 +66,7 @@ from apu_casadi.unit.events import (
     number_or_profile,
 )
 from apu_casadi.unit.exchange import OFFERED
+from apu_casadi.unit.shippedunits import is_name
 from scenarios import extensions
 from scenarios.reading import (
     PlacedError,
@@ -252,7 +253,8 @@ class Scenario(_Plain):
         noise: process and measurement noise; None for none.
         seed: seed of the noise.
         parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
-        engine: file of another engine than the paper's, seen from the scenario's file.
+        engine: file of another unit than the paper's, seen from the scenario's file, or the name of
+            one that comes with the package.
         governor: name of another law than the PI law, short for the parameter ``governor.kind``;
             its numbers are parameters ``governor.*``.
         extensions: Python files that register parts which the scenario names, seen from its file.
@@ -312,7 +314,8 @@ class Scenario(_Plain):
         checked = {k: _parameter(k, v) for k, v in _flat(self.parameters)}
         put(self, "parameters", MappingProxyType(checked))
         if self.engine is not None:
-            put(self, "engine", os.path.abspath(text_of(self.engine, "engine")))
+            engine = text_of(self.engine, "engine")
+            put(self, "engine", engine if is_name(engine) else os.path.abspath(engine))
         if self.governor is not None:
             hint = f"unknown {self.governor!r} {nearest(str(self.governor), GOVERNORS)}"
             require(self.governor in GOVERNORS, "governor", hint)
@@ -555,8 +558,9 @@ def _seen_from(folder: Path, made: dict[str, Any]) -> None:
         made["extensions"] = [
             str(folder / v) if isinstance(v, str) and v else v for v in made["extensions"]
         ]
-    if isinstance(made.get("engine"), str) and made["engine"]:
-        made["engine"] = str(folder / made["engine"])
+    engine = made.get("engine")
+    if isinstance(engine, str) and engine and ((folder / engine).exists() or not is_name(engine)):
+        made["engine"] = str(folder / engine)
     for part in ("ambient", "phases", "changes"):
         if part in made:
             made[part] = _files_of(folder, made[part])

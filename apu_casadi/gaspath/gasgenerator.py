@@ -159,6 +159,11 @@ class GasGenerator(Parametric):
         """
         return solve_design(self.parameters)
 
+    @property
+    def rated_power(self) -> float:
+        """Shaft power at the design point in whole kilowatts, W."""
+        return 1e3 * round(float(self.design.values["PW"]) / 1e3)
+
     @derived
     def maps(self) -> tuple[ScaledMap, ScaledMap]:
         """The compressor and turbine maps scaled to the design point."""
@@ -172,6 +177,11 @@ class GasGenerator(Parametric):
     def numbers(self) -> np.ndarray:
         """All numbers of this engine, by :data:`~apu_casadi.gaspath.unitnumbers.NUMBERS`."""
         return unitnumbers.vector(self.parameters, self.gas, self.design, self.maps)
+
+    @property
+    def held(self) -> dict[str, float]:
+        """The same by name."""
+        return dict(zip(unitnumbers.NUMBERS.names, self.numbers.tolist(), strict=True))
 
     def full(self, theta: Any) -> np.ndarray:
         """Return the family's theta: the health factors, shape (4,), and this engine's numbers."""

@@ -94,7 +94,8 @@ class Apu(Parametric):
         """Shaft power, W, that the two generators' mean power P_total asks for (eq. 1)."""
         return self.link.PW(P_total)
 
-    def _sets(self) -> dict[str, Parameters]:
+    def parameter_sets(self) -> dict[str, Parameters]:
+        """Return the parameter sets by the words that stand before the dot."""
         gg, gen = self.gas_generator, self.generator
         return {
             "gas_generator": gg.parameters,
@@ -109,7 +110,7 @@ class Apu(Parametric):
     def parameters(self) -> dict[str, float | str]:
         """Return every parameter as ``{"set.name": value}``; the keys :meth:`change` takes."""
         table: dict[str, float | str] = {}
-        for s, p in self._sets().items():
+        for s, p in self.parameter_sets().items():
             for f in dataclasses.fields(p):
                 table[f"{s}.{f.name}"] = getattr(p, f.name)
         table["generator.neutral"] = self.generator.neutral
@@ -139,7 +140,9 @@ class Apu(Parametric):
             s, _, name = key.partition(".")
             if key != "governor.kind":
                 groups.setdefault(s, {})[name] = value
-        new: dict[str, Any] = {s: p.change(**groups.get(s, {})) for s, p in self._sets().items()}
+        new: dict[str, Any] = {
+            s: p.change(**groups.get(s, {})) for s, p in self.parameter_sets().items()
+        }
         gg, gen = self.gas_generator, self.generator
         touched = {"gas_generator", "compressor_map", "turbine_map"} & set(groups)
         if touched:

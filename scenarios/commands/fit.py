@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     gg = given.engine(args)
     mapping = parse_mapping(args.column)
     _known_targets(mapping, gg)
-    reading = _reading(args)
+    reading = _reading(args, gg)
     notes: list[str] = []
     tables = [read_table(f, mapping, reading=reading, notes=notes) for f in args.files]
     sensors = _sensors(args.sigma, gg)
@@ -104,13 +104,17 @@ def run(args: argparse.Namespace) -> int:
     how |= {"prior": _priors(args.prior), "consider": given.numbers(args.consider, "--consider")}
     fit = fitting.fit_engine(data, given.names(args.estimate), gg=gg, **how)
     profiles = _profiles(fit, args) if args.profile else []
-    figures = _draw(fit, args.figure, steady, [d.ambient for d in data]) if args.figure else []
+    figures = []
+    if args.figure:
+        ambients = [d.ambient for d in data]
+        figures = _draw(fit, args.figure, steady, ambients, given.program(args))
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["read_as"] = [*notes, *_unheeded(tables, times, args)]
     days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
     found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
     found |= {"apu_casadi_version": installed(), **given.own(args)}
+    found |= given.assumed(args)
     if args.json:
         jsontext.show(found)
         return 0
@@ -138,7 +142,7 @@ def _profiles(fit: EngineFit, args: argparse.Namespace) -> list[Profile]:
 # ------------------------------------------------------------------------------ options
 
 
-def _reading(args: argparse.Namespace) -> Reading:
+def _reading(args: argparse.Namespace, gg: GasGenerator) -> Reading:
     """Return how files are read that leave a question."""
     from estimators.apu.recordings.plausible import parse_limits
     from estimators.apu.recordings.recorded import Reading
@@ -146,7 +150,7 @@ def _reading(args: argparse.Namespace) -> Reading:
     missing = [given.number(n, "--missing", args.missing) for n in given.names(args.missing)]
     limits = parse_limits(args.range)
     how = args.exclude_implausible, limits, args.time_format, args.time_zone
-    return Reading(args.encoding, args.decimal, tuple(missing), *how)
+    return Reading(args.encoding, args.decimal, tuple(missing), *how, engine=gg)
 
 
 def _priors(items: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -185,7 +189,7 @@ def _deviation(p: given.Pair, unit: str) -> tuple[float, bool]:
     """Return a standard deviation in SI, and whether it is relative to the reading."""
     import numpy as np
 
-    from estimators.apu.recordings.units import UNITS, convert
+    from apu_casadi.core.units import UNITS, convert
 
     # the longest ending that is a unit: 3K, 1.5 kPa, 0.5%, 3 K
     endings = [u for u in UNITS if p.value.endswith(u) and not u[0].isdigit() and u != "-"]
@@ -486,7 +490,9 @@ def _day(ambient: Mapping[str, Any]) -> str:
     return day_words(fixed) + (f", but {' and '.join(moving)} as recorded" if moving else "")
 
 
-def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]]) -> list[Path]:
+def _draw(
+    fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]], program: str
+) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
     from apu_casadi.core import files
     from apu_casadi.gaspath.gasgenerator import GasGenerator
@@ -504,7 +510,7 @@ def _draw(fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, A
         target = first if len(fit.names) == 1 else first.with_stem(f"{first.stem}_{k + 1}")
         t = fit.recordings[k].t + (1 if steady else 0)
         how["heading"] = f"{name}: measured and fitted"
-        how["note"] = f"95 %: {note}. Ambient: {_day(days[k])}; {given.program()}."
+        how["note"] = f"95 %: {note}. Ambient: {_day(days[k])}; {program}."
         fig = plot_fit(t, fit.series(k), units, **how)
         made.append(files.save_figure(fig, target))
     return made

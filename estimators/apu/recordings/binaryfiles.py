@@ -114,7 +114,7 @@ def _label(path: Path, label: Any) -> tuple[str, Any]:
         return header(str(label))
     parts = [str(p).strip() for p in label if str(p).strip()]
     if len(parts) == 2:
-        from estimators.apu.recordings.units import unit_of
+        from apu_casadi.core.units import unit_of
 
         unit = parts[1].strip("[]()")
         if unit_of(unit) is not None:

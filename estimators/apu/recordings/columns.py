@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.units import unit_of
 from estimators.apu.recordings.timestamps import is_time_name, looks_like_time
-from estimators.apu.recordings.units import unit_of
 
 __all__ = ["Column", "cut", "header", "parsed", "text_columns"]
 

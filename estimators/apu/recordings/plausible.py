@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.units import UNITS
 from apu_casadi.gaspath.conditions import RANGES as CONDITIONS
-from estimators.apu.recordings.units import UNITS
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.sensors import RANGES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["PLAUSIBLE", "Limits", "parse_limits"]
+__all__ = ["PLAUSIBLE", "Limits", "parse_limits", "plausible_for"]
 
 _COLD, _HOT, _BURNT = (150.0, 420.0), (300.0, 1200.0), (400.0, 1900.0)
 _AMBIENT_P, _HIGH_P = (5e3, 2.5e5), (4e4, 2e6)
@@ -60,6 +61,24 @@ _USUAL = {
 }
 #: What loggers write for "no reading", where a range would let it pass.
 _SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
+
+
+def plausible_for(gg: GasGenerator) -> dict[str, tuple[float, float]]:
+    """Return the ranges for an engine of another size than the default one.
+
+    Flows, powers and speeds go with their design values; the default engine's are the table's.
+    """
+    own, default = (
+        {"kg/s": e.parameters.W2, "W": e.design.values["PW"], "rad/s": e.parameters.N}
+        for e in (gg, GasGenerator())
+    )
+    factor = {unit: own[unit] / default[unit] for unit in own}
+    units = {s.name: s.unit for s in (*gg.Y, *gg.U)}
+    found = {}
+    for name, (low, high) in PLAUSIBLE.items():
+        size = factor.get(units.get(name, ""), 1.0)
+        found[name] = (low * size, high * size)
+    return found
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.units import UNITS, convert, split_unit, unit_of
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.recordings.binaryfiles import netcdf_columns, parquet_columns
 from estimators.apu.recordings.columns import Column, text_columns
-from estimators.apu.recordings.plausible import PLAUSIBLE, Limits
+from estimators.apu.recordings.plausible import PLAUSIBLE, Limits, plausible_for
 from estimators.apu.recordings.timestamps import TIMES, is_time_name, looks_like_time, to_seconds
-from estimators.apu.recordings.units import UNITS, convert, split_unit, unit_of
 from estimators.apu.sensors import KNOWN
 
 __all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_mapping", "read_table"]
@@ -46,6 +46,8 @@ class Reading:
         missing: numbers that stand for a gap, in the unit of the file.
         exclude: leave impossible readings out instead of refusing them.
         ranges: quantity -> (lowest, highest), SI; go before the table's.
+        engine: the engine that the readings are of; 100 % speed is its design speed, and the ranges
+            of flows, powers and speeds are those of its size.
         time_format, time_zone: see :func:`~estimators.apu.recordings.timestamps.to_seconds`.
     """
 
@@ -56,11 +58,12 @@ class Reading:
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     time_format: str | None = None
     time_zone: str | None = None
+    engine: GasGenerator = field(default_factory=GasGenerator)
 
     @property
     def limits(self) -> Limits:
         """The table of ranges with those given."""
-        return Limits({**PLAUSIBLE, **self.ranges}, self.exclude)
+        return Limits({**plausible_for(self.engine), **self.ranges}, self.exclude)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +151,7 @@ class Table:
         if gap.any():
             raw = np.where(gap, np.nan, raw)
         if isinstance(unit, str) and unit == "%" and si == "rad/s":
-            design = GasGenerator().parameters.N
+            design = self.reading.engine.parameters.N
             self._tell(
                 f"{what}: 100 % is taken as the design speed, {design * 30 / np.pi:.0f} r/min"
             )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from estimators.apu.recordings.units import UNITS, convert, unit_of
+from apu_casadi.core.units import UNITS, convert, unit_of
 
 __all__ = ["TIMES", "is_time_name", "looks_like_time", "to_seconds"]
 

@@ -1,14 +1,14 @@
-"""Units of recorded quantities, and their way into SI."""
+"""Units, and their way into SI: of recorded quantities, and of the numbers of a unit's file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
 
-__all__ = ["UNITS", "convert", "split_unit", "unit_of"]
+__all__ = ["ALL_UNITS", "UNITS", "convert", "split_unit", "unit_of"]
 
 _PSI, _LB = 6894.757293168, 0.45359237  # Pa, kg
 #: By SI unit: what one of each unit is in it.
@@ -26,12 +26,31 @@ _SCALES: dict[str, dict[str, float]] = {
     "kg/kg": {"kg/kg": 1.0, "g/kg": 1e-3},
     "1": {"1": 1.0, "-": 1.0, "%": 1e-2},
 }
+#: Of machines and fuels, which no recording has: there ``H`` are hours.
+_MORE: dict[str, dict[str, float]] = {
+    "ohm": {"ohm": 1.0, "mohm": 1e-3},
+    "H": {"H": 1.0, "mH": 1e-3, "uH": 1e-6},
+    "V": {"V": 1.0, "kV": 1e3},
+    "Hz": {"Hz": 1.0, "kHz": 1e3},
+    "J/kg": {"J/kg": 1.0, "kJ/kg": 1e3, "MJ/kg": 1e6},
+    "kg m^2": {"kg m^2": 1.0},
+    "kg/s^2": {"kg/s^2": 1.0},
+}
+Scales = Mapping[str, tuple[str, float, float]]
+
+
+def _by_unit(scales: Mapping[str, Mapping[str, float]]) -> dict[str, tuple[str, float, float]]:
+    return {unit: (si, x, 0.0) for si, all_of in scales.items() for unit, x in all_of.items()}
+
+
 #: Unit -> (SI unit, factor, offset): SI value = factor * value + offset.
 UNITS: dict[str, tuple[str, float, float]] = {
-    **{unit: (si, scale, 0.0) for si, all_of in _SCALES.items() for unit, scale in all_of.items()},
+    **_by_unit(_SCALES),
     **dict.fromkeys(("degC", "°C", "C"), ("K", 1.0, 273.15)),
     **dict.fromkeys(("degF", "°F"), ("K", 5 / 9, 459.67 * 5 / 9)),
 }
+#: Those of an engine's file.
+ALL_UNITS = UNITS | _by_unit(_MORE)
 #: Other spellings, in lower case and without blanks, dots and underscores, that mean one thing.
 _SPELLED = """
 degC: degc celsius degreecelsius degreescelsius degreesc ºc ℃ °c
@@ -91,7 +110,13 @@ def split_unit(name: str, known: Callable[[str], bool]) -> tuple[str, str] | Non
 
 
 def convert(
-    values: np.ndarray, unit: str | None, si: str, what: str, *, difference: bool = False
+    values: np.ndarray,
+    unit: str | None,
+    si: str,
+    what: str,
+    *,
+    difference: bool = False,
+    known: Scales = UNITS,
 ) -> np.ndarray:
     """Return values in the SI unit ``si``; no unit means that they are in it already.
 
@@ -104,12 +129,12 @@ def convert(
         return np.asarray(values, float)
     if not isinstance(unit, str):
         raise DataError(f"{what}: the unit must be text, got {unit!r:.40}")
-    if unit not in UNITS:
+    if unit not in known:
         other = unit_of(unit)
         if other is None:
-            raise DataError(f"{what}: unknown unit {unit!r} {nearest(unit, UNITS)}")
+            raise DataError(f"{what}: unknown unit {unit!r} {nearest(unit, known)}")
         unit = other
-    base, factor, offset = UNITS[unit]
+    base, factor, offset = known[unit]
     if {base, si} == {"1", "kg/kg"}:
         base = si
     if base != si:
