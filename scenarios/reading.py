@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.checked import bounded
@@ -113,6 +114,18 @@ def read_profile(value: Any, place: str, folder: str = "") -> Any:
         return value
     with inside(place):
         return profile_from_table(value, place, folder)
+
+
+def files_seen_from(folder: Path, value: Any) -> Any:
+    """Return tables with the files of their profiles seen from a folder."""
+    if isinstance(value, list):
+        return [files_seen_from(folder, v) for v in value]
+    if not isinstance(value, Mapping):
+        return value
+    table = {k: files_seen_from(folder, v) for k, v in value.items()}
+    if isinstance(table.get("file"), str) and table["file"]:
+        table["file"] = str(folder / table["file"])
+    return table
 
 
 def of_profiles(made_of: Any, table: Mapping[str, Any]) -> Any:

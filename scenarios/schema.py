@@ -71,6 +71,7 @@ from scenarios import extensions
 from scenarios.reading import (
     PlacedError,
     check_numbers,
+    files_seen_from,
     inside,
     limits,
     load_parts,
@@ -563,19 +564,7 @@ def _seen_from(folder: Path, made: dict[str, Any]) -> None:
         made["engine"] = str(folder / engine)
     for part in ("ambient", "phases", "changes"):
         if part in made:
-            made[part] = _files_of(folder, made[part])
-
-
-def _files_of(folder: Path, value: Any) -> Any:
-    """Return tables with the files of their profiles seen from a folder."""
-    if isinstance(value, list):
-        return [_files_of(folder, v) for v in value]
-    if not isinstance(value, Mapping):
-        return value
-    table = {k: _files_of(folder, v) for k, v in value.items()}
-    if isinstance(table.get("file"), str) and table["file"]:
-        table["file"] = str(folder / table["file"])
-    return table
+            made[part] = files_seen_from(folder, made[part])
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
