@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.core.profiles.profile import Profile
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.gaspath import health
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
@@ -28,8 +29,8 @@ HEALTH_LO, HEALTH_HI = health.RUN_RANGE
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
 
 
-def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
-    """Return the checked factors as a new dictionary of floats.
+def health_factors(factors: Any, what: str = "health") -> dict[str, Any]:
+    """Return the checked factors as a new dictionary of floats and profiles.
 
     Raises:
         ScenarioError: not a mapping, unknown name (the nearest is named), or outside (0.5, 1.5].
@@ -40,11 +41,25 @@ def health_factors(factors: Any, what: str = "health") -> dict[str, float]:
     for name, value in factors.items():
         if name not in HEALTH_FACTORS:
             raise ScenarioError(f"{what}: unknown {name!r} {nearest(str(name), HEALTH_FACTORS)}")
-        checked[name] = number(value, f"{what}.{name}", lo=HEALTH_LO, hi=HEALTH_HI, open_lo=True)
+        limits: dict[str, Any] = {"lo": HEALTH_LO, "hi": HEALTH_HI, "open_lo": True}
+        checked[name] = number_or_profile(value, f"{what}.{name}", **limits)
     return checked
 
 
-def all_factors(factors: Mapping[str, float] | None) -> dict[str, float]:
+def number_or_profile(value: Any, what: str, **limits: Any) -> Any:
+    """Return a number within limits, or a profile whose values are.
+
+    Raises:
+        ScenarioError: it is neither, or beyond the limits.
+    """
+    if not isinstance(value, Profile):
+        return number(value, what, **limits)
+    for bound in value.bounds:
+        number(bound, what, **limits)
+    return value
+
+
+def all_factors(factors: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return every health factor by name: the checked ones that are given, one for the others."""
     return {**dict.fromkeys(HEALTH_FACTORS, 1.0), **health_factors(factors or {})}
 
@@ -119,12 +134,14 @@ class LoadChange:
 class HealthChange:
     """From ``t`` [s] on, the named health factors hold; the others keep their values.
 
+    A factor may be a profile, whose time counts from ``t``.
+
     Raises:
         ScenarioError: ``t`` negative or not finite, an unknown factor, or one outside (0.5, 1.5].
     """
 
     t: float
-    factors: Mapping[str, float] = field(default_factory=dict)
+    factors: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check time and factors, and keep a read-only copy of the factors."""
@@ -165,7 +182,25 @@ class FaultChange:
             )
 
 
-Event = LoadChange | HealthChange | FaultChange
+@dataclass(frozen=True)
+class SpeedChange:
+    """From ``t`` [s] on, the governor holds the rotor speed ``N_ref`` [rad/s], also a profile.
+
+    Raises:
+        ScenarioError: ``t`` negative or not finite, or no positive speed.
+    """
+
+    t: float
+    N_ref: Any
+
+    def __post_init__(self) -> None:
+        _time(self.t, "SpeedChange")
+        what, unit = "SpeedChange.N_ref", "rad/s"
+        N_ref = number_or_profile(self.N_ref, what, lo=0.0, open_lo=True, unit=unit)
+        object.__setattr__(self, "N_ref", N_ref)
+
+
+Event = LoadChange | HealthChange | FaultChange | SpeedChange
 
 
 def who(numbers: Sequence[int]) -> str:
@@ -195,7 +230,7 @@ class Holding(NamedTuple):
                 now = now._replace(factors={**now.factors, **e.factors})
             elif isinstance(e, LoadChange):
                 now = now._replace(loads=_put(now.loads, e.generator, e.load))
-            else:
+            elif isinstance(e, FaultChange):
                 now = now._replace(faults=_put(now.faults, e.generator, e.fault))
         return now
 
@@ -215,9 +250,13 @@ def _refuse_second(i: int, e: Event, other: Event) -> None:
     for name, value in e.factors.items():
         if other.factors.get(name, value) != value:
             raise ScenarioError(
-                f"events[{i}]: at t = {e.t:g} s {name} = {value:g}, but {other.factors[name]:g} by "
-                "another event at that instant"
+                f"events[{i}]: at t = {e.t:g} s {name} = {_shown(value)}, but "
+                f"{_shown(other.factors[name])} by another event at that instant"
             )
+
+
+def _shown(value: Any) -> str:
+    return value.label if isinstance(value, Profile) else f"{value:g}"
 
 
 def in_order(events: Iterable[Event], duration: float, *, generators: int = 2) -> tuple[Event, ...]:
@@ -233,9 +272,10 @@ def in_order(events: Iterable[Event], duration: float, *, generators: int = 2) -
     """
     events = tuple(events)
     for i, e in enumerate(events):
-        if not isinstance(e, LoadChange | HealthChange | FaultChange):
+        if not isinstance(e, Event):
             raise ScenarioError(
-                f"events[{i}]: LoadChange, HealthChange or FaultChange expected, got {e!r}"
+                f"events[{i}]: LoadChange, HealthChange, FaultChange or SpeedChange expected, "
+                f"got {e!r}"
             )
         if e.t >= duration:
             raise ScenarioError(
