@@ -255,7 +255,7 @@ def test_the_last_instant_is_at_hand_wherever_results_are(storage, tmp_path, mon
     book = recorder.Recorder(gg, np.arange(K) * 0.02, 0, means, where)
     for k in range(K):
         y, factors = np.arange(n) + 100.0 * k, dict.fromkeys("abcd", 1.0)
-        of = Of((1, 2), np.full(9, 4.0 * k), None, np.zeros((11, 1)))
+        of = Of((1, 2), np.full(len(means[1, 2].kept), 4.0 * k), None, np.zeros((11, 1)))
         book.put(k, 1, recorder.Row(y, [of], factors, np.zeros(1)))
         assert book.last().tolist() == (np.arange(n) + 100.0 * k).tolist()
     rows = book.instants()

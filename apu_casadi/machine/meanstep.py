@@ -154,7 +154,7 @@ def _harmonics(
     asked = [Term.of(q) for q in quad]
     own = list(dict.fromkeys((q.base, q.power) for q in asked))
     y = ss.g(x, u, th)
-    values = ca.vertcat(*(Term(b, n, "", 0, False).value(ss, y) for b, n in own))
+    values = ca.vertcat(*(Term(b, n, "", 0, False).value(ss, x, y) for b, n in own))
     parts = _parts(ss, x, u, th, ca.Function("terms", [x, u, th], [values]))
     light = weights * window(share)
     total = []
