@@ -50,6 +50,7 @@ class Column:
         values: shape (K,), NaN where there is a gap.
         raw: the same as the file holds it: numbers, text, dates; for time columns.
         problem: why these are no numbers, for a column that nobody may need; else None.
+        utc: whether dates are in UTC.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Column:
     values: np.ndarray
     raw: Any = None
     problem: str | None = None
+    utc: bool = False
 
 
 def cut(cell: Any) -> str:

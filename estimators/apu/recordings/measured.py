@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
-from estimators.apu.recordings.binaryfiles import open_netcdf, time_dims
+from apu_casadi.core.results import load
+from estimators.apu.recordings.binaryfiles import time_dims
 from estimators.apu.recordings.layout import Reading, merged, parse_mapping, read_layout
 from estimators.apu.recordings.plausible import PLAUSIBLE, plain, si_of
 from estimators.apu.recordings.recorded import Table, read_data, read_table
@@ -195,7 +196,7 @@ def read_recording(
     tables = [t for s in sources for t in _tables(s, mapping, base, notes)]
     if not tables:
         raise DataError("no recording is given")
-    return _joined(tables, notes)
+    return _joined(tables, notes, len(sources) > 1)
 
 
 def _tables(
@@ -207,7 +208,7 @@ def _tables(
         path = Path(source)
         if path.suffix.lower() not in (".nc", ".cdf") or not path.is_file():
             return [read_table(path, mapping, **how)]
-        data, name = open_netcdf(path), path.name
+        data, name = load(path), path.name
     elif hasattr(source, "data_vars"):
         data, name = source, "Dataset"
     else:
@@ -223,7 +224,7 @@ def _tables(
     ]
 
 
-def _joined(tables: list[Table], notes: list[str]) -> Measurements:
+def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurements:
     """Take the quantities of all tables, on a common time."""
     starts: list[Start | None] = []
     times: list[np.ndarray] = []
@@ -248,7 +249,7 @@ def _joined(tables: list[Table], notes: list[str]) -> Measurements:
     if len({zoned for _, zoned in dated}) > 1:
         raise DataError("some files have dates with a zone and some without: give time_zone=...")
     zero = min((d for d, _ in dated), default=None)
-    if len(tables) > 1 and zero is None:
+    if several and zero is None:
         notes.append("all files are taken to count their seconds from the same instant")
     channels: dict[str, Channel] = {}
     unused: list[str] = []

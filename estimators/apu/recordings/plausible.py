@@ -75,6 +75,8 @@ _USUAL = {
     "rad/s": ("rpm",),
     "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"),
     "W": ("kW", "hp", "MW"),
+    "V": ("kV", "mV"),
+    "A": ("mA", "kA"),
     "m": ("ft", "km"),
 }
 #: What loggers write for "no reading", where a range would let it pass.
@@ -186,6 +188,7 @@ class Limits:
             else f"no possible {name} ({limits}; {count}"
         )
         others = _fits(si, raw[there], low, high)
+        others = others if unit is None or not _inside(raw[there], low, high) else [si, *others][:2]
         if others and out.sum() * 2 >= there.sum() and self._many(values[there], low, high):
             meant = " or ".join(others)
             raise DataError(
@@ -212,8 +215,8 @@ class Limits:
     @staticmethod
     def _many(values: np.ndarray, low: float, high: float) -> bool:
         """Whether the column as a whole is off, and not one reading of several."""
-        middle = float(np.median(values))
-        return not low <= middle <= high
+        off = (values < low) | (values > high)
+        return not low <= float(np.median(values)) <= high or bool(off.mean() > 0.9)
 
     def _bare(self, name: str, si: str, values: np.ndarray, where: str, mixed: bool) -> None:
         """Refuse a column without unit whose readings may be in another one as well."""
@@ -275,13 +278,16 @@ def clipped(values: np.ndarray) -> int:
     return count if count >= 4 and count > 0.002 * values.size else 0
 
 
+def _inside(values: np.ndarray, low: float, high: float) -> bool:
+    return bool(((values >= low) & (values <= high)).all())
+
+
 def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
     """Return the units in which all the readings would be plausible."""
     found = []
     for unit in _USUAL.get(si, ()):
         _, factor, offset = UNITS[unit]
-        v = raw * factor + offset
-        if ((v >= low) & (v <= high)).all():
+        if _inside(raw * factor + offset, low, high):
             found.append(unit)
     return found[:2]
 

@@ -328,9 +328,11 @@ class Table:
         else:
             c, unit = self._find(found)
             raw = c.values if c.raw is None else c.raw
+        utc = not plus and self._find(found)[0].utc
         form, zone = self.reading.time_format, self.reading.time_zone
         what = f"{self.source}, column {found}"
-        return to_seconds(raw, unit, what, self._tell, form=form, zone=zone, start=start)
+        how: dict[str, Any] = {"form": form, "zone": zone, "start": start, "utc": utc}
+        return to_seconds(raw, unit, what, self._tell, **how)
 
     def ordered(self) -> Table:
         """Return the table with its rows in the order of time; rows of one stamp are joined.
@@ -422,7 +424,7 @@ def read_table(
         if _KINDS[kind] == "text":
             columns, lines = text_columns(path, tell, reading, _known)
         elif _KINDS[kind] == "parquet":
-            columns = parquet_columns(path, tell)
+            columns = _named(path, parquet_columns(path, tell), reading)
         else:
             columns, others = netcdf_columns(path, tell, dim)
     except OSError as e:
@@ -454,7 +456,21 @@ def read_data(
 
     columns, others = memory_columns(source, data, tell, dim)
     reading = Reading() if reading is None else reading
+    columns = _named(source, columns, reading)
     return _table(source, source, columns, mapping, reading, notes, None, others)
+
+
+def _named(path: Any, columns: list[Column], reading: Reading) -> list[Column]:
+    """Return columns with the names and units that were given, if any."""
+    if not reading.names:
+        return columns
+    if len(columns) != len(reading.names):
+        raise DataError(
+            f"{path}: {len(columns)} columns, but {len(reading.names)} names are given: give one "
+            "for each column in order, '' for one to leave out"
+        )
+    each = zip(columns, reading.names, reading.units or [""] * len(columns), strict=True)
+    return [dataclasses.replace(c, name=n, unit=u or None) for c, n, u in each if n]
 
 
 def _table(
