@@ -7,6 +7,7 @@ import xarray as xr
 from numpy.testing import assert_allclose
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.results import dataset
 from estimators.apu.recordings.layout import Reading, read_layout
 from estimators.apu.recordings.measured import read_recording
 
@@ -122,6 +123,18 @@ def test_two_machines():
     assert data.electrical == ("i_a_1", "i_a_2") and data.gaspath == ("N",)
     assert_allclose(data.machine(2)["i_a"].values, I["i_b"])
     assert read_recording({"t": t, "i_a": I["i_a"]}).machine(1)["i_a"].t.size == K
+
+
+def test_generators_of_a_run():
+    """A dimension of generators becomes a quantity for each; what has others is told."""
+    waves = np.array([I["i_a"], I["i_b"]])
+    ds = dataset({"time": [0.0, 0.02], "time_w": t}, {"time": {"T5": [700.0, 701.0]},
+                 "time_w": {"i_a": waves}}, generators=2)  # fmt: skip
+    ds["spectrum"] = (("time", "order"), np.ones((2, 3)))
+    data = read_recording(ds)
+    assert tuple(sorted(data)) == ("T5", "i_a_1", "i_a_2")
+    assert_allclose(data.machine(2)["i_a"].values, I["i_b"])
+    assert any(n.startswith("spectrum (has the dimensions (time, order)") for n in data.unused)
 
 
 def test_names_of_the_recording_itself():

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import load
+from apu_casadi.core.results import GENERATOR, load
 from apu_casadi.core.units import header, unit_of
 from estimators.apu.recordings.columns import Column, Tell, cut, parsed
 
@@ -150,16 +150,35 @@ def netcdf_columns(
 
 def time_dims(data: Any) -> list[str]:
     """Dimensions along which a dataset has columns, the longest last."""
+    data = _each_generator(data)
     found = [d for d in data.sizes if any(v.dims == (d,) for v in data.data_vars.values())]
     return sorted(map(str, found), key=lambda d: int(data.sizes[d]))
+
+
+def _each_generator(data: Any) -> Any:
+    """A dataset without the dimension of generators, whose numbers end the names instead."""
+    if GENERATOR not in data.dims or data.sizes[GENERATOR] == 1:
+        return data
+    many = [n for n, v in data.data_vars.items() if GENERATOR in v.dims]
+    numbers = 1 + np.arange(data.sizes[GENERATOR])
+    numbers = data[GENERATOR].values if GENERATOR in data.coords else numbers
+    out = data.drop_vars([*many, *(n for n, v in data.coords.items() if GENERATOR in v.dims)])
+    for n in many:
+        for k, number in enumerate(numbers):
+            out[f"{n}_{number}"] = data[n].isel({GENERATOR: k}, drop=True)
+    return out
 
 
 def dataset_columns(
     path: Path | str, data: Any, tell: Tell, dim: str | None = None
 ) -> tuple[list[Column], dict[str, str]]:
-    """Return the columns of an xarray.Dataset along one dimension, and why other ones are none."""
+    """Return the columns of an xarray.Dataset along one dimension, and why other ones are none.
+
+    What each generator has of its own is a column for each, ``v_a_2``.
+    """
     import xarray as xr
 
+    data = _each_generator(data)
     sizes = {str(d): int(n) for d, n in data.sizes.items()}
     if not sizes:
         raise DataError(f"{path}: no data rows")

@@ -264,6 +264,11 @@ def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurement
             channels[name] = c
         taken = {c.source.partition(", column ")[2] for c in channels.values()}
         unused += [n for n in table.columns if n not in taken and not is_time_name(n)]
+    unused += [
+        f"{n} ({why})"
+        for n, why in {n: why for table in tables for n, why in table.others.items()}.items()
+        if not any(n in table.columns for table in tables)
+    ]
     if not channels:
         raise DataError(
             f"{tables[0].source}: none of the columns {', '.join(tables[0].columns)} is a quantity "

@@ -90,7 +90,7 @@ _RUN = 8  # equal readings in a row, while others change, that look stuck
 def plain(name: str) -> str:
     """Return a quantity of a generator without the machine's number: ``v_a`` of ``v_a_2``."""
     head, _, machine = name.rpartition("_")
-    return head if machine in ("1", "2") and head in ELECTRICAL else name
+    return head if machine in ["1", "2", "3", "4"] and head in ELECTRICAL else name
 
 
 def si_of(name: str) -> str | None:
