@@ -186,7 +186,8 @@ def test_what_looks_wrong_is_told():
     ({"t": t, **I}, {"rte": 1}, r"unknown option 'rte' \(did you mean 'rate'"),
     (np.ones((3, 2)), {"names": ("i_a",), "rate": 1.0}, "2 columns, but 1 names are given"),
     ("none.csv", {}, "none.csv: no such file"),
-    ({"t": [0, 1, 1], "i_a": [1.0, 2.0, 3.0]}, {}, "give --rate HZ if the stamps are too coarse"),
+    ({"t": 20 * np.arange(9), "i_a": t[:9]}, {}, "steps of 20 s are no sampling of a waveform"),
+    ({"t": [0, 1, 1], "i_a": [1.0, 2.0, 3.0]}, {}, "--rate HZ if the stamps are too"),
     ({"t": [0, 1, 1], "i_a": [1.0, 2.0, 3.0]}, {"sort": True}, "another row of the same stamp"),
 ])  # fmt: skip
 def test_what_is_no_recording(source, how, words):

@@ -7,7 +7,9 @@ import xarray as xr
 from numpy.testing import assert_allclose
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.recordings.recorded import Reading, parse_mapping, read_table
+from estimators.apu.recordings.thermal import check_temperatures
 from scenarios.cli import main
 
 K = 12
@@ -516,6 +518,31 @@ def test_temperatures_that_the_other_readings_refute(tmp_path, capsys):
         )
         assert main(["fit", str(path), "--column", f"{name}={name}:degC"]) == 0
         capsys.readouterr()
+
+
+@pytest.mark.parametrize(("name", "factor", "words"), [
+    ("P3", 0.1, r"column P3: wrong unit\? 7.892e.04 Pa .* no compressor's .*--altitude"),
+    ("Wf", 0.454, "columns Wf, PW and T5: 688.2 K .* too hot for an engine .*--range T5"),
+])  # fmt: skip
+def test_pressure_and_heat_that_cannot_be(tmp_path, name, factor, words):
+    """kPa that are called hPa, kg/h that are called lb/h; believed where the range is given."""
+    table, _ = read(tmp_path, text())
+    readings = {n: table.get(n, d[2]) for n, d in DATA.items()}
+    check_temperatures("x.csv", readings, {}, GasGenerator())
+    readings[name] = readings[name] * factor
+    with pytest.raises(DataError, match=words):
+        check_temperatures("x.csv", readings, {}, GasGenerator())
+    check_temperatures("x.csv", readings, {}, GasGenerator(), ("P3", "T5"))
+
+
+def test_units_of_time_in_names(tmp_path):
+    """TimeMs, and a column that is asked for by a name that is a unit."""
+    for name, time in (("TimeMs", None), ("msec", "msec"), ("Elapsed Hours", None)):
+        scale = 3600e-3 if "Hours" in name else 1.0
+        cells = [f"{20 * i / 1e3 / 3600:.12f}" if scale != 1 else str(20 * i) for i in k]
+        table, notes = read(tmp_path, text(cells, tname=name), time=time)
+        assert_allclose(np.diff(table.time()), 0.02, atol=1e-6)
+        assert any("as its name says" in n or "as Elapsed in h" in n for n in notes)
 
 
 def test_calibration_points_have_the_same_ranges(tmp_path, capsys):

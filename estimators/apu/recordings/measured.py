@@ -26,7 +26,7 @@ from apu_casadi.core.errors import DataError, nearest
 from apu_casadi.core.results import load
 from estimators.apu.recordings.binaryfiles import time_dims
 from estimators.apu.recordings.layout import Reading, merged, parse_mapping, read_layout
-from estimators.apu.recordings.plausible import PLAUSIBLE, plain, si_of
+from estimators.apu.recordings.plausible import PLAUSIBLE, WAVES, plain, si_of
 from estimators.apu.recordings.recorded import Table, read_data, read_table
 from estimators.apu.recordings.timestamps import Start, is_time_name
 from estimators.apu.sensors import ELECTRICAL
@@ -34,6 +34,7 @@ from estimators.apu.sensors import ELECTRICAL
 if TYPE_CHECKING:
     import xarray as xr
 
+SLOW = 0.01  # s, a step with which no waveform is sampled
 __all__ = ["Channel", "Measurements", "read_recording"]
 
 
@@ -261,6 +262,7 @@ def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurement
                     f"{name} is in {channels[name].source} and in {c.source}: give one of them, or "
                     "another name to one"
                 )
+            _check_rate(c, table)
             channels[name] = c
         taken = {c.source.partition(", column ")[2] for c in channels.values()}
         unused += [n for n in table.columns if n not in taken and not is_time_name(n)]
@@ -276,6 +278,19 @@ def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurement
         )
     notes += [f for table in tables for f in table.flags()]
     return Measurements(channels, tuple(notes), tuple(unused), zero)
+
+
+def _check_rate(c: Channel, table: Table) -> None:
+    """Refuse waveforms of a few samples a period, and tell of steps that may be in another unit."""
+    step = 1.0 / c.rate
+    if plain(c.name) in WAVES and step > SLOW:
+        raise DataError(
+            f"{c.source}: steps of {step:g} s are no sampling of a waveform: unit of the time "
+            "missing? give columns={'time': 'COLUMN:ms'}, or rate=HZ"
+        )
+    if step >= 10 and table.notes is not None:
+        note = f"{table.source}: steps of {step:g} s; if they are ms, give the time's unit"
+        table.notes.extend([note] * (note not in table.notes))
 
 
 def _first(starts: list[Start | None], dated: bool) -> int:

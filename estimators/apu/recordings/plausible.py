@@ -72,7 +72,7 @@ _SMALL = {"PW": 2e3}
 _USUAL = {
     "K": ("degC", "degF", "degR"),
     "Pa": ("kPa", "bar", "psi", "hPa", "MPa"),
-    "rad/s": ("rpm",),
+    "rad/s": ("rpm", "krpm", "rev/s", "%"),
     "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"),
     "W": ("kW", "hp", "MW"),
     "V": ("kV", "mV"),
@@ -194,7 +194,7 @@ class Limits:
             raise DataError(
                 f"{where(k)}: {'unit missing' if unit is None else 'wrong unit'}? {raw[k]:.9g} is "
                 f"plausible as {meant}, not as {unit or si} ({name} lies within {limits}): write "
-                f"the unit into the header, {name} [{others[0]}], or give --column "
+                f"the unit into the header, such as {name} [{others[0]}], or give --column "
                 f"{name}={name}:{others[0]}"
             )
         if not self.exclude:
@@ -287,9 +287,11 @@ def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
     found = []
     for unit in _USUAL.get(si, ()):
         _, factor, offset = UNITS[unit]
+        if unit == "%":  # of the design speed
+            factor = low / 40
         if _inside(raw * factor + offset, low, high):
             found.append(unit)
-    return found[:2]
+    return found[:4]
 
 
 def parse_limits(items: list[str]) -> dict[str, tuple[float, float]]:

@@ -13,6 +13,7 @@ refused, or left out on request.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,7 @@ from estimators.apu.recordings.timestamps import (
     looks_like_time,
     may_be_time,
     to_seconds,
+    unit_in_name,
 )
 from estimators.apu.sensors import KNOWN
 
@@ -268,6 +270,9 @@ class Table:
         """Return columns of truth values that are false in some rows, which nobody heeds."""
         out = []
         for n, c in self.columns.items():
+            marks = re.search(r"(?i)valid|quality|status|flag", n) and c.problem is None
+            if marks and np.unique(c.values[np.isfinite(c.values)]).size > 1:
+                out.append(f"{self.source}, column {n} is not heeded, although it changes")
             cells = [str(x).strip().lower() for x in (c.raw if c.problem else ())]
             if cells and set(cells) <= {"true", "false", "good", "bad", "ok", "valid", "invalid"}:
                 bad = sum(x in ("false", "bad", "invalid") for x in cells)
@@ -328,6 +333,10 @@ class Table:
         else:
             c, unit = self._find(found)
             raw = c.values if c.raw is None else c.raw
+            own = unit_in_name(c.name) if unit is None and c.problem is None else None
+            if own not in (None, "s"):
+                self._tell(f"{self.source}: column {c.name} is taken in {own}, as its name says")
+                unit = own
         utc = not plus and self._find(found)[0].utc
         form, zone = self.reading.time_format, self.reading.time_zone
         what = f"{self.source}, column {found}"

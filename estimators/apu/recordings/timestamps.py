@@ -25,6 +25,7 @@ __all__ = [
     "looks_like_time",
     "may_be_time",
     "to_seconds",
+    "unit_in_name",
 ]
 
 #: Names of time columns, in lower case and without blanks, underscores and hyphens.
@@ -89,6 +90,13 @@ Start = tuple[np.datetime64, bool]
 def is_time_name(name: str) -> bool:
     """Tell whether a column of this name is the time."""
     return re.sub(r"[ _/.\-]", "", name).lower() in _NAMES
+
+
+def unit_in_name(name: str) -> str | None:
+    """Return the unit of time that a name ends with or is: ``TimeMs``, ``msec``, ``Hours``."""
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name) or [""]
+    unit = unit_of(words[-1].lower()) if len(words[-1]) > 1 else None
+    return unit if unit is not None and UNITS[unit][0] == "s" else None
 
 
 def may_be_time(name: str) -> bool:
@@ -390,13 +398,12 @@ def _day_first(there: list[str]) -> str | None:
     """The format of dates whose first or second number is above 12 somewhere; None if it is not."""
     found = re.match(r"\d{1,2}([./-])\d{1,2}[./-](\d{4}|\d{2})(?!\d)", there[0])
     pairs = [re.match(r"(\d{1,2})[./-](\d{1,2})[./-]", c) for c in there]
-    if found is None or not all(pairs):
+    if found is None or not all(pairs) or len(found[2]) == 2:
         return None
     first, second = (max(int(p[k]) for p in pairs if p) for k in (1, 2))
     if (first > 12) == (second > 12):
         return None
-    year, sep = "%Y" if len(found[2]) == 4 else "%y", found[1]
-    date = sep.join(("%d", "%m") if first > 12 else ("%m", "%d")) + sep + year
+    date = found[1].join(("%d", "%m", "%Y") if first > 12 else ("%m", "%d", "%Y"))
     rest = there[0][found.end() :]
     if re.fullmatch(r"[ T]\d{1,2}:\d{2}:\d{2}(\.\d+)?( [aApP][mM])?", rest):
         half = rest[-1] in "mM"
@@ -469,7 +476,8 @@ def _iso(
     try:
         dates = pd.to_datetime(clean, format="ISO8601", utc=all(zoned) or None)
     except (ValueError, OverflowError) as e:
-        raise DataError(f"{what}: {str(e).splitlines()[0]}") from None
+        why = str(e).splitlines()[0].partition(". You")[0]
+        raise DataError(f"{what}: {why}: correct it, or give --time-format") from None
     return _told(dates, what, tell, zone, start)
 
 
