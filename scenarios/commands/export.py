@@ -1,0 +1,87 @@
+"""Export models for other tools: functions as C99, or an FMU.
+
+apu export c step ekf --out c_code --check
+apu export c generator.f --load 'kind = "RL", power_kW = 90' --fault 'mu = 0.05, k_rf = 20'
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from scenarios.commands import given
+from scenarios.shell import jsontext, progress, usage
+
+if TYPE_CHECKING:
+    from scenarios.export.cfunctions import Asked
+
+NAME = "export"
+HELP = "export functions as C99 (c)"
+_ASKED = f"""
+--load W part      | load of each generator, W; or by the keys of a scenario (default 225 kW)
+--fault TABLE part | fault of each generator, by the keys of a scenario: 'mu = 0.05, k_rf = 20'
+{given.ambient_options()}
+{given.WHOLE}
+"""
+_C = f"""
+names NAME +            | gas_generator.step (short: step), .f, .g, .residual, .rates; generator.f,
+                        | .g, .z, .residual; ekf, the gas-path filter's step
+{_ASKED.strip()}
+--out DIR =results/c    | folder (default %(default)s)
+--check                 | compile and run the examples: every digit as Python's
+--json                  | print JSON
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions."""
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    for name, call, table in (("c", _c, _C),):
+        p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
+        p.set_defaults(action=call)
+        usage.declare(p, table)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the action."""
+    status: int = args.action(args)
+    return status
+
+
+def _asked(args: argparse.Namespace) -> Asked:
+    from apu_casadi.machine.loads.series import SeriesLoad
+    from apu_casadi.unit.events import Ambient
+    from scenarios.export.cfunctions import Asked
+    from scenarios.reading import read_fault
+
+    unit = given.unit(args)
+    watts = 225e3 if args.load is None else args.load
+    load = SeriesLoad.from_power(watts) if isinstance(watts, float) else given.load(args)
+    fault = None if args.fault is None else read_fault(args.fault, "--fault")
+    return Asked(unit, load, fault, Ambient(**given.ambient_of(args)))
+
+
+def _c(args: argparse.Namespace) -> int:
+    """Write functions as C99 that needs math.h alone, with names, numbers and an example."""
+    from apu_casadi.core import files
+    from scenarios.export import ccode, cfunctions
+
+    folder, asked = files.folder(Path(args.out)), _asked(args)
+    report: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys(args.names):
+        progress.tell(f"exporting {name}", quiet=args.json)
+        made = cfunctions.exported(name, asked)
+        paths = ccode.write(made, folder)
+        checked = ccode.check(made, folder) if args.check else None
+        report[made.name] = {"files": [str(p) for p in paths], "steps_equal": checked}
+        if not args.json:
+            print(f"{made.name}: {made.doc}")
+            if checked:
+                print(f"  compiled without a warning; {checked} steps equal to the last digit")
+    if args.json:
+        jsontext.show(report)
+    else:
+        print(f"{given.ambient_line(given.ambient_given(args))}; {given.program(args)}")
+        given.written(p for r in report.values() for p in r["files"])
+    return 0
