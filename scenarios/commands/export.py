@@ -1,4 +1,4 @@
-"""Export models for other tools: functions as C99, or an FMU.
+"""Export models for other tools: functions as C99, or an FMU of a model.
 
 apu export c step ekf --out c_code --check
 apu export c generator.f --load 'kind = "RL", power_kW = 90' --fault 'mu = 0.05, k_rf = 20'
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from scenarios.export.cfunctions import Asked
 
 NAME = "export"
-HELP = "export functions as C99 (c)"
+HELP = "export functions as C99 (c) or a model as an FMU (fmu)"
 _ASKED = f"""
 --load W part      | load of each generator, W; or by the keys of a scenario (default 225 kW)
 --fault TABLE part | fault of each generator, by the keys of a scenario: 'mu = 0.05, k_rf = 20'
@@ -32,12 +32,21 @@ names NAME +            | gas_generator.step (short: step), .f, .g, .residual, .
 --check                 | compile and run the examples: every digit as Python's
 --json                  | print JSON
 """
+_FMU = f"""
+model {{gas_generator,generator,apu}} | one engine, one generator, or the whole unit with its
+                        | governor and the exchange of 20 ms inside
+{_ASKED.strip()}
+--fmi int =3            | version of the standard, 3 or 2 (default %(default)s)
+--out FILE              | default results/MODEL.fmu
+--no-library            | sources alone, nothing is compiled
+--json                  | print JSON
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions."""
     actions = parser.add_subparsers(metavar="ACTION", required=True)
-    for name, call, table in (("c", _c, _C),):
+    for name, call, table in (("c", _c, _C), ("fmu", _fmu, _FMU)):
         p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
         p.set_defaults(action=call)
         usage.declare(p, table)
@@ -84,4 +93,26 @@ def _c(args: argparse.Namespace) -> int:
     else:
         print(f"{given.ambient_line(given.ambient_given(args))}; {given.program(args)}")
         given.written(p for r in report.values() for p in r["files"])
+    return 0
+
+
+def _fmu(args: argparse.Namespace) -> int:
+    """Write an FMU for model exchange and co-simulation, with its sources."""
+    from scenarios.export import fmu, fmumodel
+
+    path = Path(args.out or f"results/{args.model}.fmu")
+    progress.tell(f"exporting {args.model}", quiet=args.json)
+    asked = _asked(args)
+    model = fmumodel.fmu_model(args.model, asked)
+    fmu.build(model, path, fmi=args.fmi, library=not args.no_library)
+    roles = ("input", "parameter", "state", "output")
+    names = {r: [v.signal.name for v in model.of(r)] for r in roles}
+    if args.json:
+        jsontext.show({"file": str(path), "fmi": args.fmi, "model": model.name, **names})
+        return 0
+    print(f"{model.doc} FMI {args.fmi}.0, model exchange and co-simulation")
+    for role, found in names.items():
+        print(f"  {len(found):3d} {role}s: {', '.join(found)}")
+    print(f"{given.ambient_line(given.ambient_given(args))}; {given.program(args)}")
+    given.written([path])
     return 0

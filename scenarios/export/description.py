@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Iterator
+from itertools import pairwise
 from xml.etree import ElementTree as Xml
 
 from apu_casadi.core.errors import DataError
@@ -14,20 +14,35 @@ from scenarios.export.fmumodel import STEP, FmuModel, Variable
 
 BASE = ("kg", "m", "s", "A", "K", "rad")
 _DERIVED = """
-N kg1 m1 s-2 | J kg1 m2 s-2 | W kg1 m2 s-3 | Pa kg1 m-1 s-2 | V kg1 m2 s-3 A-1
-ohm kg1 m2 s-3 A-2 | H kg1 m2 s-2 A-2 | F kg-1 m-2 s4 A2 | Wb kg1 m2 s-2 A-1 | Hz s-1 | 1
+N    kg m s^-2
+J    kg m^2 s^-2
+W    kg m^2 s^-3
+Pa   kg m^-1 s^-2
+V    kg m^2 s^-3 A^-1
+ohm  kg m^2 s^-3 A^-2
+H    kg m^2 s^-2 A^-2
+F    kg^-1 m^-2 s^4 A^2
+Wb   kg m^2 s^-2 A^-1
+Hz   s^-1
+1
 """
-_ROLES = {"input": ("input", "continuous"), "parameter": ("parameter", "tunable")}
-_ROLES |= {"state": ("local", "continuous"), "output": ("output", "continuous")}
+# causality, variability, initial
+_ROLES = {
+    "input": ("input", "continuous", ""),
+    "parameter": ("parameter", "tunable", "exact"),
+    "state": ("local", "continuous", "exact"),
+    "rate": ("local", "continuous", ""),
+    "output": ("output", "continuous", ""),
+}
 
 
-def _powers(text: str) -> dict[str, int]:
-    found = (re.fullmatch(r"([A-Za-z]+)(-?\d+)", p) for p in text.split())
-    return {p[1]: int(p[2]) for p in found if p}
+def _powers(words: list[str]) -> dict[str, int]:
+    pairs = (w.partition("^") for w in words)
+    return {name: int(power or 1) for name, _, power in pairs}
 
 
 KNOWN = {n: {n: 1} for n in BASE}
-KNOWN |= {w.split()[0]: _powers(w.partition(" ")[2]) for w in re.split(r"[|\n]", _DERIVED) if w.split()}
+KNOWN |= {w[0]: _powers(w[1:]) for w in map(str.split, _DERIVED.strip().splitlines())}
 
 
 def base_powers(unit: str) -> dict[str, int]:
@@ -48,49 +63,56 @@ def base_powers(unit: str) -> dict[str, int]:
     return {b: n for b, n in total.items() if n}
 
 
-def rates(model: FmuModel) -> list[tuple[str, str, str]]:
-    """Return name, unit and meaning of the rates of the states."""
-    states = (v.signal for v in model.of("state"))
-    return [(f"{s.name}_dot", f"{s.unit}/s", f"rate of {s.name}") for s in states]
-
-
-def described(model: FmuModel, fmi: int, identifier: str) -> tuple[str, str]:
+def described(model: FmuModel, fmi: int) -> tuple[str, str]:
     """Return the description's text, and its token, a hash of all that it says."""
-    without = _text(model, fmi, identifier, "")
-    digest = hashlib.sha256(without.encode()).hexdigest()
-    token = "{" + "-".join(digest[i:j] for i, j in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32))) + "}"
-    return _text(model, fmi, identifier, token), token
+    digest = hashlib.sha256(_text(model, fmi, "").encode()).hexdigest()
+    cuts = (0, 8, 12, 16, 20, 32)
+    token = "{" + "-".join(digest[i:j] for i, j in pairwise(cuts)) + "}"
+    return _text(model, fmi, token), token
 
 
-def _text(model: FmuModel, fmi: int, identifier: str, token: str) -> str:
-    key = "instantiationToken" if fmi == 3 else "guid"
-    root = Xml.Element("fmiModelDescription", {
-        "fmiVersion": "3.0" if fmi == 3 else "2.0", "modelName": model.name, key: token,
-        "description": model.doc, "version": installed(), "license": "Apache-2.0",
-        "generationTool": f"apu-casadi {installed()}", "variableNamingConvention": "flat",
-    })  # fmt: skip
-    if fmi == 2:
-        root.set("numberOfEventIndicators", "0")
-    state = "FMUState" if fmi == 3 else "FMUstate"
+def _text(model: FmuModel, fmi: int, token: str) -> str:
+    head = {"fmiVersion": f"{fmi}.0", "modelName": model.name, "description": model.doc}
+    head |= {"instantiationToken" if fmi == 3 else "guid": token, "license": "Apache-2.0"}
+    head |= {"version": installed(), "generationTool": f"apu-casadi {installed()}"}
+    head |= {"variableNamingConvention": "flat"}
+    root = Xml.Element("fmiModelDescription", head)
     for kind in ("ModelExchange", "CoSimulation"):
-        part = Xml.SubElement(root, kind, {"modelIdentifier": identifier})
-        part.set(f"canGetAndSet{state}", "true")
-        part.set(f"canSerialize{state}", "true")
+        state, able = "FMUState" if fmi == 3 else "FMUstate", {"modelIdentifier": model.name}
+        able |= {f"canGetAndSet{state}": "true", f"canSerialize{state}": "true"}
         if kind == "CoSimulation":
-            part.set("canHandleVariableCommunicationStepSize", "true")
+            able["canHandleVariableCommunicationStepSize"] = "true"
+        part = Xml.SubElement(root, kind, able)
         if fmi == 2:
             files = Xml.SubElement(part, "SourceFiles")
             for name in source_names(model, fmi):
                 Xml.SubElement(files, "File", {"name": name})
-    _units(Xml.SubElement(root, "UnitDefinitions"), model)
+    units = Xml.SubElement(root, "UnitDefinitions")
+    for name in dict.fromkeys(["s", *(v.signal.unit for v in model.variables)]):
+        powers = {b: str(n) for b, n in base_powers(name).items()}
+        Xml.SubElement(Xml.SubElement(units, "Unit", {"name": name}), "BaseUnit", powers)
     log = Xml.SubElement(root, "LogCategories")
     for name in ("logStatusError", "logStatusDiscard"):
         Xml.SubElement(log, "Category", {"name": name})
-    Xml.SubElement(root, "DefaultExperiment", {"startTime": "0", "stopTime": "10", "stepSize": repr(STEP)})
+    usual = {"startTime": "0", "stopTime": "10", "stepSize": repr(STEP)}
+    Xml.SubElement(root, "DefaultExperiment", usual)
     variables = Xml.SubElement(root, "ModelVariables")
-    for element in (_variables3(model) if fmi == 3 else _variables2(model)):
-        variables.append(element)
+    if fmi == 3:
+        time = {"name": "time", "valueReference": "0", "description": "time", "unit": "s"}
+        time |= {"causality": "independent", "variability": "continuous"}
+        Xml.SubElement(variables, "Float64", time)
+    for reference, v in enumerate(model.variables, 1):
+        attributes, numbers = _variable(v, reference, len(model.of("state")))
+        if fmi == 3:
+            Xml.SubElement(variables, "Float64", attributes | numbers)
+        else:  # a place in the list, counted from 1, is the reference itself
+            Xml.SubElement(Xml.SubElement(variables, "ScalarVariable", attributes), "Real", numbers)
     _structure(Xml.SubElement(root, "ModelStructure"), model, fmi)
+    return text_of(root)
+
+
+def text_of(root: Xml.Element) -> str:
+    """Return a document."""
     Xml.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, "unicode") + "\n"
 
@@ -101,86 +123,29 @@ def source_names(model: FmuModel, fmi: int) -> list[str]:
     return [n for n in own if n.endswith(".c")]
 
 
-def _units(parent: Xml.Element, model: FmuModel) -> None:
-    names = dict.fromkeys(["s", *(v.signal.unit for v in model.variables)])
-    names |= dict.fromkeys(unit for _, unit, _ in rates(model))
-    for name in names:
-        unit = Xml.SubElement(parent, "Unit", {"name": name})
-        Xml.SubElement(unit, "BaseUnit", {b: str(n) for b, n in base_powers(name).items()})
-
-
-def _numbers(v: Variable) -> dict[str, str]:
-    """Attributes of a value: unit, range, magnitude, start."""
-    told = {"unit": v.signal.unit}
-    told |= {k: repr(x) for k, x in (("min", v.least), ("max", v.most)) if math.isfinite(x)}
-    if v.role == "state":
-        told["nominal"] = repr(float(v.signal.nominal))
-    if v.role != "output":
-        told["start"] = repr(v.start)
-    return told
-
-
-def _attributes(v: Variable, reference: int) -> dict[str, str]:
-    causality, variability = _ROLES[v.role]
+def _variable(v: Variable, reference: int, states: int) -> tuple[dict[str, str], dict[str, str]]:
+    """Return what a variable is, and the attributes of its value; a rate follows its state."""
+    causality, variability, initial = _ROLES[v.role]
     told = {"name": v.signal.name, "valueReference": str(reference), "description": v.signal.doc}
     told |= {"causality": causality, "variability": variability}
-    if v.role in ("parameter", "state"):
-        told["initial"] = "exact"
-    return told
-
-
-def placed(model: FmuModel) -> Iterator[tuple[int, Variable | tuple[str, str, str], int]]:
-    """Yield value reference, variable or rate, and for a rate the reference of its state."""
-    reference, first = 1, 1 + sum(v.role in ("input", "parameter") for v in model.variables)
-    for v in model.variables:
-        if v.role == "output":
-            break
-        yield reference, v, 0
-        reference += 1
-    for k, rate in enumerate(rates(model)):
-        yield reference, rate, first + k
-        reference += 1
-    for v in model.of("output"):
-        yield reference, v, 0
-        reference += 1
-
-
-def _variables3(model: FmuModel) -> Iterator[Xml.Element]:
-    yield Xml.Element("Float64", {"name": "time", "valueReference": "0", "description": "time",
-                                  "causality": "independent", "variability": "continuous",
-                                  "unit": "s"})  # fmt: skip
-    for reference, v, state in placed(model):
-        if isinstance(v, Variable):
-            yield Xml.Element("Float64", _attributes(v, reference) | _numbers(v))
-        else:
-            told = {"name": v[0], "valueReference": str(reference), "description": v[2]}
-            told |= {"causality": "local", "variability": "continuous", "unit": v[1]}
-            yield Xml.Element("Float64", told | {"derivative": str(state)})
-
-
-def _variables2(model: FmuModel) -> Iterator[Xml.Element]:
-    # positions are those of the list, from 1: the references themselves
-    for reference, v, state in placed(model):
-        if isinstance(v, Variable):
-            element = Xml.Element("ScalarVariable", _attributes(v, reference))
-            Xml.SubElement(element, "Real", _numbers(v))
-        else:
-            told = {"name": v[0], "valueReference": str(reference), "description": v[2]}
-            element = Xml.Element("ScalarVariable", told | {"causality": "local", "variability": "continuous"})
-            Xml.SubElement(element, "Real", {"unit": v[1], "derivative": str(state)})
-        yield element
+    told |= {"initial": initial} if initial else {}
+    value = {"unit": v.signal.unit}
+    value |= {k: repr(float(x)) for k, x in (("min", v.least), ("max", v.most)) if abs(x) < 1e300}
+    value |= {"nominal": repr(float(v.signal.nominal))} if v.role == "state" else {}
+    value |= {"start": repr(v.start)} if math.isfinite(v.start) else {}
+    value |= {"derivative": str(reference - states)} if v.role == "rate" else {}
+    return told, value
 
 
 def _structure(parent: Xml.Element, model: FmuModel, fmi: int) -> None:
-    outputs = [r for r, v, _ in placed(model) if isinstance(v, Variable) and v.role == "output"]
-    moving = [r for r, v, _ in placed(model) if not isinstance(v, Variable)]
-    for tag, references in (("Output", outputs), ("ContinuousStateDerivative", moving),
-                            ("InitialUnknown", sorted([*outputs, *moving]))):  # fmt: skip
-        if fmi == 3:
-            for r in references:
-                Xml.SubElement(parent, tag, {"valueReference": str(r)})
-        else:
-            name = {"Output": "Outputs", "InitialUnknown": "InitialUnknowns"}.get(tag, "Derivatives")
-            group = Xml.SubElement(parent, name)
-            for r in references:
-                Xml.SubElement(group, "Unknown", {"index": str(r)})
+    roles = {r: v.role for r, v in enumerate(model.variables, 1) if v.role in ("rate", "output")}
+    outputs, rates = ([r for r, role in roles.items() if role == k] for k in ("output", "rate"))
+    for new, old, references in (
+        ("Output", "Outputs", outputs),
+        ("ContinuousStateDerivative", "Derivatives", rates),
+        ("InitialUnknown", "InitialUnknowns", list(roles)),
+    ):
+        group = parent if fmi == 3 else Xml.SubElement(parent, old)
+        for r in references:
+            told = {"valueReference": str(r)} if fmi == 3 else {"index": str(r)}
+            Xml.SubElement(group, new if fmi == 3 else "Unknown", told)

@@ -18,15 +18,15 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.backend import find_compiler
 from apu_casadi.core.errors import BackendError, ParameterError
-from scenarios.export.ccode import array, generated, number, work
-from scenarios.export.description import described, source_names
+from scenarios.export.ccode import generated, number, work
+from scenarios.export.description import described, source_names, text_of
 from scenarios.export.fmumodel import CONSTANTS, FmuModel
 
 VERSIONS = (3, 2)
 _COMMON = ("unit.c", "unit.h")
-_FLAGS = ["-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno"]
+_FLAGS = ["-std=c99", "-O1", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno"]
 _TIMEOUT = 900.0  # s
-_ABSENT = "N_Z N_MEANS M_TH M_U M_X".split()  # sizes of arrays that C wants not to be empty
+_ABSENT = ["N_Z", "N_MEANS", "M_TH", "M_U", "M_X"]  # sizes of arrays that C wants not to be empty
 
 
 def platform_folder(fmi: int) -> tuple[str, str]:
@@ -54,51 +54,43 @@ def sources(model: FmuModel, fmi: int, token: str) -> dict[str, str]:
 def _model_h(model: FmuModel, token: str) -> tuple[str, str]:
     """Sizes, constants and prototypes, and the arrays that they tell of."""
     roles = {"U": "input", "P": "parameter", "X": "state", "Y": "output"}
-    sizes = dict.fromkeys(_ABSENT, 1) | model.sizes
-    sizes |= {f"N_{k}": len(model.of(role)) for k, role in roles.items()}
+    of = {k: model.of(role) for k, role in roles.items()}
+    sizes = dict.fromkeys(_ABSENT, 1) | model.sizes | {f"N_{k}": len(v) for k, v in of.items()}
     for i, n in enumerate(("W_ARG", "W_RES", "W_IW", "W_W")):
         sizes[n] = max(work(f)[i] for f in model.functions)
-    numbers: dict[str, Any] = {}
-    for k in "UPX":
-        numbers[f"{k}_START"] = [v.start for v in model.of(roles[k])]
-    for k in "UP":
-        numbers[f"{k}_LEAST"] = [v.least for v in model.of(roles[k])]
-        numbers[f"{k}_MOST"] = [v.most for v in model.of(roles[k])]
-    numbers["X_NOMINAL"] = [float(v.signal.nominal) for v in model.of("state")]
-    numbers |= model.arrays
+    numbers: dict[str, Any] = {f"{k}_START": [v.start for v in of[k]] for k in "UPX"}
+    numbers |= {f"{k}_LEAST": [v.least for v in of[k]] for k in "UP"}
+    numbers |= {f"{k}_MOST": [v.most for v in of[k]] for k in "UP"}
+    numbers["X_NOMINAL"] = [v.signal.nominal for v in of["X"]]
+    made = [_array(n, np.asarray(v)) for n, v in (numbers | model.arrays).items()]
+    constants = {n: number(v) for n, v in CONSTANTS.items()}
+    constants |= {"NAME": f'"{model.name}"', "TOKEN": f'"{token}"'}
+    takes = "(const double **arg, double **res, long long int *iw, double *w, int mem);"
     lines = ["/* Sizes and numbers of this model. */", "#ifndef MODEL_H", "#define MODEL_H", ""]
     lines += ["enum {", ",\n".join(f"  {n} = {v}" for n, v in sizes.items()), "};", ""]
-    lines += [f"#define {n} {number(v)}" for n, v in CONSTANTS.items()]
-    lines += [f'#define NAME "{model.name}"', f'#define TOKEN "{token}"', ""]
-    definitions = []
-    for name, values in numbers.items():
-        declared, defined = _array(name, values)
-        lines.append(declared)
-        definitions.append(defined)
-    work_space = "(const double **arg, double **res, long long int *iw, double *w, int mem);"
-    lines += ["", *(f"int {f.name()}{work_space}" for f in model.functions), "", "#endif", ""]
-    return "\n".join(lines), "\n".join(definitions)
+    lines += [f"#define {n} {v}" for n, v in constants.items()]
+    lines += [f"extern {head};" for head, _ in made]
+    lines += [f"int {f.name()}{takes}" for f in model.functions]
+    return "\n".join([*lines, "#endif", ""]), "\n".join(f"{h} =\n{v};" for h, v in made) + "\n"
 
 
-def _array(name: str, values: Any) -> tuple[str, str]:
-    a = np.asarray(values)
-    whole = a.dtype.kind == "i" or name in ("RESET", "M_AT", "MEAN_OF", "Y_OF")
-    kind = "int" if whole else "double"
-    entries = [str(int(v)) if whole else _finite(float(v)) for v in a.ravel()]
-    if a.ndim == 2:
-        rows = ", ".join("{" + ", ".join(entries[i : i + a.shape[1]]) + "}"
-                         for i in range(0, a.size, a.shape[1]))  # fmt: skip
-        head = f"const {kind} {name}[{a.shape[0]}][{a.shape[1]}]"
-        return f"extern {head};", f"{head} = {{{rows}}};\n"
-    size = max(1, a.size)
-    return f"extern const {kind} {name}[{size}];", array(f"const {kind} ", name, entries)
+def _array(name: str, a: np.ndarray) -> tuple[str, str]:
+    """Head and values of a constant array, which C wants not to be empty."""
+    whole = a.dtype.kind == "i"
+    kind, shape = "int" if whole else "double", "".join(f"[{n or 1}]" for n in a.shape)
+
+    def braced(part: Any) -> str:
+        if part.ndim > 1:
+            return "{" + ",\n".join(braced(row) for row in part) + "}"
+        values = [str(v) if whole else number(max(-1e300, min(1e300, v))) for v in part.tolist()]
+        return (
+            "{" + ",\n".join(", ".join(values[i : i + 4]) for i in range(0, len(values), 4)) + "}"
+        )
+
+    return f"const {kind} {name}{shape}", braced(a if a.size else np.zeros(1, a.dtype))
 
 
-def _finite(value: float) -> str:
-    return number(max(-1e300, min(1e300, value)))
-
-
-def build(model: FmuModel, path: Path, *, fmi: int = 3, compile_it: bool = True) -> Path:
+def build(model: FmuModel, path: Path, *, fmi: int = 3, library: bool = True) -> Path:
     """Write an FMU with sources and, by default, a library for this platform; return its path.
 
     Raises:
@@ -108,13 +100,13 @@ def build(model: FmuModel, path: Path, *, fmi: int = 3, compile_it: bool = True)
     """
     if fmi not in VERSIONS:
         raise ParameterError(f"FMI version {fmi!r}: one of {', '.join(map(str, VERSIONS))}")
-    text, token = described(model, fmi, model.name)
+    text, token = described(model, fmi)
     texts = sources(model, fmi, token)
     contents: dict[str, bytes] = {"modelDescription.xml": text.encode()}
     contents |= {f"sources/{n}": t.encode() for n, t in texts.items()}
     if fmi == 3:
         contents["sources/buildDescription.xml"] = _build_description(model).encode()
-    if compile_it:
+    if library:
         folder, end = platform_folder(fmi)
         contents[f"binaries/{folder}/{model.name}{end}"] = _library(
             model.name, texts, source_names(model, fmi)
@@ -151,7 +143,4 @@ def _build_description(model: FmuModel) -> str:
     group = Xml.SubElement(one, "SourceFileSet", {"language": "C99"})
     for name in source_names(model, 3):
         Xml.SubElement(group, "SourceFile", {"name": name})
-    Xml.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, "unicode") + "\n"
-
-
+    return text_of(root)

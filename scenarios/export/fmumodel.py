@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
-from apu_casadi.core.signals import Signal, Signals
+from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.gaspath.health import RUN_RANGE
@@ -35,18 +35,17 @@ TOLERANCE = 1e-7  # of a step, relative, of an estimate four orders below the me
 NEWTON_TOL = 1e-3  # of the iterations, relative to it
 FIRST = 2e-6  # s; first step after a switch
 DEFAULT_FAULT = Ttsc(0.05, 20.0)
-_RANGE = (-math.inf, math.inf)
+_ANY, _POSITIVE = (-math.inf, math.inf), (1e-9, 1e9)
 _AXIS = "phase_angle"
 
 
-@dataclass(frozen=True)
-class Variable:
+class Variable(NamedTuple):
     """A variable of an FMU.
 
     Args:
         signal: name, unit, meaning, magnitude.
-        role: ``"input"``, ``"parameter"``, ``"state"`` or ``"output"``.
-        start: value to start with; NaN of an output.
+        role: one of :data:`ROLES`.
+        start: value to start with; NaN of a rate or an output.
         least, most: range.
     """
 
@@ -63,26 +62,36 @@ class FmuModel:
 
     Args:
         name, doc: of the model.
-        variables: in the order inputs, parameters, states, outputs.
+        given: inputs, parameters, states, outputs.
         functions: that the C code calls.
         sources: its files beside those that all have.
         sizes: constants by name, whole numbers.
-        arrays: constants by name, numbers; two-dimensional ones row by row.
+        arrays: constants by name, numbers.
     """
 
     name: str
     doc: str
-    variables: tuple[Variable, ...]
+    given: tuple[Variable, ...]
     functions: tuple[ca.Function, ...]
     sources: tuple[str, ...]
     sizes: dict[str, int]
     arrays: dict[str, Any]
 
     def of(self, role: str) -> list[Variable]:
-        """Return the variables of a role."""
-        return [v for v in self.variables if v.role == role]
+        """Return the variables of a role; a rate stands for each state."""
+        if role != "rate":
+            return [v for v in self.given if v.role == role]
+        states = (v.signal for v in self.of("state"))
+        told = (Signal(f"{s.name}_dot", f"{s.unit}/s", f"rate of {s.name}") for s in states)
+        return [Variable(s, "rate") for s in told]
+
+    @property
+    def variables(self) -> list[Variable]:
+        """All but the time, in the order of their value references, which begin with 1."""
+        return [v for role in ROLES for v in self.of(role)]
 
 
+ROLES = ("input", "parameter", "state", "rate", "output")
 MODELS: dict[str, Callable[[Asked], FmuModel]] = {}
 
 
@@ -102,21 +111,44 @@ def _model(make: Callable[[Asked], FmuModel]) -> Callable[[Asked], FmuModel]:
     return make
 
 
-def _variables(role: str, signals: Iterable[Signal], start: Iterable[float] = (), *,
-               ranges: dict[str, tuple[float, float]] | None = None) -> list[Variable]:  # fmt: skip
+Ranges = Mapping[str, tuple[float, float]]
+
+
+def _variables(
+    role: str, signals: Iterable[Signal], start: Iterable[float] = (), ranges: Ranges | None = None
+) -> list[Variable]:
     values, known = list(start), ranges or {}
     made = []
     for i, s in enumerate(signals):
-        lo, hi = known.get(s.name, (1e-9, 1e9) if s.unit == "ohm" else _RANGE)
+        lo, hi = known.get(s.name, _POSITIVE if s.unit == "ohm" else _ANY)
         made.append(Variable(s, role, float(values[i]) if values else math.nan, lo, hi))
     return made
 
 
-def _outputs(signals: Sequence[Signal], others: Iterable[Variable]) -> tuple[list[Variable], list[int]]:
-    """Outputs that no input or state tells already, and their places."""
-    taken = {v.signal.name for v in others}
+def _finished(
+    name: str,
+    doc: str,
+    given: Sequence[Variable],
+    outputs: Iterable[Signal],
+    functions: Iterable[ca.Function],
+    sources: str,
+    parts: Iterable[tuple[Mapping[str, int], Mapping[str, Any]]],
+) -> FmuModel:
+    """Put a model together; what an input or a state tells already is no output."""
+    taken, signals = {v.signal.name for v in given}, list(outputs)
     kept = [i for i, s in enumerate(signals) if s.name not in taken]
-    return _variables("output", [signals[i] for i in kept]), kept
+    shown = _variables("output", (signals[i] for i in kept))
+    sizes: dict[str, int] = {}
+    arrays: dict[str, Any] = {"Y_OF": _places(kept)}
+    for more, numbers in parts:
+        sizes |= more
+        arrays |= numbers
+    whole = (*given, *shown)
+    return FmuModel(name, doc, whole, tuple(functions), tuple(sources.split()), sizes, arrays)
+
+
+def _places(indices: Sequence[int]) -> np.ndarray:
+    return np.array(indices, dtype=int)
 
 
 # ------------------------------------------------------------------------------ gas generator
@@ -151,23 +183,21 @@ def _gas_numbers(gg: GasGenerator) -> tuple[dict[str, int], dict[str, Any]]:
 def _health(gg: GasGenerator, theta: np.ndarray) -> list[Variable]:
     lo, hi = RUN_RANGE
     ranges = dict.fromkeys(gg.THETA.names, (lo + 1e-9, hi))
-    return _variables("parameter", gg.THETA, theta, ranges=ranges)
+    return _variables("parameter", gg.THETA, theta, ranges)
 
 
 @_model
 def gas_generator(asked: Asked) -> FmuModel:
     """The gas generator: one state, fuel and shaft power as inputs."""
     gg, gas = asked.unit.gas_generator, asked.gas
-    first = [
-        *_variables("input", gg.U, gas.u, ranges=gg.input_ranges),
+    given = [
+        *_variables("input", gg.U, gas.u, gg.input_ranges),
         *_health(gg, gas.theta),
         *_variables("state", gg.X, gas.x),
     ]
-    outputs, kept = _outputs(list(gg.Y), first)
-    sizes, arrays = _gas_numbers(gg)
     doc = "Gas generator of an all-electric auxiliary power unit."
-    return FmuModel("gas_generator", doc, (*first, *outputs), tuple(_gas_functions(gg)),
-                    ("gas_generator.c", "gas.c", "gas.h"), sizes, {**arrays, "Y_OF": kept})  # fmt: skip
+    made = _gas_functions(gg), "gas_generator.c gas.c gas.h", [_gas_numbers(gg)]
+    return _finished("gas_generator", doc, given, gg.Y, *made)
 
 
 # ------------------------------------------------------------------------------ generator
@@ -175,21 +205,43 @@ def gas_generator(asked: Asked) -> FmuModel:
 
 @dataclass(frozen=True, eq=False)
 class _Machine:
-    """A generator's two sets of equations with one fault, and what its variables are.
+    """A generator with one fault: its variables, and the numbers that the C code takes.
 
     Args:
+        healthy, faulty: its two sets of equations.
         states, inputs, faults: variables; inputs without the speed.
-        outputs: signals of the generator.
-        functions, sizes, arrays: as of a model.
     """
 
+    healthy: GeneratorModel
+    faulty: GeneratorModel
     states: list[Variable]
     inputs: list[Variable]
     faults: list[Variable]
-    outputs: list[Signal]
-    functions: list[ca.Function]
-    sizes: dict[str, int]
-    arrays: dict[str, Any]
+
+    @property
+    def functions(self) -> list[ca.Function]:
+        """Those of both sets of equations."""
+        return [*_parts("healthy", self.healthy), *_parts("faulty", self.faulty)]
+
+    @property
+    def numbers(self) -> tuple[dict[str, int], dict[str, Any]]:
+        """Sizes, and arrays by name."""
+        ss, own, method = self.faulty, self.healthy.x.names, radau(STAGES)
+        stage = [i for i, n in enumerate(ss.x.names) if n not in own]
+        n, names = len(ss.numbers), ss.theta.names
+        theta = max(len(s.shared.theta) for s in (self.healthy, ss))
+        sizes = {"M_X": len(ss.x), "M_XH": len(own), "M_U": len(ss.u), "M_Y": len(ss.y)}
+        sizes |= {"M_TH": theta, "M_FAULT": len(names), "N_MACHINE": n, "M_GIVEN": len(names) + n}
+        sizes |= {"M_AXIS": names.index(_AXIS) if _AXIS in names else -1, "N_RESET": len(stage)}
+        sizes |= {"M_INPUTS": len(self.inputs), "M_ANGLE": ss.x.index("theta_e")}
+        sizes |= {"N_MEANS": len(MEANS), "R_STAGES": STAGES, "R_PAIRS": STAGES // 2}
+        arrays: dict[str, Any] = {"M_NUMBERS": ss.numbers, "M_NOMINAL": ss.x.nominals}
+        arrays |= {"M_AT": _places(ss.x.indices(own)), "RESET": _places(stage)}
+        arrays |= {"MEAN_OF": _places(ss.y.indices(MEANS))}
+        arrays |= {"R_INVERSE": method.inverse, "R_WEIGHTS": method.weights}
+        arrays |= {"R_ERROR": method.error, "R_RE": method.values.real, "R_IM": method.values.imag}
+        arrays |= {"R_FROM_RE": method.of.real, "R_FROM_IM": method.of.imag}
+        return sizes, arrays | {"R_TO_RE": method.to.real, "R_TO_IM": method.to.imag}
 
 
 def _machine(asked: Asked) -> _Machine:
@@ -197,48 +249,33 @@ def _machine(asked: Asked) -> _Machine:
     fault = asked.fault or DEFAULT_FAULT
     healthy, faulty = gen.variant(load), gen.variant(load, fault)
     theta = dict(zip(faulty.theta.names, gen.fault_vector(load, fault).tolist(), strict=True))
-    severity = fault.severities[0].name if fault.severities else ""
-    if severity != faulty.theta.names[0]:
-        raise ParameterError(
-            f"a {type(fault).__name__} cannot be exported: its first parameter, "
-            f"{faulty.theta.names[0]}, must be the first of its severities, zero where healthy"
-        )
+    severity = _severity(fault, faulty)
     if asked.fault is None:
         theta[severity] = 0.0
-    w_r = float(at.u[at.ss.u.index("w_r")])
-    u = gen.inputs(load, w_r=w_r, V_ref=at.V_ref)
-    x = gen.transfer(at.x, at.ss, faulty, u=at.u, theta=(), u_target=u,
-                     theta_target=tuple(theta.values()))  # fmt: skip
-    n = len(faulty.u) - len(NOISE)
+    u = gen.inputs(load, w_r=float(at.u[at.ss.u.index("w_r")]), V_ref=at.V_ref)
+    now: dict[str, Any] = {"u_target": u, "theta_target": tuple(theta.values())}
+    x = gen.transfer(at.x, at.ss, faulty, u=at.u, theta=(), **now)
     ranges = {k.name: (k.lo, k.hi) for k in fault.keys if k.name in theta}
-    ranges[severity] = (0.0, ranges.get(severity, _RANGE)[1])
-    stage = [i for i, s in enumerate(faulty.x) if s.name not in healthy.x]
-    method, names = radau(STAGES), faulty.theta.names
-    sizes = {
-        "M_X": len(faulty.x), "M_XH": len(healthy.x), "M_U": len(faulty.u), "M_Y": len(faulty.y),
-        "M_TH": max(len(ss.shared.theta) for ss in (healthy, faulty)), "M_INPUTS": n - 1,
-        "M_FAULT": len(theta), "M_AXIS": names.index(_AXIS) if _AXIS in names else -1,
-        "M_GIVEN": len(theta) + len(faulty.numbers), "N_MACHINE": len(faulty.numbers),
-        "M_ANGLE": faulty.x.index("theta_e"), "N_RESET": len(stage), "N_MEANS": len(MEANS),
-        "R_STAGES": STAGES, "R_PAIRS": STAGES // 2,
-    }  # fmt: skip
-    arrays = {
-        "M_NUMBERS": faulty.numbers, "M_NOMINAL": faulty.x.nominals,
-        "M_AT": faulty.x.indices(healthy.x.names), "RESET": stage,
-        "MEAN_OF": faulty.y.indices(MEANS), "R_INVERSE": method.inverse,
-        "R_RE": method.values.real, "R_IM": method.values.imag, "R_ERROR": method.error,
-        "R_FROM_RE": method.of.real, "R_FROM_IM": method.of.imag, "R_WEIGHTS": method.weights,
-        "R_TO_RE": method.to.real, "R_TO_IM": method.to.imag,
-    }  # fmt: skip
+    ranges[severity] = 0.0, ranges.get(severity, _ANY)[1]
+    n = len(faulty.u) - len(NOISE)
     return _Machine(
+        healthy,
+        faulty,
         _variables("state", faulty.x, x),
-        _variables("input", list(faulty.u)[1:n], u[1:n]),
-        _variables("parameter", faulty.theta, theta.values(), ranges=ranges),
-        list(faulty.y),
-        [f for name, ss in (("healthy", healthy), ("faulty", faulty)) for f in _parts(name, ss)],
-        sizes,
-        arrays,
+        _variables("input", faulty.u[1:n], u[1:n]),
+        _variables("parameter", faulty.theta, theta.values(), ranges),
     )
+
+
+def _severity(fault: Fault, faulty: GeneratorModel) -> str:
+    """Name of the parameter that is zero where the machine is healthy."""
+    first = faulty.theta.names[0]
+    if not fault.severities or fault.severities[0].name != first:
+        raise ParameterError(
+            f"a {type(fault).__name__} cannot be exported: its first parameter, {first}, must be "
+            "the first of its severities, zero where the machine is healthy"
+        )
+    return first
 
 
 def _parts(name: str, ss: GeneratorModel) -> list[ca.Function]:
@@ -255,20 +292,18 @@ def _parts(name: str, ss: GeneratorModel) -> list[ca.Function]:
     return [*made.values(), ca.Function(f"{name}_follow", [given], [follow], {"cse": True})]
 
 
-_MACHINE = ("machine.c", "machine.h", "radau.c", "radau.h")
+_MACHINE = "machine.c machine.h radau.c radau.h"
 
 
 @_model
 def generator(asked: Asked) -> FmuModel:
     """One generator with exciter and load: speed, voltage reference and load as inputs."""
     m, at = _machine(asked), asked.point.generator
-    w_r = at.ss.u["w_r"]
-    speed = _variables("input", [w_r], [float(at.u[at.ss.u.index("w_r")])])
-    first = [*speed, *m.inputs, *m.faults, *m.states]
-    outputs, kept = _outputs(m.outputs, first)
+    speed = _variables("input", [at.ss.u["w_r"]], [at.u[at.ss.u.index("w_r")]])
+    given = [*speed, *m.inputs, *m.faults, *m.states]
     doc = "Starter/generator with exciter, load and stator fault."
-    return FmuModel("generator", doc, (*first, *outputs), tuple(m.functions),
-                    ("generator.c", *_MACHINE), m.sizes, {**m.arrays, "Y_OF": kept})  # fmt: skip
+    made = m.functions, f"generator.c {_MACHINE}", [m.numbers]
+    return _finished("generator", doc, given, m.faulty.y, *made)
 
 
 # ------------------------------------------------------------------------------ the unit
@@ -284,6 +319,7 @@ def _link_functions(link: Link, gg: GasGenerator) -> list[ca.Function]:
     first, *rest = ca.vertsplit(tuned)
     own = link.with_numbers([first, *numbers[1:4].tolist(), *rest])
     now = own.fuel(N, ca.vertsplit(x))
+    feed = ca.vertcat(now.Wf, own.PW(P))
 
     def machine(_N: Any, _slope: Any) -> tuple[Any, Any]:
         return P, None
@@ -297,9 +333,7 @@ def _link_functions(link: Link, gg: GasGenerator) -> list[ca.Function]:
     after = [N1, ca.vertcat(*done.governor), y, z1, residual]
     return [
         ca.Function("link_speed", [N, tuned], [own.w_r(N)]),
-        ca.Function(
-            "link_now", [N, x, P, tuned], [ca.vertcat(now.Wf, own.PW(P)), ca.vertcat(*now.rates)]
-        ),
+        ca.Function("link_now", [N, x, P, tuned], [feed, ca.vertcat(*now.rates)]),
         ca.Function("exchange", [N, x, P, air, theta, tuned, h, z], after),
     ]
 
@@ -309,29 +343,26 @@ def apu(asked: Asked) -> FmuModel:
     """The whole unit: governor and the exchange of 20 ms inside, loads and the day as inputs."""
     unit, m, gas = asked.unit, _machine(asked), asked.gas
     gg, law = unit.gas_generator, unit.governor
-    air = [gg.U[n] for n in AMBIENT]
     N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=unit.N_ref)
-    tuned = [N_ref, *law.signals("governor")]
-    first = [
-        *_variables("input", air, (gas.u[gg.U.index(n)] for n in AMBIENT), ranges=gg.input_ranges),
+    air = [float(gas.u[gg.U.index(n)]) for n in AMBIENT]
+    given = [
+        *_variables("input", (gg.U[n] for n in AMBIENT), air, gg.input_ranges),
         *m.inputs,
         *_health(gg, gas.theta),
         *m.faults,
-        *_variables("parameter", tuned, [unit.N_ref, *law.numbers.values()]),
+        *_variables("parameter", [N_ref], [unit.N_ref]),
+        *_variables("parameter", law.signals("governor"), law.numbers.values()),
         *_variables("state", gg.X, gas.x),
         *_variables("state", law.X, law.start(float(gas["Wf"]))),
         *m.states,
     ]
-    means = [_mean(s) if s.name in MEANS else s for s in m.outputs]
-    outputs, kept = _outputs([*gg.Y, *means], first)
-    sizes, arrays = _gas_numbers(gg)
-    sizes |= {**m.sizes, "N_GOVERNOR": len(law.X), "N_AMBIENT": len(air)}
+    outputs = [*gg.Y, *(_mean(s) if s.name in MEANS else s for s in m.faulty.y)]
+    own = {"N_GOVERNOR": len(law.X), "N_AMBIENT": len(air)}
     functions = [f for f in _gas_functions(gg) if f.name() != "gas_step"]
+    functions += [*m.functions, *_link_functions(unit.link, gg)]
     doc = "All-electric auxiliary power unit: gas generator, governor and generators."
-    return FmuModel("apu", doc, (*first, *outputs),
-                    (*functions, *m.functions, *_link_functions(unit.link, gg)),
-                    ("apu.c", "gas.c", "gas.h", *_MACHINE),
-                    sizes, {**arrays, **m.arrays, "Y_OF": kept})  # fmt: skip
+    made = functions, f"apu.c gas.c gas.h {_MACHINE}", [m.numbers, _gas_numbers(gg), (own, {})]
+    return _finished("apu", doc, given, outputs, *made)
 
 
 def _mean(s: Signal) -> Signal:
