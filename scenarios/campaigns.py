@@ -293,7 +293,7 @@ def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
     table = s.to_dict()
     # the same numbers from the same program: a changed model runs its campaign again
     files = [digest(path) for path in s.extensions]
-    files += [digest(s.engine, "engine file")] if s.engine else []
+    files += [registry.engine_digest(s.engine)] if s.engine else []
     content = json.dumps([table, solver, package_digest(), *files], sort_keys=True)
     return _Task(hashlib.sha256(content.encode()).hexdigest()[:32], table, solver, keep)
 

@@ -24,8 +24,8 @@ from scenarios.shell import jsontext
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.enginefile import Engine
 
 Progress = Callable[[float, float], None]
 """Called with the simulated and the total time [s]."""
@@ -106,24 +106,41 @@ def run(
     ds = _simulate(s, progress, solver, phasors)
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
+    if s.engine:
+        ds.attrs["assumed"] = json.dumps(assumed(s), ensure_ascii=False)
     if out is not None:
         write(ds, out)
     return ds
 
 
-def engine_of(path: str | os.PathLike[str] | None) -> GasGenerator:
-    """Return the engine that a file describes; None is the paper's.
+def engine_file(name: str | os.PathLike[str] | None) -> Engine:
+    """Return the unit of a file, or of the package by its name; None is the default one.
 
     Raises:
         DataError: the file cannot be read; ParameterError, MapError : what it says cannot be.
     """
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
+    if name is None:
+        return _engine_file(None)
+    return _engine_file(str(name), engine_digest(name))
 
-    if path is None:
-        return GasGenerator()
-    from apu_casadi.gaspath.engines import read_engine
 
-    return read_engine(Path(path))
+@last(4)
+def _engine_file(name: str | None, content: str = "") -> Engine:
+    from apu_casadi.unit.enginefile import Engine, read_unit
+
+    return Engine() if name is None else read_unit(name)
+
+
+def engine_digest(name: str | os.PathLike[str]) -> str:
+    """Return a digest of an engine's file and of the map files that it names.
+
+    Raises:
+        ScenarioError: one of them cannot be read; DataError : no unit of this name.
+    """
+    from apu_casadi.unit.enginefile import files_of
+    from apu_casadi.unit.shippedunits import unit_path
+
+    return "".join(digest(p, "engine file") for p in files_of(unit_path(Path(name))))
 
 
 @last(4)
@@ -134,28 +151,34 @@ def unit_of(parameters: str = "{}", engine: str | None = None, content: str = ""
 
     Args:
         parameters: values by dotted name, a JSON table.
-        engine: file of the engine.
+        engine: file of the unit, or the name of a shipped one.
         content: its digest, so that a file that has changed is read again.
 
     Raises:
         ParameterError: an unknown name or a value out of range.
     """
-    from apu_casadi.unit.apu import Apu
-
-    unit = Apu() if engine is None else Apu(gas_generator=engine_of(engine))
-    return unit.change(json.loads(parameters))
+    return engine_file(engine).unit.change(json.loads(parameters))
 
 
 def unit_for(s: Scenario) -> Apu:
     """Return the unit that a scenario is about."""
     law = {} if s.governor is None else {"governor.kind": s.governor}
     parameters = json.dumps({**s.parameters, **law}, sort_keys=True)
-    return unit_of(parameters, *([s.engine, digest(s.engine, "engine file")] if s.engine else []))
+    return unit_of(parameters, *([s.engine, engine_digest(s.engine)] if s.engine else []))
+
+
+def assumed(s: Scenario) -> list[dict[str, Any]]:
+    """Return what the engine's file of a scenario leaves to the default unit: rows for JSON."""
+    rows = engine_file(s.engine).assumed if s.engine else ()
+    return [a._asdict() for a in rows if a.name not in s.parameters]
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:
+    from apu_casadi.unit.events import Ambient
     from apu_casadi.unit.multirate import simulate_joint
 
+    if not isinstance(s.ambient, Ambient):
+        raise ScenarioError("ambient: profiles are not followed by joint runs")
     return simulate_joint(
         unit_for(s),
         duration=s.duration,
@@ -199,6 +222,7 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
         "title": str(scenario.get("title", "")),
         "apu_casadi_version": str(ds.attrs.get("apu_casadi_version", "")),
         **{k: scenario[k] for k in ("engine", "governor", "extensions") if k in scenario},
+        **({"assumed_engine": json.loads(ds.attrs["assumed"])} if "assumed" in ds.attrs else {}),
         **conditions(ds),
         "phases": phase_summary(ds),
         "validity": json.loads(ds.attrs.get("validity", "[]")),

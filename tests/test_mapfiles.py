@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from apu_casadi.core.errors import DataError, MapError
+from apu_casadi.core.errors import ApuWarning, DataError, MapError
 from apu_casadi.gaspath.maps.gasturbmaps import read_map_gasturb
 from apu_casadi.gaspath.maps.mapfiles import SHIPPED, read_map, read_map_csv, shipped, write_map_csv
 from apu_casadi.gaspath.maps.maptable import MapTable
@@ -193,8 +193,11 @@ def test_trim_leaves_out_lines_at_or_below_unity(write):
     lines[start:end] = section("Pressure Ratio", grid(ratio))
     path = write(lines)
     with pytest.raises(MapError, match=r"row 2, column 2: 0\.98; .*trim=True"):
-        read_map(path)
+        read_map(path, trim=False)
+    with pytest.warns(ApuWarning, match=r"my\.map: left out, since PR <= 1 there: N = 0\.5, beta"):
+        told = read_map(path)
     table = read_map(path, trim=True)
+    assert told == table
     # the choke line first (all points at fault); then speed and beta line have one point of five
     # at fault each, and the speed line is asked first
     part = dict(N=N[1:], beta=BETA[1:], W=W[1:, 1:], PR=PR[1:, 1:], eta=ETA[1:, 1:])
@@ -294,7 +297,7 @@ def test_messages_of_gasturb_turbines(write):
     with pytest.raises(DataError, match=r"'Min Pressure Ratio' at line 3: speeds differ .*0\.6"):
         read_map(write(replaced(4, "0.50000000", "0.60000000")(lines)))
     with pytest.raises(MapError, match=r"line 5, section 'Min.*row 2, column 2: 1; pressure ratio"):
-        read_map(write(replaced(5, "1.15", "1.00")(lines)))
+        read_map(write(replaced(5, "1.15", "1.00")(lines)), trim=False)
 
 
 def test_messages_of_files(tmp_path):

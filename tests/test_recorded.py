@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import dataset, save
+from apu_casadi.core.units import UNITS, convert
 from estimators.apu.recordings.recorded import parse_mapping, read_table
-from estimators.apu.recordings.units import UNITS, convert
 
 
 def written(tmp_path, text, name="run.csv"):

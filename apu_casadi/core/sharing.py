@@ -22,7 +22,7 @@ import os
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Generic, TypeVar, cast, overload
 
 import casadi as ca
@@ -38,6 +38,7 @@ __all__ = [
     "keep",
     "kept",
     "last",
+    "of_family",
     "once",
     "remade",
     "twin",
@@ -253,6 +254,35 @@ def once(make: Callable[..., T]) -> Callable[..., T]:
 
 class _Owner:
     """Holds the results of one function of :func:`last`."""
+
+
+def of_family(make: Callable[..., T]) -> Callable[..., T]:
+    """Let what is made of a model be made of the model's family: once for all its units.
+
+    The model has a ``family``, or None, and the result a method ``unit`` that holds the numbers
+    of a model.
+    """
+
+    @functools.wraps(make)
+    def call(model: Any, *args: Any, **more: Any) -> T:
+        family = model.family
+        if family is None:
+            return make(model, *args, **more)
+        key = _frozen((args, more))
+        made: Any = keep(family, call, key, lambda: make(family, *args, **more))
+        held: T = made.unit(model)
+        return held
+
+    return call
+
+
+def _frozen(value: Any) -> Any:
+    """Return what an argument says as a key: lists and tables as tuples, arrays as lists."""
+    if isinstance(value, Mapping):
+        return tuple((k, _frozen(v)) for k, v in value.items())
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
 
 
 def building(make: Callable[..., T]) -> Callable[..., T]:

@@ -87,6 +87,12 @@ class StateSpace(Parametric):
         """Return theta of :attr:`shared`: this model's, shape (ntheta,), and its numbers."""
         return np.append(np.asarray(theta, dtype=float), self.numbers)
 
+    @property
+    def held(self) -> dict[str, float]:
+        """Its numbers by name."""
+        names = () if self.family is None else self.family.theta.names[len(self.theta) :]
+        return dict(zip(names, self.numbers, strict=True))
+
     @classmethod
     def member(
         cls, name: str, family: StateSpace, theta: Signals, numbers: Sequence[float]

@@ -44,7 +44,7 @@ from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, StepMaker, run
-from estimators.models.filtermodel import FilterModel
+from estimators.models.filtermodel import FilterModel, Unknown
 from estimators.models.recording import Recording, record
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ J_SIGMA = 0.1  # relative; the paper gives no inertia
 # error of the power shows in no output of its own sample.
 ITERATIONS = 2
 ITERATED = "noise"
+FREE_SIGMA = 0.02  # of a parameter's magnitude
 LAG_SIGMA = 0.3  # relative; start of a lagging sensor's state, which the first sample settles
 JUMP = 0.03  # standard deviation that a jump of the health factors is met with
 
@@ -128,6 +129,7 @@ class GasPathFilter(Parametric):
         means = {"N": self.gg.parameters.N} | dict.fromkeys(HEALTH, 1.0)
         means |= {f"gain_{n}": 0.0 for n in self.gains}
         means |= {s.name: s.signal.nominal for s in self.lagging}
+        means |= {n: v for n, v in self.gg.held.items() if n in self.model.x}
         if not self.known_power:
             means["PW"] = PW_PRIOR[0]
         return Belief.of(self.model.x, means | mean, self.sigma)
@@ -256,6 +258,7 @@ def gas_path_filter(
     walk: Mapping[str, float] | None = None,
     governed: Governor | None = GOVERNOR,
     power_jumps: bool = False,
+    free: Mapping[str, Unknown] | None = None,
 ) -> GasPathFilter:
     """Make a gas-path filter.
 
@@ -277,9 +280,13 @@ def gas_path_filter(
         governed: law of the fuel within a step; None: it is held from one reading to the next.
         power_jumps: the error of the shaft power may jump where a recording says so; ``eta`` must
             be estimated then.
+        free: parameters of the gas generator that are states, by name (``gas_generator.eta_c``,
+            ``compressor_map.a_W``); their prior means are those of ``gg``, their standard
+            deviations ``FREE_SIGMA`` of the magnitude.
 
     Raises:
         ParameterError: unknown ``power``, gain, or an efficiency where no power is measured.
+        SignalError: unknown parameter in ``free``.
     """
     gg = GasGenerator() if gg is None else gg
     if missing := [n for n in ("Wf", "PW") if n not in sensors]:
@@ -310,7 +317,9 @@ def gas_path_filter(
         governed=governed,
         power_jumps=power_jumps,
         sensors=model_sensors(gg, sensors.only(sensors.outputs).sensors),
+        free=tuple((free or {}).items()),
     )
+    sigma |= {n: FREE_SIGMA * model.x[n].nominal for n in free or {}}
     return GasPathFilter(gg, sensors, model, sigma)
 
 
@@ -375,8 +384,9 @@ def null_direction(filt: GasPathFilter, x: Mapping[str, float], u: Mapping[str, 
     v = gg.U.pack({"PW": 0.0, **u})
     theta = gg.THETA.pack({n: x.get(n, 1.0) for n in HEALTH})
     N = np.array([x["N"]])
-    z = engine_function(gg)(N, v, theta)[3]
-    y_w = np.asarray(gg.cycle.sensitivities(N, z, v, theta)[3])[rows]
+    full = gg.full(theta)
+    z = engine_function(gg.family)(N, v, full)[3]
+    y_w = np.asarray(gg.family.sensitivities(N, z, v, full)[3])[rows]
     seen = y_w[:, 1 + len(gg.U) :] / gg.Y.nominals[rows][:, None]
     n = np.linalg.svd(seen)[2][-1]
     return n * np.sign(n[int(np.abs(n).argmax())])

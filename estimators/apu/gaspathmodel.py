@@ -3,6 +3,11 @@
 The cycle is solved once for each evaluation, and its derivatives are those of the implicit function
 theorem at the solution (:attr:`Cycle.sensitivities`), not of the iteration.
 
+The model is one of a family: the numbers of the engine are known parameters of what is compiled.
+In the usual family they are held, without derivatives by them.  Where some are *free*, states of
+the filter, the family is that of ``GasGenerator.by_parameters``, which solves the design point in
+every step: its derivatives by every parameter are exact.
+
 A sensor with a lag tau has a state of its own: tau dx/dt = v - x with the value v of the middle of
 the step, by which the speed goes on as well, held over the step:
 
@@ -12,7 +17,7 @@ the step, by which the speed goes on as well, held over the step:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -23,11 +28,13 @@ from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.health import HEALTH
+from apu_casadi.gaspath.stations import THETA, U, X, Y
 from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.sensors import GAS_PATH, Sensor
-from estimators.models.filtermodel import FilterModel
+from estimators.models.filtermodel import FilterModel, Unknown, augment
 
 __all__ = [
     "DT",
@@ -47,23 +54,27 @@ GOVERNOR = GovernorParameters()
 
 
 @kept
-def engine_function(gg: GasGenerator, outputs: tuple[str, ...] = OUTPUTS[1:]) -> ca.Function:
+def engine_function(c: CycleFunctions, outputs: tuple[str, ...] = OUTPUTS[1:]) -> ca.Function:
     """The cycle as Function (N, u, theta) -> (xdot, y, check, z) with exact, cheap derivatives.
 
     ``y`` are the outputs.  The Jacobian is handed the solved z, so it costs no second solution.
+
+    Args:
+        c: the cycle of one engine, or of a family of them.
+        outputs: names.
     """
-    c = gg.cycle
-    rows = gg.Y.indices(outputs)
+    rows = Y.indices(outputs)
     x, _, u, theta = c.symbols()
-    z = c.solve(c.similar(x, u), x, u, theta)
-    ode, alg, y = c.equations(x, z, u, theta)
-    made = {"xdot": ode, "y": y[rows], "check": ca.norm_1(alg), "z": z}
+    z = c.solve(c.start(x, u, theta), x, u, theta)
+    ode, _, y = c.equations(x, z, u, theta)
+    made = {"xdot": ode, "y": y[rows], "check": y[Y.index("residual")], "z": z}
     given = {"x": x, "u": u, "theta": theta}
     nominal = {f"out_{k}": ca.MX.sym(k, *v.shape) for k, v in made.items()}
     _, _, xdot_w, y_w, z_w = c.sensitivities(x, nominal["out_z"], u, theta)
-    width = [len(gg.X), len(gg.U), len(gg.THETA)]
-    ends = np.cumsum([0, *width]).tolist()
-    whole = [xdot_w, y_w[rows, :], ca.MX(1, ends[-1]), z_w]
+    ends = np.cumsum([0, *(len(v) for v in (X, U, c.theta))]).tolist()
+    whole = [xdot_w, y_w[rows, :], ca.MX(1, 0), z_w]
+    # none by numbers that are held
+    whole = [ca.horzcat(d, ca.MX(d.shape[0], ends[-1] - d.shape[1])) for d in whole]
     blocks = [d[:, i:j] for d in whole for i, j in pairwise(ends)]
     names = [*given, *nominal], [f"jac_{o}_{i}" for o in made for i in given]
     jac = ca.Function("jac_gas_path", [*given.values(), *nominal.values()], blocks, *names)
@@ -86,12 +97,12 @@ def model_sensors(gg: GasGenerator, sensors: Sequence[Sensor]) -> tuple[Sensor, 
         ParameterError: a sensor of an output that is not there, or that depends on shaft power,
             which is not known at the sample.
     """
-    of_inputs = gg.equations.jac_sparsity(2, 2)  # dy/du
+    of_inputs = gg.family.equations.jac_sparsity(2, 2)  # dy/du
     for s in sensors:
         for n in s.reads:
-            if n not in gg.Y.names:
-                raise ParameterError(f"sensor {s.name}: no output {n!r} {nearest(n, gg.Y.names)}")
-            if of_inputs.has_nz(gg.Y.index(n), gg.U.index("PW")):
+            if n not in Y.names:
+                raise ParameterError(f"sensor {s.name}: no output {n!r} {nearest(n, Y.names)}")
+            if of_inputs.has_nz(Y.index(n), U.index("PW")):
                 raise ParameterError(
                     f"sensor {s.name} reads {n}, which depends on the shaft power of the step that "
                     "begins at the sample: a gas-path filter cannot take it as an output"
@@ -103,37 +114,35 @@ def _relative(name: str, doc: str, default: float | None = 0.0) -> Signal:
     return Signal(name, "1", doc, default=default, nominal=0.01)
 
 
-def _states(
-    gg: GasGenerator, known: bool, gains: Sequence[str], sensors: Sequence[Sensor]
-) -> Signals:
-    power = () if known else (dataclasses.replace(gg.U["PW"], default=None),)
+def _states(known: bool, gains: Sequence[str], sensors: Sequence[Sensor]) -> Signals:
+    power = () if known else (dataclasses.replace(U["PW"], default=None),)
     docs = {n: _GAIN_DOCS.get(n, f"relative gain error of the sensor of {n}") for n in gains}
     errors = [_relative(f"gain_{n}", doc) for n, doc in docs.items()]
     lags = [dataclasses.replace(s.signal, default=None) for s in sensors if s.tau]
-    return Signals([*gg.X, *gg.THETA, *power, *errors, *lags])
+    return Signals([*X, *THETA, *power, *errors, *lags])
 
 
-def _inputs(gg: GasGenerator, known: bool, power_jumps: bool) -> tuple[Signals, Signals]:
+def _inputs(known: bool, power_jumps: bool) -> tuple[Signals, Signals]:
     """Inputs and noises."""
     measured = ("Wf", "PW") if known else ("Wf",)
     spread = [
         Signal(
             f"sigma_{n}",
-            gg.U[n].unit,
+            U[n].unit,
             f"standard deviation of the measured {n}",
             default=0.0,
-            nominal=0.01 * gg.U[n].nominal,
+            nominal=0.01 * U[n].nominal,
         )
         for n in measured
     ]
-    U = [s for s in gg.U if known or s.name != "PW"] + spread
-    U += [_relative("jump", "standard deviation of a sudden change of health in this step")]
+    given = [s for s in U if known or s.name != "PW"] + spread
+    given += [_relative("jump", "standard deviation of a sudden change of health in this step")]
     W = [Signal(f"w_{n}", "1", f"error of the measured {n} over its sigma") for n in measured]
     if power_jumps:
-        U += [_relative("jump_PW", "the same of gain_PW")]
+        given += [_relative("jump_PW", "the same of gain_PW")]
         W += [Signal("w_gain_PW", "1", "sudden change of gain_PW over jump_PW")]
     W += [Signal(f"w_{n}", "1", f"sudden change of {n} over jump") for n in HEALTH]
-    return Signals(U), Signals(W)
+    return Signals(given), Signals(W)
 
 
 def _check_gains(
@@ -169,6 +178,7 @@ def gas_path_model(
     governed: Governor | None = None,
     power_jumps: bool = False,
     sensors: tuple[Sensor, ...] | None = None,
+    free: tuple[tuple[str, Unknown], ...] = (),
 ) -> FilterModel:
     """Make the filter's model; :func:`~.gaspath.gas_path_filter` is the convenient form.
 
@@ -187,32 +197,60 @@ def gas_path_model(
         power_jumps: add the input ``jump_PW``: standard deviation of a sudden change of
             ``gain_PW``.
         sensors: of the outputs, as :func:`model_sensors` gives them; those of the table by default.
+        free: pairs of a parameter's name, as ``"gas_generator.eta_c"``, and how it is estimated:
+            states behind all others.
 
     Raises:
         ParameterError: unknown ``power`` or gain, the gain of a power that is not measured, or
             jumps of a gain that is not estimated.
+        SignalError: unknown parameter in ``free``.
     """
     if sensors is None:
         sensors = model_sensors(gg, GAS_PATH.only(OUTPUTS).sensors)
-    known = power == "measured"
     _check_gains(power, gains, consider, power_jumps, {s.name for s in sensors})
-    X, (U, W) = _states(gg, known, gains, sensors), _inputs(gg, known, power_jumps)
-    x, u, w = (ca.MX.sym(n, len(s)) for n, s in (("x", X), ("u", U), ("w", W)))
-    p, dt = ca.MX.sym("p", 0), ca.MX.sym("dt")
+    engines = gg.by_parameters if free else gg.family
+    how: dict[str, Any] = {"power": power, "gains": gains, "consider": consider, "walks": walks}
+    how |= {"governed": governed, "power_jumps": power_jumps, "sensors": sensors}
+    made = _family(engines, **how).unit(gg)
+    return augment(made, dict(free)) if free else made
+
+
+@kept
+def _family(
+    engines: CycleFunctions,
+    *,
+    power: str,
+    gains: tuple[str, ...],
+    consider: tuple[str, ...],
+    walks: tuple[tuple[str, float], ...],
+    governed: Governor | None,
+    power_jumps: bool,
+    sensors: tuple[Sensor, ...],
+) -> FilterModel:
+    """The model of all engines of a structure, with their numbers as known parameters."""
+    known, numbers = power == "measured", Signals(engines.theta[len(THETA) :])
+    states, (inputs_of, noises) = _states(known, gains, sensors), _inputs(known, power_jumps)
+    signals = states, inputs_of, numbers, noises, Signals([s.signal for s in sensors])
+    x, u, p, w = (ca.MX.sym(n, len(s)) for n, s in zip("xupw", signals, strict=False))
+    dt = ca.MX.sym("dt")
     at, given, noise = (
-        dict(zip(s.names, ca.vertsplit(v), strict=True)) for s, v in ((X, x), (U, u), (W, w))
+        dict(zip(s.names, ca.vertsplit(v), strict=True))
+        for s, v in ((states, x), (inputs_of, u), (noises, w))
     )
 
     def true(name: str) -> Any:  # reading = (1 + gain) true + sigma w
         error = given[f"sigma_{name}"] * noise[f"w_{name}"]
         return (given[name] - error) / (1 + at.get(f"gain_{name}", 0.0))
 
-    reads = dict.fromkeys(n for s in sensors for n in s.reads if n not in gg.X.names)
-    engine, N = engine_function(gg, tuple(reads)), at["N"]
+    reads = dict.fromkeys(n for s in sensors for n in s.reads if n not in X.names)
+    function, N = engine_function(engines, tuple(reads)), at["N"]
+
+    def engine(N: Any, inputs: Mapping[str, Any]) -> Any:
+        return function(N, U.stack(inputs), ca.vertcat(*(at[n] for n in HEALTH), p))
+
     inputs = {n: given[n] for n in AMBIENT} | {"Wf": true("Wf")}
     # the outputs do not depend on the shaft power
-    before = ca.vertcat(*(at[n] for n in HEALTH))
-    _, y, check_out, _ = engine(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), before)
+    _, y, check_out, _ = engine(N, inputs | {"PW": ca.MX(0)})
     seen = {"N": N} | {n: y[i] for i, n in enumerate(reads)}
     own = {s: at[s.name] if s.tau else s.of(seen) for s in sensors}
     readings = [v * (1 + at.get(f"gain_{s.name}", 0.0)) for s, v in own.items()]
@@ -221,17 +259,15 @@ def gas_path_model(
     if power_jumps:
         at["gain_PW"] += given["jump_PW"] * noise["w_gain_PW"]
     inputs["PW"] = true("PW") if known else at["PW"]
-    u_gg, health = gg.U.stack(inputs), ca.vertcat(*(at[n] for n in HEALTH))
-    k1, _, check, _ = engine(N, u_gg, health)
+    k1, _, check, _ = engine(N, inputs)
     k1 = k1 / (1 + at.get("gain_J", 0.0))
     if governed is not None:
-        slope = governed.slope(N, k1, gg.parameters.N)
-        u_gg = gg.U.stack(inputs | {"Wf": inputs["Wf"] + dt / 2 * slope})
-    k2, y_mid, check_mid, _ = engine(N + dt / 2 * k1, u_gg, health)
+        slope = governed.slope(N, k1, p[numbers.index("gas_generator.N")])
+        inputs["Wf"] += dt / 2 * slope
+    k2, y_mid, check_mid, _ = engine(N + dt / 2 * k1, inputs)
     x1 = at | {"N": N + dt * k2 / (1 + at.get("gain_J", 0.0))}
     amid = {"N": N + dt / 2 * k1} | {n: y_mid[i] for i, n in enumerate(reads)}
     x1 |= _lagged(sensors, amid, at, dt)
-    signals = X, U, Signals(), W, Signals([s.signal for s in sensors])
     step = ca.vertcat(*x1.values()), check + check_mid
     output, name = (ca.vertcat(*readings), check_out), f"gas_path_{power}"
     made = FilterModel.of(name, signals, (x, u, p, w, dt), step, output, consider=consider)

@@ -43,6 +43,7 @@ __all__ = [
     "BASE",
     "CANDIDATES",
     "POINTS",
+    "condition",
     "findings",
     "gas_path",
     "gas_path_transient",
@@ -54,8 +55,11 @@ __all__ = [
     "steady_point",
 ]
 
-#: Steady points by name: shaft power, W, and ambient conditions, those of the default day where
-#: none are named.  The first two are Tables 4 and 5.
+#: Power of the default unit's design point, W, of which the powers of :data:`POINTS` are a share.
+RATED = 500e3
+#: Steady points by name: shaft power of the default unit, W, and ambient conditions, those of the
+#: default day where none are named.  The first two are Tables 4 and 5.  Another engine has the
+#: same share of its own power there, see :func:`condition`.
 POINTS: dict[str, dict[str, float]] = {
     "design": {"PW": 500e3},
     "offdesign": {"PW": 222e3, "dT_isa": 5.0, "altitude": 8000.0, "Mach": 0.7},
@@ -82,12 +86,22 @@ POWER_NOISES = (0.0025, 0.005, 0.01, 0.02, 0.05)
 # ---------------------------------------------------------------------- gas path
 
 
+def condition(point: str, gg: GasGenerator) -> dict[str, float]:
+    """Return shaft power, W, and ambient conditions of a point of :data:`POINTS` for an engine.
+
+    Raises:
+        ParameterError: an unknown point; the nearest is named.
+    """
+    if point not in POINTS:
+        raise ParameterError(f"unknown point {point!r} {nearest(point, POINTS)}")
+    at = POINTS[point]
+    return {**at, "PW": at["PW"] * (gg.rated_power / RATED)}
+
+
 @last(16)
 def steady_point(point: str, gg: GasGenerator) -> OperatingPoint:
     """Return a point of :data:`POINTS`."""
-    if point not in POINTS:
-        raise ParameterError(f"unknown point {point!r} {nearest(point, POINTS)}")
-    conditions: dict[str, Any] = dict(POINTS[point])
+    conditions: dict[str, Any] = condition(point, gg)
     return trim_gas_generator(gg, {"N": gg.parameters.N, "PW": conditions.pop("PW")}, **conditions)
 
 
@@ -227,8 +241,8 @@ def gas_path_transient(
     *,
     power: bool,
     seconds: float = 5.0,
-    from_power: float = 222e3,
-    to_power: float = 500e3,
+    from_power: float | None = None,
+    to_power: float | None = None,
     power_noise: float = GAS_PATH["PW"].noise,
     prior: float = PRIOR,
     sensors: SensorSet = GAS_PATH,
@@ -243,7 +257,8 @@ def gas_path_transient(
 
     Args:
         power: whether PW is measured; otherwise it is unknown at every sample.
-        seconds, from_power, to_power: length, s; the shaft power ramps in :data:`RAMP` s, W.
+        seconds, from_power, to_power: length, s; the shaft power ramps in :data:`RAMP` s, W; by
+            default from the point ``partload`` to ``design``.
         power_noise: standard deviation of PW over its value, white from sample to sample.
         prior: standard deviation of each health factor before.
         sensors: the sensor table.
@@ -257,6 +272,10 @@ def gas_path_transient(
     ss = gg.state_space
     dt, K = 0.02, round(seconds / 0.02)
     t = dt * np.arange(K)
+    if from_power is None:
+        from_power = condition("partload", gg)["PW"]
+    if to_power is None:
+        to_power = condition("design", gg)["PW"]
     PW = from_power + (to_power - from_power) * np.clip((t - 0.5) / RAMP, 0, 1)
     ends = [trim_gas_generator(gg, {"N": gg.parameters.N, "PW": P}) for P in (from_power, to_power)]
     Wf = np.interp(PW, [from_power, to_power], [e["Wf"] for e in ends])

@@ -128,7 +128,7 @@ def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter
     energy = me.x.index("energy")
     PW = apu.PW(x_e[energy]) / ca.fmax(dt, 1e-12)
     Wf = given["Wf"] - given["sigma_Wf"] * at["error_Wf"]
-    engine = engine_function(gg)
+    engine = engine_function(gg.cycle)
     inputs: dict[str, Any] = {n: given[n] for n in AMBIENT} | {"PW": PW, "Wf": Wf}
     _, y_g, check_y, _ = engine(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), health)
     k1, _, check, _ = engine(N, gg.U.stack(inputs), health)

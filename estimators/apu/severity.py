@@ -80,7 +80,7 @@ def severity(
     gain_error: bool = True,
     kappa_known: bool = True,
     generator: Generator | None = None,
-    load: float = 225e3,
+    load: float | None = None,
 ) -> tuple[Sensitivities, float]:
     """Return the sensitivities of the faulty phase's current to the severity, and w L/R.
 
@@ -94,7 +94,8 @@ def severity(
         periods: electrical periods, sampled at 10 kHz.
         gain_error: consider the gain error of the current's sensor.
         kappa_known: otherwise kappa is unknown as well, without a prior.
-        generator, load: the machine, and its load, W, balanced and resistive.
+        generator, load: the machine, and its load, W, balanced and resistive; by default its rated
+            power at rated voltage.
 
     Raises:
         ParameterError: periods not positive, or k_rf = 0, which has no logarithm.
@@ -102,7 +103,9 @@ def severity(
     if periods < 1 or not fault.k_rf > 0:
         raise ParameterError(f"periods >= 1 and k_rf > 0 expected, got {periods!r}, {fault!r}")
     gen = Generator() if generator is None else generator
-    at = gen.steady_state(SeriesLoad.from_power(load))
+    m = gen.machine
+    load = m.P_rated if load is None else load
+    at = gen.steady_state(SeriesLoad.from_power(load, V_rms=m.V_rated_rms, f=m.f_rated))
     w, V = float(at.u[0]), at.V_t
     n = round(periods * 2 * math.pi / w / 1e-4)
     t = 1e-4 * np.arange(n)
@@ -142,6 +145,7 @@ def severity_study(
     *,
     periods: int = 8,
     gain_error: bool = True,
+    generator: Generator | None = None,
 ) -> list[Severity]:
     """Return what is known of log mu and log k_rf, for every severity and kappa (None: mu).
 
@@ -153,6 +157,7 @@ def severity_study(
         for kappa in kappas:
             fault = Ttsc(mu, k_rf, kappa)
             options: dict[str, Any] = {"periods": periods, "gain_error": gain_error}
+            options["generator"] = generator
             g, ratio = severity(fault, **options)
             found = identify(g)
             three = identify(severity(fault, kappa_known=False, **options)[0])

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError
-from apu_casadi.core.sharing import kept
+from apu_casadi.core.sharing import kept, of_family
 from apu_casadi.core.signals import Signals
 from estimators.batch.smoother import rts_smoother
 from estimators.filters.belief import Belief
@@ -32,6 +32,7 @@ __all__ = ["linearised", "relinearised_filter"]
 
 
 @kept
+@of_family
 def linearised(model: FilterModel) -> FilterModel:
     """Return the model linearised about states that come as inputs ``at_<state>``.
 

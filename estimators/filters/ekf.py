@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 from apu_casadi.core.errors import ParameterError, nearest
-from apu_casadi.core.sharing import kept, once
+from apu_casadi.core.sharing import kept, of_family, once
 from estimators.filters.algebra import backward, cholesky, forward, symmetric
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
@@ -122,6 +122,7 @@ def correct(P: Any, H: Any, nu: Any, R: Any, fixed: tuple[int, ...] = ()) -> Cor
 
 
 @kept
+@of_family
 def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
     """Build the filter's step for a model.
 

@@ -69,12 +69,15 @@ class FilterStep(Parametric):
             triangular factors L of the covariance L L'.
         wide: makes the same filter in square-root form, for beliefs whose covariance double
             precision does not hold; None where there is none.
+        family: the step of the model's family, which is what :func:`run` runs, with the numbers of
+            the unit as arguments; None if the model has none.
     """
 
     model: FilterModel
     function: ca.Function
     root: bool = False
     wide: Callable[[], FilterStep] | None = None
+    family: FilterStep | None = None
 
     def __post_init__(self) -> None:
         f, (nx, nu, np_, _, ny) = self.function, self.model.sizes
@@ -91,6 +94,25 @@ class FilterStep(Parametric):
                 raise SignalError(
                     f"step {f.name()} of {self.model.name}: {what} {shown} expected, got {got}"
                 )
+
+    @property
+    def shared(self) -> FilterStep:
+        """The family's step, or the step itself if it has none: what to make functions of."""
+        return self if self.family is None else self.family
+
+    def full(self, p: Any) -> Any:
+        """Return the known parameters that :attr:`shared` takes, from the model's."""
+        return p if self.family is None else self.model.full(p)
+
+    def unit(self, like: FilterModel) -> FilterStep:
+        """Return the step for a model of this one's family."""
+        f = self.function
+        m, P, u, _, y, R, dt = (ca.MX.sym(f.name_in(i), *f.size_in(i)) for i in range(f.n_in()))
+        p = ca.MX.sym("p", len(like.p))
+        out = f.call([m, P, u, like.full(p), y, R, dt])
+        made = ca.Function(f.name(), [m, P, u, p, y, R, dt], out, f.name_in(), f.name_out())
+        wide = None if self.wide is None else partial(_wide_unit, self.wide, like)
+        return FilterStep(like, made, self.root, wide, self)
 
     @property
     def gives_roots(self) -> bool:
@@ -118,6 +140,10 @@ class FilterStep(Parametric):
         out[1] = ca.densify(ca.tril(P1) + ca.tril(P1, False).T)
         name = f"{self.function.name()}_plain"
         return FilterStep(self.model, ca.Function(name, s, out, STEP_IN, STEP_OUT))
+
+
+def _wide_unit(wide: Callable[[], FilterStep], like: FilterModel) -> FilterStep:
+    return wide().unit(like)
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +353,7 @@ def run(
     pad = n_blocks * BLOCK - K
     missing = np.isnan(data.y)
     y, R, u, dt = padded(data, pad)
+    p = step.full(data.p)
     mean, var = np.empty((nx, K)), np.empty((nx, K))
     nu, S = np.empty((ny, K)), np.empty((ny, K))
     stats = np.empty((len(STATS), K))
@@ -335,7 +362,7 @@ def run(
         s = slice(b * BLOCK, (b + 1) * BLOCK)
         n = min(BLOCK, K - b * BLOCK)
         r = slice(b * BLOCK, b * BLOCK + n)
-        out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], data.p)
+        out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], p)
         for target, source in (
             (mean, out[2]),
             (var, out[3][:: nx + 1]),
@@ -403,7 +430,7 @@ class _Passes:
 
     def _call(self, *args: np.ndarray) -> tuple[np.ndarray, ...]:
         if self.rooted not in self.calls:
-            block = _block(self.now, self.full, self.backend, backend_in_use())
+            block = _block(self.now.shared, self.full, self.backend, backend_in_use())
             self.calls[self.rooted] = Caller(block, copy=False)
         return self.calls[self.rooted](self.m, self.P, *args)
 

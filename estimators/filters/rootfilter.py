@@ -21,7 +21,7 @@ from typing import Any
 
 import casadi as ca
 
-from apu_casadi.core.sharing import kept, once
+from apu_casadi.core.sharing import kept, of_family, once
 from estimators.filters.algebra import graded_lower, root_update, without_gain
 from estimators.filters.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterStep
 from estimators.filters.stepparts import (
@@ -80,6 +80,7 @@ def root_functions(model: FilterModel, fixed: tuple[int, ...]) -> tuple[ca.Funct
 
 
 @kept
+@of_family
 def ekf_root_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
     """Build the extended filter's step with roots; arguments of :func:`~.ekf.ekf_step`.
 

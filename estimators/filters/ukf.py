@@ -38,7 +38,7 @@ import casadi as ca
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError, nearest
-from apu_casadi.core.sharing import kept
+from apu_casadi.core.sharing import kept, of_family
 from estimators.filters.algebra import forward, graded_lower, qr_lower, root_update, without_gain
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import ROOT_OUT, STEP_IN, STEP_OUT, FilterResult, FilterStep, run
@@ -176,6 +176,7 @@ def _straight(fun: ca.Function, nx: int) -> list[int]:
 
 
 @kept
+@of_family
 def ukf_step(
     model: FilterModel,
     points: str = "cubature",
@@ -199,6 +200,7 @@ def ukf_step(
     return dataclasses.replace(step, wide=wide)
 
 
+@kept
 def _built(
     model: FilterModel, points: str, alpha: float, beta: float, kappa: float, roots: bool
 ) -> FilterStep:

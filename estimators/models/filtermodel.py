@@ -14,6 +14,11 @@ that forgets it claims a wrong variance.
 functions return changed models: :func:`measure` (which outputs there are), :func:`noisy_inputs`,
 :func:`gains` and :func:`biases` (sensor errors as parameters), :func:`augment` (parameters become
 states that are estimated, or *considered*: uncertain, but not estimated).
+
+The numbers of a unit are known parameters as well, of the *family* that its model belongs to (as in
+:mod:`apu_casadi.core.statespace`).  What is compiled is made of the family, once for all units; the
+functions of this module change a family with its member, and :func:`augment` makes any of the
+numbers a state.
 """
 
 from __future__ import annotations
@@ -22,7 +27,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -30,13 +35,14 @@ import numpy as np
 from apu_casadi.core.checked import number
 from apu_casadi.core.discretisation import linearly_implicit_midpoint
 from apu_casadi.core.errors import ParameterError, SignalError, nearest
-from apu_casadi.core.sharing import Parametric, remade
+from apu_casadi.core.sharing import Parametric, derived, of_family, remade
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 
 __all__ = [
     "CHECK_TOL",
     "FilterModel",
+    "Numbered",
     "Unknown",
     "augment",
     "biases",
@@ -85,6 +91,14 @@ class Unknown:
             raise ParameterError("Unknown: a considered parameter is a constant, walk must be 0")
 
 
+class Numbered(Protocol):
+    """What tells the numbers of a unit by name: a model of one, or the unit itself."""
+
+    @property
+    def held(self) -> dict[str, float]:
+        """The numbers."""
+
+
 @dataclass(frozen=True, eq=False)
 class FilterModel(Parametric):
     """A discrete-time model with named vectors; see the module's text.
@@ -98,6 +112,8 @@ class FilterModel(Parametric):
         walk: random-walk standard deviations, unit of x per sqrt(s), shape (nx,).
         lower, upper: bounds of x, shape (nx,).
         consider: states whose mean and variance the measurements do not touch.
+        family: the model whose known parameters are the unit's numbers, too; None if it has none.
+        numbers: what the family's p has beyond this one's, in its order.
 
     Raises:
         SignalError: a function's or vector's shape does not match the declared signals; a walk, a
@@ -116,6 +132,8 @@ class FilterModel(Parametric):
     lower: np.ndarray
     upper: np.ndarray
     consider: tuple[str, ...] = ()
+    family: FilterModel | None = field(default=None, repr=False)
+    numbers: tuple[float, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         nx, nu, np_, nw, ny = (len(s) for s in (self.x, self.u, self.p, self.w, self.y))
@@ -135,6 +153,11 @@ class FilterModel(Parametric):
             if shape != (nx,):
                 raise SignalError(f"{self.name}.{label}: shape ({nx},) expected, got {shape}")
         fixed = self.x.indices(self.consider)
+        if len(self.shared.p) - len(self.p) != len(self.numbers):
+            raise SignalError(
+                f"{self.name}: {len(self.numbers)} numbers for the "
+                f"{len(self.shared.p) - len(self.p)} parameters of its family"
+            )
         for i, s in enumerate(self.x):
             if not (math.isfinite(self.walk[i]) and self.walk[i] >= 0):
                 raise SignalError(
@@ -191,6 +214,44 @@ class FilterModel(Parametric):
         return cls(name, x, u, p, w, y, f, g, walk, lower, upper, held)
 
     @property
+    def shared(self) -> FilterModel:
+        """The family, or the model itself if it has none: what to make functions of."""
+        return self if self.family is None else self.family
+
+    @property
+    def held(self) -> dict[str, float]:
+        """Its numbers by name."""
+        names = [n for n in self.shared.p.names if n not in self.p]
+        return dict(zip(names, self.numbers, strict=True))
+
+    @derived
+    def _order(self) -> list[int]:
+        """Places of the family's p among this one's and the numbers."""
+        names = [*self.p.names, *self.held]
+        return [names.index(n) for n in self.shared.p.names]
+
+    def full(self, p: Any) -> Any:
+        """Return p of :attr:`shared`: this model's, shape (np,) or symbols, and its numbers."""
+        if isinstance(p, ca.SX | ca.MX):
+            return ca.vertcat(p, ca.DM(list(self.numbers)))[self._order]
+        return np.append(p, self.numbers)[self._order]
+
+    def unit(self, like: Numbered) -> FilterModel:
+        """Return the model of one unit: this one's with those of its p held that ``like`` holds."""
+        numbers = {n: v for n, v in like.held.items() if n in self.p}
+        scalar = self.transition.is_a("SXFunction") and self.output.is_a("SXFunction")
+        x, u, _, w, dt = self.symbols(ca.SX if scalar else ca.MX)
+        own = Signals([s for s in self.p if s.name not in numbers])
+        p = type(x).sym("p", len(own))
+        names = [*own.names, *numbers]
+        full = ca.vertcat(p, ca.DM([*numbers.values()]))[[names.index(n) for n in self.p.names]]
+        signals = self.x, self.u, own, self.w, self.y
+        step, seen = self.transition(x, u, full, w, dt), self.output(x, u, full, w)
+        made = FilterModel.of(self.name, signals, (x, u, p, w, dt), step, seen, like=self)
+        held = tuple(numbers[n] for n in self.p.names if n in numbers)
+        return dataclasses.replace(made, family=self, numbers=held)
+
+    @property
     def sizes(self) -> tuple[int, int, int, int, int]:
         """(nx, nu, np, nw, ny)."""
         return len(self.x), len(self.u), len(self.p), len(self.w), len(self.y)
@@ -202,6 +263,7 @@ class FilterModel(Parametric):
         return (*(kind.sym(n, m) for n, m in names), kind.sym("dt"))
 
     @remade
+    @of_family
     def with_walk(self, walks: Mapping[str, float]) -> FilterModel:
         """Return the model with other random-walk standard deviations, by state name.
 
@@ -214,6 +276,7 @@ class FilterModel(Parametric):
         return dataclasses.replace(self, walk=new)
 
     @remade
+    @of_family
     def expanded(self) -> FilterModel:
         """Return the same model in scalar operations, faster, where that is possible.
 
@@ -235,6 +298,7 @@ class FilterModel(Parametric):
 
 
 @remade
+@of_family
 def discretise(
     ss: StateSpace, *, method: str = "midpoint", walk: Mapping[str, float] | None = None
 ) -> FilterModel:
@@ -283,6 +347,7 @@ def discretise(
 
 
 @remade
+@of_family
 def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model with only these outputs, in this order.
 
@@ -299,6 +364,7 @@ def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
 
 
 @remade
+@of_family
 def noisy_inputs(model: FilterModel, sigma: Mapping[str, float]) -> FilterModel:
     """Return the model for inputs that are measured with white noise.
 
@@ -371,6 +437,7 @@ def _sensor_errors(model: FilterModel, names: Sequence[str], kind: str) -> Filte
 
 
 @remade
+@of_family
 def gains(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model with parameters ``gain_<name>``: that sensor reads (1 + gain) y.
 
@@ -381,6 +448,7 @@ def gains(model: FilterModel, names: Sequence[str]) -> FilterModel:
 
 
 @remade
+@of_family
 def biases(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model with parameters ``bias_<name>``: that sensor reads y + bias.
 
@@ -391,13 +459,25 @@ def biases(model: FilterModel, names: Sequence[str]) -> FilterModel:
 
 
 @remade
+@of_family
 def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
     """Return the model in which these parameters are states, appended in the given order.
 
+    Numbers of the unit (``machine.r_s``) may be among them.
+
     Raises:
         SignalError: unknown parameter.
+        ParameterError: a number of the unit on which nothing depends, or whose derivatives are left
+            out.
     """
     moved = model.p.indices(list(unknowns))
+    for i, name in zip(moved, unknowns, strict=True):
+        of = model.transition.jac_sparsity(0, 2), model.output.jac_sparsity(0, 2)
+        if "." in name and not any(s.colind()[i + 1] > s.colind()[i] for s in of):
+            raise ParameterError(
+                f"{model.name}: no derivatives by {name}; a parameter of the gas generator is an "
+                "unknown of the filter that is made with it as free"
+            )
     kept = [i for i in range(len(model.p)) if i not in moved]
     nx, n = len(model.x), len(moved)
     _, u, _, w, dt = model.symbols()
@@ -418,6 +498,7 @@ def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
 
 
 @remade
+@of_family
 def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
     """Return the model for inputs whose white noise comes with the data.
 
@@ -454,6 +535,7 @@ def measured_inputs(model: FilterModel, names: Sequence[str]) -> FilterModel:
 
 
 @remade
+@of_family
 def lagging(
     model: FilterModel, outputs: Sequence[tuple[Signal, Callable[..., Any], Sequence[str], float]]
 ) -> FilterModel:

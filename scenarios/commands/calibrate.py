@@ -1,7 +1,7 @@
 """Fit map numbers to steady points and print them with their standard deviations.
 
-Without FILE the defaults of the package are made again: from maps without any calibration, and
-the rows W2, T3, P3, T5 and HPCSM of the paper's Table 5 and HPCSM of Table 4.
+Without FILE the calibration of the default unit is made again: from maps without any calibration,
+and the rows W2, T3, P3, T5 and HPCSM of the paper's Table 5 and HPCSM of Table 4.
 
 FILE is a CSV with one quantity on each line and SI units; role is ambient (altitude, Mach, dT_isa,
 war), health (f_eta_c, ...), fixed (two for each point) or measured:
@@ -20,6 +20,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.core.errors import ParameterError
 from scenarios.commands import given
 from scenarios.shell import jsontext, progress
 
@@ -102,38 +103,41 @@ def run(args: argparse.Namespace) -> int:
     """Fit, and print the result."""
     from apu_casadi.gaspath.calibration import calibrate, read_points, write_points
 
+    if args.engine and not args.file:
+        raise ParameterError(
+            "--engine needs FILE: the published points are those of the default unit"
+        )
     points = read_points(args.file) if args.file else published_points()
+    gg = given.engine(args)
     if args.file:
-        _plausible(args.file, points)
+        _plausible(args.file, points, gg)
     if args.write_points:
         write_points(points, args.write_points)
     free = given.names(args.free) if args.free else list(FREE)
     progress.tell(f"fitting {len(free)} numbers to {len(points)} points", quiet=args.json)
-    gg = given.engine(args)
     result = calibrate(gg if args.file else uncalibrated(gg), points, free)
     now = in_use(gg, result.names)
     if args.json:
-        jsontext.show(report(result, now))
+        jsontext.show(report(result, now) | given.own(args) | given.assumed(args))
     else:
-        print(text(result, now))
+        print(text(result, now, "in the file" if args.engine else "in the code"))
     return 0
 
 
-def _plausible(path: str, points: Sequence[CalibrationPoint]) -> None:
+def _plausible(path: str, points: Sequence[CalibrationPoint], gg: GasGenerator) -> None:
     """Refuse numbers that their quantity cannot have: a slip, or another unit than SI.
 
     Raises:
         DataError: with file, point, name and value.
     """
     from apu_casadi.core.errors import DataError
-    from apu_casadi.gaspath.gasgenerator import GasGenerator
-    from estimators.apu.recordings.plausible import PLAUSIBLE
+    from estimators.apu.recordings.plausible import plausible_for
 
-    units = {s.name: s.unit for s in (*GasGenerator.Y, *GasGenerator.U)}
+    units, plausible = {s.name: s.unit for s in (*gg.Y, *gg.U)}, plausible_for(gg)
     for p in points:
         values = {**p.fixed, **p.ambient, **{n: v for n, (v, _) in p.measured.items()}}
         for name, value in values.items():
-            low, high = PLAUSIBLE.get(name, (value, value))
+            low, high = plausible.get(name, (value, value))
             if not low <= value <= high:
                 raise DataError(
                     f"{path}: point {p.name!r}: {name} = {value:.6g} {units.get(name, '')} is not "
@@ -165,11 +169,11 @@ def in_use(gg: GasGenerator, names: Sequence[str]) -> dict[str, float]:
     return {f"{s}.{f}": getattr(getattr(gg, s).calibration, f) for s, _, f in parts}
 
 
-def text(result: CalibrationResult, now: Mapping[str, float]) -> str:
+def text(result: CalibrationResult, now: Mapping[str, float], where: str = "in the code") -> str:
     """Return the result as text, with the values of the engine before beside them."""
     std = result.std
     width = max(len(n) for n in result.names)
-    lines = [f"{'number':<{width}}  {'value':>12}  {'std. dev.':>10}  {'in the code':>12}"]
+    lines = [f"{'number':<{width}}  {'value':>12}  {'std. dev.':>10}  {where:>12}"]
     lines += [
         f"{n:<{width}}  {result.values[n]:12.8f}  {std[n]:10.2e}  {now[n]:12.8f}"
         for n in result.names

@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     report |= {"apu_casadi_version": ds.attrs["apu_casadi_version"], "reasons": _told(ds, "reason")}
     report |= {"warnings": _told(ds, "warnings"), "file": str(Path(args.out) / campaigns.DATASET)}
     if args.json:
-        jsontext.show(report)
+        jsontext.show(report | given.own(args) | given.assumed(args))
     else:
         _print(report)
     return 0

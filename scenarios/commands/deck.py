@@ -10,6 +10,7 @@ Points that do not exist, or lie beyond a limit, are NaN; ``status`` says why.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from pathlib import Path
@@ -26,7 +27,7 @@ OPTIONS = f"""
 --altitude AXIS =0:12000:7 | m
 --mach AXIS =0:0.8:5       | flight Mach number
 --disa AXIS ={DEFAULT_DAY["dT_isa"]:g} | ISA deviation, K (default %(default)s)
---power AXIS =0:500e3:11   | shaft power, W
+--power AXIS               | shaft power, W (default: 11 values up to design power, 0:500e3:11)
 --outputs A,B              | outputs to keep (default: all)
 {given.UNIT}
 --out FILE =deck.nc        | netCDF file
@@ -45,6 +46,10 @@ def run(args: argparse.Namespace) -> int:
 
     usage.count("--threads", args.threads, most=1024)
     options = {"altitude": "altitude", "Mach": "mach", "dT_isa": "disa", "PW": "power"}
+    engine = given.engine_file(args, given.LIMITED)
+    gg = engine.unit.gas_generator
+    if args.power is None:
+        args.power = f"0:{gg.rated_power:g}:11"
     axes: dict[str, Any] = {n: _axis(f"--{o}", getattr(args, o)) for n, o in options.items()}
     points = math.prod(len(v) for v in axes.values())
     if points > LARGEST:
@@ -54,11 +59,12 @@ def run(args: argparse.Namespace) -> int:
     files.folder(Path(args.out).parent)
     keep = None if args.outputs is None else given.names(args.outputs)
     progress.tell(f"solving {points} points", quiet=args.json)
-    gg = given.engine(args)
     t = time.perf_counter()
-    deck = performance_deck(gg, **axes, outputs=keep, n_threads=args.threads)
+    how: dict[str, Any] = {"outputs": keep, "n_threads": args.threads, "limits": engine.limits}
+    deck = performance_deck(gg, **axes, **how)
     t = time.perf_counter() - t
     deck.attrs |= {"apu_casadi_version": installed(), **given.own(args)}
+    deck.attrs |= {k: json.dumps(v, ensure_ascii=False) for k, v in given.assumed(args).items()}
     results.save(deck, args.out)
     status = deck["status"].values
     counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}

@@ -6,9 +6,9 @@ What a command assumed, it prints; the defaults of the day are those of
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.errors import ParameterError
@@ -21,7 +21,14 @@ if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.machine.loads.load import Load
     from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.enginefile import Engine
     from scenarios.schema import Scenario
+
+TABLES = ("gas_generator", "compressor_map", "turbine_map")
+"""Parts of a unit that a gas generator is made of; ``LIMITED`` with the limits of its points."""
+LIMITED = (*TABLES, "limits")
+MACHINE = ("machine", "exciter", "generator")
+"""Those of a generator."""
 
 _FLAGS = {"altitude": "--altitude M", "Mach": "--mach MA", "dT_isa": "--disa K"}
 _FLAGS |= {"war": "--humidity --war RATIO"}
@@ -30,7 +37,8 @@ PARTS = """
 --with FILE ... >extensions | a Python file of your own that registers loads, faults, sensors, ...
 """
 UNIT = f"""{PARTS.rstrip()}
---engine FILE | another engine: its design data and maps (default: the paper's)
+--engine FILE | another unit: its file, or the name of one that comes with the package (apu list);
+              | what it does not give is the default unit's and is printed as assumed
 """
 
 
@@ -91,29 +99,67 @@ def parts(args: Namespace) -> None:
         load_parts(args.extensions)
 
 
-def engine(args: Namespace) -> GasGenerator:
+def engine_file(args: Namespace, parts_of_it: Sequence[str] | None = None) -> Engine:
+    """Return the unit of ``--engine``, else the paper's, and tell what is assumed of some parts.
+
+    Args:
+        args: the command's.
+        parts_of_it: those that the command uses, as in :mod:`apu_casadi.unit.enginefile`; None is
+            all of them.
+    """
+    from scenarios import registry
+
+    parts(args)
+    found = registry.engine_file(args.engine)
+    rows = [a._asdict() for a in found.assumed_for(parts_of_it)] if args.engine else []
+    tell(args, args.engine, rows)
+    return found
+
+
+def tell(args: Namespace, engine: str | None, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print once what an engine's file leaves to the default unit; keep it for :func:`assumed`."""
+    if not rows or getattr(args, "assumed", None):
+        return
+    args.assumed = list(rows)
+    if getattr(args, "json", False):
+        return
+    width = max(len(str(r["name"])) for r in rows)
+    print(f"assumed, since {engine} does not give it:", file=sys.stderr)
+    for r in rows:
+        value = f"{r['value']:.6g}" if isinstance(r["value"], float) else r["value"]
+        unit = "" if r["unit"] == "1" else f" {r['unit']}"
+        print(f"  {r['name']:<{width}} {value}{unit} ({r['source']})", file=sys.stderr)
+
+
+def engine(args: Namespace, parts_of_it: Sequence[str] = TABLES) -> GasGenerator:
     """Return the gas generator that a command is about: of ``--engine``, else the paper's."""
-    from scenarios import registry
-
-    parts(args)
-    return registry.engine_of(args.engine)
+    return engine_file(args, parts_of_it).unit.gas_generator
 
 
-def unit(args: Namespace) -> Apu:
+def unit(args: Namespace, parts_of_it: Sequence[str] | None = None) -> Apu:
     """Return the whole unit with the engine and the governor of the options, else the paper's."""
-    from scenarios import registry
-
-    parts(args)
     law = {} if args.governor is None else {"governor.kind": args.governor}
-    return registry.unit_of(json.dumps(law), args.engine)
+    return engine_file(args, parts_of_it).unit.change(law)
 
 
 def load(args: Namespace) -> Load:
     """Return the load of each generator that ``--load`` describes by the keys of a scenario."""
-    from scenarios.reading import read_load
+    from apu_casadi.core.profiles.profile import Varying
+    from scenarios.reading import PlacedError, read_load
 
     parts(args)
-    return read_load(args.load, "--load")
+    load = read_load(args.load, "--load")
+    if isinstance(load, Varying):
+        raise PlacedError("--load", f"must not change in time here, got {load.label}")
+    return load
+
+
+def power_load(unit: Apu, P: float, power_factor: float = 1.0) -> Load:
+    """Return the load that draws P, W, from the rated voltage of the unit's generators."""
+    from apu_casadi.machine.loads.series import SeriesLoad
+
+    m = unit.generator.machine
+    return SeriesLoad.from_power(P, power_factor, V_rms=m.V_rated_rms, f=m.f_rated)
 
 
 def load_words(load: Load) -> str:
@@ -131,7 +177,15 @@ def scenario(args: Namespace, name: str) -> Scenario:
     s = registry.get(name)
     if args.extensions:
         s = s.change(extensions=(*s.extensions, *args.extensions))
-    return s.change(**own(args))
+    s = s.change(**own(args))
+    tell(args, s.engine, registry.assumed(s))
+    return s
+
+
+def assumed(args: Namespace) -> dict[str, Any]:
+    """Return for JSON what was assumed beside the engine's file: name, value, unit, source."""
+    rows = getattr(args, "assumed", None)
+    return {"assumed_engine": rows} if rows else {}
 
 
 def own(args: Namespace) -> dict[str, str]:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from estimators.information.identifiability import Identifiability, SensorComparison
 
 NAME = "identify"
+_PARTS = (*given.TABLES, *given.MACHINE)
 SWEPT = (0.005, 0.01, 0.02, 0.05, 0.1)  # priors of the printed sweep
 HELP = "tell what can be known of the faults from given sensors"
 OPTIONS = f"""
@@ -76,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     these = sets["these"]
     lines = [*_heading(args, sensors), *_known(these), *_confounded(these)]
     lines += [*_sensors(sets, added), *_power(f), *_swept(f.sweep), *_trials(f.trials)]
-    lines += [*(_ramp(f.ramp) if f.ramp else []), *_electrical(f.electrical)]
+    lines += [*(_ramp(args, f.ramp) if f.ramp else []), *_electrical(f.electrical)]
     print("\n".join(lines))
     if args.figure is not None:
         print(f"\n{args.figure}")
@@ -100,7 +101,7 @@ def _sets(
 
 
 def _engine(args: argparse.Namespace) -> dict[str, GasGenerator]:
-    return {} if args.engine is None else {"gas_generator": given.engine(args)}
+    return {} if args.engine is None else {"gas_generator": given.engine(args, _PARTS)}
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def _found(args: argparse.Namespace) -> Found:
         study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
         study.limiting_noises(first, **how),
         aims,
-        severity_study(),
+        severity_study(generator=given.engine_file(args, _PARTS).unit.generator),
         trials,
         ramp,
     )
@@ -183,10 +184,11 @@ def _report(
         "eta_bias": args.eta_bias / 100,
         "gain_errors": args.gain_errors,
         "sensors": list(sensors),
-        "points": {n: _condition(n) for n in given.names(args.point)},
+        "points": {n: _condition(args, n) for n in given.names(args.point)},
         "trial_seeds": [10_000, 10_000 + args.trials] if args.trials else None,
         "apu_casadi_version": installed(),
         **given.own(args),
+        **given.assumed(args),
         "sentences": these.sentences(),
         "rank": these.rank,
         "rank_in_noise": these.rank_in_noise,
@@ -238,22 +240,22 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
         f"gain errors: {gains};",
         f"true speed and fuel flow unknown; efficiency behind PW known to {args.eta_bias:g} %; "
         "noise: estimators.apu.sensors.",
-        *(f"{n}: {_condition_words(n)}; healthy engine" for n in given.names(args.point)),
+        *(f"{n}: {_condition_words(args, n)}; healthy engine" for n in given.names(args.point)),
         given.program(args)
         + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
     ]
 
 
-def _condition_words(point: str) -> str:
-    c = _condition(point)
+def _condition_words(args: argparse.Namespace, point: str) -> str:
+    c = _condition(args, point)
     return f"shaft power {c['PW'] / 1e3:g} kW, {day_words(c['ambient'])}"
 
 
-def _condition(point: str) -> dict[str, Any]:
+def _condition(args: argparse.Namespace, point: str) -> dict[str, Any]:
     """Shaft power and all ambient conditions of a named point."""
-    from estimators.apu.identify import POINTS
+    from estimators.apu.identify import condition
 
-    at = POINTS[point]
+    at = condition(point, given.engine(args, _PARTS))
     return {"PW": at["PW"], "ambient": {n: at.get(n, v) for n, v in DEFAULT_DAY.items()}}
 
 
@@ -371,10 +373,12 @@ def _trials(trials: dict[str, Trials]) -> list[str]:
     return lines
 
 
-def _ramp(ramp: dict[str, Identifiability]) -> list[str]:
+def _ramp(args: argparse.Namespace, ramp: dict[str, Identifiability]) -> list[str]:
+    ends = (f"{_condition(args, n)['PW'] / 1e3:g}" for n in ("partload", "design"))
     lines = [
         "",
-        "Load ramp of 5 s, 222 to 500 kW on the ground: bound on 1 sigma, % (without prior)",
+        f"Load ramp of 5 s, {' to '.join(ends)} kW on the ground: bound on 1 sigma, % "
+        "(without prior)",
         "(white noise only: PW 1 % from sample to sample, no efficiency bias, no gain errors)",
     ]
     for label, r in ramp.items():

@@ -26,7 +26,7 @@ NAME = "linearise"
 HELP = "print and draw the eigenvalues at a steady point"
 OPTIONS = f"""
 --model {{gas,generator,joint}} =joint | default %(default)s
---power float KW =225.0 | load of each generator at 230 V (default %(default)s)
+--power float KW     | load of each generator at rated voltage (default: its rated power, 225)
 --power-factor float PF =1.0 | default 1
 --constant-power     | a load that holds its power
 --load TABLE part    | another load, by the keys of a scenario:
@@ -43,7 +43,10 @@ def run(args: argparse.Namespace) -> int:
     """Trim, linearise, print and draw."""
     from apu_casadi.unit.events import Ambient
 
-    unit, load = given.unit(args), _load(args)
+    unit = given.unit(args)
+    if args.power is None:
+        args.power = unit.generator.machine.P_rated / 1e3
+    load = _load(args, unit)
     model = linear_model(args.model, unit, load, Ambient(**given.ambient_of(args)))
     path = None
     if not args.no_figures:
@@ -51,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         from scenarios import registry
         from scenarios.figures.eigenplot import plot_eigenvalues
 
-        label = f"{_words(args, load)} each, {day_words(given.ambient_of(args))}"
+        label = f"{_words(args, load, unit)} each, {day_words(given.ambient_of(args))}"
         path = registry.prepare(args.out) / "eigenvalues.png"
         note = f"Load {label}; healthy; {given.program(args)}."
         files.save_figure(plot_eigenvalues({label: model}, note), path)
@@ -62,13 +65,14 @@ def run(args: argparse.Namespace) -> int:
             "load": args.load or _asked(args),
             "apu_casadi_version": installed(),
             **given.own(args),
+            **given.assumed(args),
         }
         jsontext.show(report(model) | told)
         return 0
     print(table(model))
     if args.model != "generator":
         print(f"\n{given.ambient_line(given.ambient_given(args))}")
-    print(f"load of each generator: {_words(args, load)}; healthy; {given.program(args)}")
+    print(f"load of each generator: {_words(args, load, unit)}; healthy; {given.program(args)}")
     if path is not None:
         print(f"\n{path}")
     return 0
@@ -79,22 +83,21 @@ def _asked(args: argparse.Namespace) -> dict[str, Any]:
     return {"power": 1e3 * args.power, **keys}
 
 
-def _load(args: argparse.Namespace) -> Load:
+def _load(args: argparse.Namespace, unit: Apu) -> Load:
     from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
-    from apu_casadi.machine.loads.series import SeriesLoad
 
     if args.load is not None:
         return given.load(args)
     if args.constant_power:
         return ConstantPowerLoad(1e3 * args.power)
-    return SeriesLoad.from_power(1e3 * args.power, args.power_factor)
+    return given.power_load(unit, 1e3 * args.power, args.power_factor)
 
 
-def _words(args: argparse.Namespace, load: Load) -> str:
+def _words(args: argparse.Namespace, load: Load, unit: Apu) -> str:
     if args.load is not None:
         return given.load_words(load)
     kind = "constant power" if args.constant_power else f"power factor {args.power_factor:g}"
-    return f"{args.power:g} kW at 230 V, {kind}"
+    return f"{args.power:g} kW at {unit.generator.machine.V_rated_rms:g} V, {kind}"
 
 
 def linear_model(model: str, apu: Apu, load: Load, ambient: Ambient) -> LinearModel:

@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     ds = None if args.trajectory is None else results.load(args.trajectory)
     folder = registry.prepare(args.out)
     progress.tell("drawing both maps")
-    gg = given.engine(args)
+    gg = given.engine(args, given.LIMITED)
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
         path = folder / f"{name}.png"

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
     from apu_casadi.machine.loads.load import Load
+    from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.enginefile import Engine
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -86,15 +88,14 @@ def _mode(args: argparse.Namespace) -> str:
     return modes[0]
 
 
-def _limits(texts: list[str]) -> Limits:
-    from apu_casadi.gaspath.steady.steadypoint import Limits
-
-    known = [f.name for f in dataclasses.fields(Limits)]
+def _limits(texts: list[str], engine: Engine) -> Limits:
+    """Return the engine's limits, changed by ``--limit``."""
+    known = [f.name for f in dataclasses.fields(engine.limits)]
     values = given.numbers(texts, "--limit")
     for name in values:
         if name not in known:
             raise SignalError(f"--limit: unknown {name!r} {nearest(name, known)}")
-    return dataclasses.replace(Limits(), **values)
+    return dataclasses.replace(engine.limits, **values)
 
 
 def _fixed(texts: list[str], gg: GasGenerator) -> dict[str, Any]:
@@ -121,7 +122,7 @@ def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, dict[s
         raise SignalError("--load is solved at governed speed; leave --speed out")
     ambient = Ambient(**given.ambient_of(args))
     unit = given.unit(args)
-    joint = unit.steady_state(_load(args), ambient=ambient, **how)
+    joint = unit.steady_state(_load(args, unit), ambient=ambient, **how)
     g = joint.generator
     return joint.gas, {"V_t": g.V_t, "V_ref": g.V_ref, **_scalars(g.y)}
 
@@ -132,7 +133,7 @@ def _alone(
     """Solve the gas generator alone."""
     from apu_casadi.gaspath.steady.trimming import maximum_power, trim_gas_generator
 
-    gg = given.engine(args)
+    gg = given.engine(args, given.LIMITED)
     N = gg.parameters.N if args.speed is None else args.speed * RPM
     how: dict[str, Any] = {"theta": health, "limits": limits, **given.ambient_of(args)}
     if mode == "--max-power":
@@ -147,7 +148,9 @@ def _alone(
 
 
 def _gas(args: argparse.Namespace, mode: str) -> int:
-    health, limits = given.numbers(args.health, "--health"), _limits(args.limit)
+    health = given.numbers(args.health, "--health")
+    used = None if mode == "--load" else given.LIMITED
+    limits = _limits(args.limit, given.engine_file(args, used))
     extra: dict[str, float] = {}
     if mode == "--load":
         point, extra = _joint(args, health=health, limits=limits)
@@ -164,6 +167,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
             "limits": dataclasses.asdict(limits),
             "apu_casadi_version": installed(),
             **given.own(args),
+            **given.assumed(args),
         }
         if point.second is not None:
             report["second"] = point.second.values
@@ -193,13 +197,14 @@ def _second(point: OperatingPoint) -> str:
 
 
 def _generator(args: argparse.Namespace) -> int:
-    unit = given.unit(args)
+    unit = given.unit(args, given.MACHINE)
     w_r = None if args.speed is None else unit.w_r(args.speed * RPM)
-    point = unit.generator.steady_state(_load(args), w_r=w_r, V_t=args.voltage)
+    point = unit.generator.steady_state(_load(args, unit), w_r=w_r, V_t=args.voltage)
     values = {"V_t": point.V_t, "V_ref": point.V_ref, **_scalars(point.y)}
     if args.json:
         report = {"generator": values, "residual": point.residual, "load": _asked(args)}
-        jsontext.show(report | {"apu_casadi_version": installed(), **given.own(args)})
+        report |= {"apu_casadi_version": installed(), **given.own(args), **given.assumed(args)}
+        jsontext.show(report)
         return 0
     print(_table(values, list(values)))
     print(f"\nresidual {point.residual:.1e} 1/s")
@@ -207,12 +212,10 @@ def _generator(args: argparse.Namespace) -> int:
     return 0
 
 
-def _load(args: argparse.Namespace) -> Load:
-    from apu_casadi.machine.loads.series import SeriesLoad
-
+def _load(args: argparse.Namespace, unit: Apu) -> Load:
     if isinstance(args.load, Mapping):
         return given.load(args)
-    return SeriesLoad.from_power(args.load, args.power_factor)
+    return given.power_load(unit, args.load, args.power_factor)
 
 
 def _asked(args: argparse.Namespace) -> Mapping[str, Any] | None:
@@ -226,8 +229,9 @@ def _load_words(args: argparse.Namespace) -> str:
     if args.load is None:
         return ""
     if isinstance(args.load, Mapping):
-        return f"load of each generator: {given.load_words(_load(args))}; "
-    kilowatts = f"{args.load / 1e3:g} kW at 230 V"
+        return f"load of each generator: {given.load_words(given.load(args))}; "
+    rated = given.unit(args).generator.machine.V_rated_rms
+    kilowatts = f"{args.load / 1e3:g} kW at {rated:g} V"
     return f"load of each generator: {kilowatts}, power factor {args.power_factor:g}; "
 
 

@@ -21,7 +21,13 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, MapError
 from apu_casadi.gaspath.maps.mapcheck import Finding
-from apu_casadi.gaspath.maps.mapreading import file_lines, number, one_line, table_of
+from apu_casadi.gaspath.maps.mapreading import (
+    file_lines,
+    number,
+    one_line,
+    table_of,
+    trimmed,
+)
 from apu_casadi.gaspath.maps.maptable import MapTable, fault
 
 _SECTIONS = (
@@ -62,7 +68,7 @@ _NEEDED = {
 }
 
 
-def read_map_gasturb(path: str | Path, *, trim: bool = False, check: bool = True) -> MapTable:
+def read_map_gasturb(path: str | Path, *, trim: bool | None = None, check: bool = True) -> MapTable:
     """Read a map from the GasTurb/GSP text layout that the module's text describes.
 
     The file with a surge line and a pressure ratio table is a compressor, the one with minimum and
@@ -71,10 +77,7 @@ def read_map_gasturb(path: str | Path, *, trim: bool = False, check: bool = True
 
     Args:
         path: the file.
-        trim: many compressor maps of this layout reach PR <= 1 at low speed or near choke, which no
-            operating point of an engine needs and the surface cannot hold.  True leaves out the
-            outermost speed or beta lines, each time the one with the largest share of such points,
-            until none is left, and says so in the table's ``source``; False raises.
+        trim: as in :func:`~apu_casadi.gaspath.maps.mapfiles.read_map`.
         check: as in :func:`~apu_casadi.gaspath.maps.mapfiles.read_map`.
 
     Raises:
@@ -93,18 +96,20 @@ def read_map_gasturb(path: str | Path, *, trim: bool = False, check: bool = True
     surge_W: np.ndarray | None = None
     surge_PR: np.ndarray | None = None
     if kind == "turbine":
-        PR = _turbine_ratio(path, blocks, N, beta, trim)
+        PR = _turbine_ratio(path, blocks, N, beta)
     else:
         ratio, surge = blocks["Pressure Ratio"], blocks["Surge Line"]
         _same_grid(path, flow, ratio)
-        if not trim:
-            _check_values(path, ratio, "PR")
         PR = ratio.array[1:, 1:]
         _check_pair(path, surge)
         surge_W, surge_PR = surge.array[0, 1:], surge.array[1, 1:]
         if surge_W.size and (surge_W[0] <= 0 or surge_PR[0] <= 1):
             surge_W, surge_PR = surge_W[1:], surge_PR[1:]
-    rows, columns, note = _trimmed(N, beta, PR) if trim else (slice(None), slice(None), "")
+    rows, columns, note = trimmed(path, N, beta, PR, trim)
+    if not note:
+        for section in ("Pressure Ratio", "Min Pressure Ratio", "Max Pressure Ratio"):
+            if section in _NEEDED[kind]:
+                _check_values(path, blocks[section], "PR")
     title = re.sub(r"^99\s*", "", head[0]) if head else ""
     n_surge = 0 if surge_W is None else surge_W.size
     told = [f"GasTurb/GSP text file {Path(path).name}", *head[1:], *([note] if note else [])]
@@ -176,15 +181,13 @@ def _kind(path: str | Path, blocks: dict[str, _Block]) -> str:
 
 
 def _turbine_ratio(
-    path: str | Path, blocks: dict[str, _Block], N: np.ndarray, beta: np.ndarray, trim: bool
+    path: str | Path, blocks: dict[str, _Block], N: np.ndarray, beta: np.ndarray
 ) -> np.ndarray:
     """Return PR = min + beta (max - min) on the grid."""
     lo, hi = blocks["Min Pressure Ratio"], blocks["Max Pressure Ratio"]
     for b in (lo, hi):
         _check_pair(path, b)
         _same_axis(path, b, "speeds", b.array[0, 1:], N)
-        if not trim:
-            _check_values(path, b, "PR")
     PR: np.ndarray = lo.array[1, 1:, None] + beta * (hi.array[1, 1:] - lo.array[1, 1:])[:, None]
     return PR
 
@@ -202,21 +205,6 @@ def _place(f: Finding, blocks: dict[str, _Block], first: tuple[int, int], n_surg
     else:
         row, column = 1 + first[0] + max(f.i, 0), 1 + first[1] + max(f.j, 0)
     return f", line {b.where(row, column)}, section {title!r}"
-
-
-def _trimmed(N: np.ndarray, beta: np.ndarray, PR: np.ndarray) -> tuple[slice, slice, str]:
-    """Return the rows and columns to keep so that PR > 1, and a remark on what is left out."""
-    r0, r1, c0, c1 = 0, N.size, 0, beta.size
-    bad = ~(PR > 1)
-    while r0 < r1 and c0 < c1 and bad[r0:r1, c0:c1].any():
-        part = bad[r0:r1, c0:c1]
-        share = [part[0].mean(), part[-1].mean(), part[:, 0].mean(), part[:, -1].mean()]
-        step = np.eye(4, dtype=int)[int(np.argmax(share))]
-        r0, r1, c0, c1 = r0 + step[0], r1 - step[1], c0 + step[2], c1 - step[3]
-    out = [f"N = {v:g}" for v in (*N[:r0], *N[r1:])]
-    out += [f"beta = {v:g}" for v in (*beta[:c0], *beta[c1:])]
-    note = f"left out, since PR <= 1 there: {', '.join(out)}" if out else ""
-    return slice(r0, r1), slice(c0, c1), note
 
 
 def _size(path: str | Path, block: _Block) -> int:

@@ -1,4 +1,4 @@
-"""Component maps as tables, and their files: plain CSV, and the GasTurb/GSP text layout.
+"""Component maps as tables, and their files: plain CSV, and the text layouts of others.
 
 A compressor and a turbine have one form here: relative corrected speed N and an auxiliary
 coordinate beta give corrected flow W, pressure ratio PR (above 1: outlet/inlet in a compressor,
@@ -23,6 +23,8 @@ Columns may stand in any order; empty lines and empty cells at the end of a line
 write them, are ignored.
 
 **GasTurb/GSP.**  See :mod:`apu_casadi.gaspath.maps.gasturbmaps`.
+
+**NPSS.**  See :mod:`apu_casadi.gaspath.maps.npssmaps`.
 """
 
 from __future__ import annotations
@@ -48,19 +50,30 @@ from apu_casadi.gaspath.maps.maptable import (
     MapTable,
     fault,
 )
+from apu_casadi.gaspath.maps.npssmaps import is_npss, read_map_npss
 
-__all__ = ["SHIPPED", "read_map", "read_map_csv", "read_map_gasturb", "shipped", "write_map_csv"]
+__all__ = [
+    "SHIPPED",
+    "read_map",
+    "read_map_csv",
+    "read_map_gasturb",
+    "read_map_npss",
+    "shipped",
+    "write_map_csv",
+]
 
 SHIPPED = ("axi5", "lpt2269")
 
 
-def read_map(path: str | Path, *, trim: bool = False, check: bool = True) -> MapTable:
-    """Read a map file; the layout (CSV or GasTurb/GSP) is told from the content.
+def read_map(path: str | Path, *, trim: bool | None = None, check: bool = True) -> MapTable:
+    """Read a map file; the layout (CSV, GasTurb/GSP or NPSS) is told from the content.
 
     Args:
         path: the file.
-        trim: leave out the edge lines of a GasTurb/GSP map that reach PR <= 1, as in
-            :func:`read_map_gasturb`; without effect on CSV files, whose rows are easily removed.
+        trim: many maps of the text layouts reach PR <= 1 at low speed or near choke.  True leaves
+            out the outermost speed or beta lines, each time the one with the largest share of such
+            points, until none is left, and says so in the table's ``source``; None does so with a
+            warning; False refuses.  Without effect on CSV files, whose rows are easily removed.
         check: False accepts numbers that do not go with their neighbours
             (:mod:`apu_casadi.gaspath.maps.mapcheck`); the table's ``source`` says so.
 
@@ -69,6 +82,13 @@ def read_map(path: str | Path, *, trim: bool = False, check: bool = True) -> Map
         MapError: the numbers are readable but make no map.
     """
     lines = file_lines(path)
+    if is_npss(lines):
+        return read_map_npss(path, trim=trim, check=check)
+    if any("MapData(" in text or "np.array(" in text for text in lines):
+        raise DataError(
+            f"{path}: a Python module; maps as Python arrays, as pyCycle has them, are not read: "
+            "write them as CSV (write_map_csv of a MapTable)"
+        )
     words = [text.strip().lower() for text in lines]
     first = next((w for w in words if w and not w.startswith("#")), "")
     if re.match(r"99(\s|$)", first) or any(section_of(w) for w in words):
@@ -77,8 +97,8 @@ def read_map(path: str | Path, *, trim: bool = False, check: bool = True) -> Map
         return read_map_csv(path, check=check)
     raise DataError(
         f"{path}: neither a CSV map (header {','.join(GRID_COLUMNS)}) nor the GasTurb/GSP layout "
-        f"(title '99 ...', sections such as 'Mass Flow'); see "
-        "apu_casadi.gaspath.maps.mapfiles for both"
+        f"(title '99 ...', sections such as 'Mass Flow') nor the NPSS layout ('Table TB_Wc(...) "
+        "{'); see apu_casadi.gaspath.maps.mapfiles for them"
     )
 
 

@@ -1,14 +1,21 @@
-"""What the readers of map files share: lines, numbers, tables with errors that name the place."""
+"""What the readers of map files share: lines, numbers, tables with errors that name the place.
+
+Many maps reach PR <= 1 at low speed or near choke, which no operating point of an engine needs and
+the surface cannot hold: :func:`trimmed` leaves out the outermost lines.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from apu_casadi.core.errors import DataError, MapError
+import numpy as np
+
+from apu_casadi.core.errors import ApuWarning, DataError, MapError
 from apu_casadi.gaspath.maps.mapcheck import Finding
 from apu_casadi.gaspath.maps.maptable import MapTable, found_text
 
@@ -76,3 +83,31 @@ def table_of(
 def one_line(text: str) -> str:
     """Return a text without line breaks and repeated blanks."""
     return " ".join(text.split())
+
+
+def trimmed(
+    path: str | Path, N: np.ndarray, beta: np.ndarray, PR: np.ndarray, trim: bool | None
+) -> tuple[slice, slice, str]:
+    """Return the rows and columns to keep so that PR > 1, and a remark on what is left out.
+
+    With ``trim`` None a warning tells what is left out; nothing is where that would be more than
+    half of the table, since then a cell is wrong and not the map's end.  False keeps all.
+    """
+    r0, r1, c0, c1 = 0, N.size, 0, beta.size
+    everything = slice(r0, r1), slice(c0, c1), ""
+    if trim is False:
+        return everything
+    bad = ~(PR > 1)
+    while r0 < r1 and c0 < c1 and bad[r0:r1, c0:c1].any():
+        part = bad[r0:r1, c0:c1]
+        share = [part[0].mean(), part[-1].mean(), part[:, 0].mean(), part[:, -1].mean()]
+        step = np.eye(4, dtype=int)[int(np.argmax(share))]
+        r0, r1, c0, c1 = r0 + step[0], r1 - step[1], c0 + step[2], c1 - step[3]
+    out = [f"N = {v:g}" for v in (*N[:r0], *N[r1:])]
+    out += [f"beta = {v:g}" for v in (*beta[:c0], *beta[c1:])]
+    if not out or (trim is None and 2 * (r1 - r0) * (c1 - c0) < PR.size):
+        return everything
+    note = f"left out, since PR <= 1 there: {', '.join(out)}"
+    if trim is None:
+        warnings.warn(ApuWarning(f"{path}: {note}"), stacklevel=4)
+    return slice(r0, r1), slice(c0, c1), note

@@ -179,7 +179,7 @@ def fault(column: str, value: float) -> str | None:
     if column in ("PR", "PR_surge") and value <= 1:
         return (
             "pressure ratio must be > 1: remove the beta or speed lines that reach it "
-            "(read_map with trim=True does so for the GasTurb/GSP layout)"
+            "(read_map with trim=True does so for the text layouts)"
         )
     if column == "eta" and not 0 < value <= 1:
         return "efficiency must be in (0, 1], as a fraction, not per cent"

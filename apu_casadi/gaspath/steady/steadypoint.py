@@ -50,6 +50,10 @@ class LoadLaw:
             raise SignalError(f"load law needs finite numbers and N_ref > 0, got {self!r}")
 
 
+LIMIT_UNITS = {"T4_max": "K", "T5_max": "K", "Wf_min": "kg/s"}
+"""Units of the limits that are no ratios."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """Beyond these a solved point is refused.

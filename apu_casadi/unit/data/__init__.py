@@ -1,0 +1,1 @@
+"""Units that come with the package, each an engine file with the source of every number."""
