@@ -89,7 +89,9 @@ def test_description(asked, name, version):
     if name != "generator":
         assert tunable[:4] == list(HEALTH_FACTORS)
     if name != "gas_generator":
-        assert "mu" in tunable and "R_a" in [v.signal.name for v in model.of("input")]
+        prefix = "generator2." if name == "apu" else ""
+        inputs = [v.signal.name for v in model.of("input")]
+        assert f"{prefix}mu" in tunable and f"{prefix}R_a" in inputs
 
 
 def test_units_in_base_units():
@@ -324,14 +326,43 @@ def test_gas_generator_by_model_exchange(built, asked, tmp_path):
 
 # ------------------------------------------------------------------------------ the unit
 
-JOINT = ["N", "T4", "PW", "Wf", "P_total", "P_e", "P_loss_fault", "SM"]
+JOINT = ["N", "T4", "PW", "Wf", "SM"]
+WAVES = ["v_a", "i_a", "i_b", "T_e"]
+MEANS = ["P_total", "P_e", "P_loss_fault"]
 EVENTS = [
     LoadChange(0.2, LESS),
     HealthChange(0.4, {"f_eta_c": 0.98}),
     FaultChange(0.61, DEFAULT_FAULT),
     FaultChange(1.0, None),
 ]
-CHANGES = [(0.2, LESS_R), (0.4, {"f_eta_c": 0.98}), (0.61, {"mu": 0.05}), (1.0, {"mu": 0.0})]
+
+
+def of_each(values, which=(1, 2)):
+    """Values by name for generators of these numbers."""
+    return {f"generator{k}.{n}": v for k in which for n, v in values.items()}
+
+
+CHANGES = [
+    (0.2, of_each(LESS_R)),
+    (0.4, {"f_eta_c": 0.98}),
+    (0.61, of_each({"mu": 0.05})),
+    (1.0, of_each({"mu": 0.0})),
+]
+
+
+def compared(path, folder, ds, changes, dt=0.1):
+    """Compare the FMU's co-simulation with a joint run, generator by generator."""
+    n = ds.sizes.get("generator", 1)
+    own = [f"generator{k}.{q}" for k in range(1, n + 1) for q in (*MEANS, *WAVES)]
+    t, v = cosimulate(path, folder, t_end=1.2, names=[*JOINT, *own], changes=changes, dt=dt)
+    at = [int(np.abs(ds["time"].values - i).argmin()) for i in t]
+    at_w = [int(np.abs(ds["time_w"].values - i).argmin()) for i in t]
+    close(v[: len(JOINT)], JOINT, ds, at)
+    rows = v[len(JOINT) :].reshape(n, -1, t.size)
+    for k in range(n):
+        one = ds.isel(generator=k) if "generator" in ds.dims else ds
+        close(rows[k][: len(MEANS)], MEANS, one, at)
+        close(rows[k][len(MEANS) :, 1:], WAVES, one, at_w[1:])
 
 
 @needs_compiler
@@ -339,16 +370,24 @@ CHANGES = [(0.2, LESS_R), (0.4, {"f_eta_c": 0.98}), (0.61, {"mu": 0.05}), (1.0, 
 @VERSIONS
 def test_unit_by_cosimulation(built, asked, tmp_path, version):
     """The paper's exchange inside: load step, health step, fault, and its end."""
-    names = [*JOINT, "v_a", "i_a", "i_b", "T_e"]
-    t, v = cosimulate(
-        built("apu", version), tmp_path, t_end=1.2, names=names, changes=CHANGES, dt=0.1
-    )
     how = {"solver": "cvodes", "rtol": 1e-10, "atol": 1e-12, "waveform_dt": 1e-3}
     ds = simulate_joint(asked.unit, duration=1.2, load=LOAD, events=EVENTS, **how)
-    rows = [int(np.abs(ds["time"].values - i).argmin()) for i in t]
-    close(v[: len(JOINT)], JOINT, ds, rows)
-    waves = [int(np.abs(ds["time_w"].values - i).argmin()) for i in t]
-    close(v[len(JOINT) :, 1:], names[len(JOINT) :], ds, waves[1:])
+    compared(built("apu", version), tmp_path, ds, CHANGES)
+
+
+@needs_compiler
+@pytest.mark.ci
+def test_different_generators(asked, tmp_path):
+    """Another machine with another gear and load beside the first; a fault in it alone."""
+    unit = asked.unit.change({"generator2.machine.r_s": 0.006, "generator2.coupling.gear": 3.1})
+    loads = [LOAD, SeriesLoad.from_power(100e3, 0.85)]
+    mine = Asked(unit, loads, None, asked.ambient)
+    path = fmu.build(fmu_model("apu", mine), tmp_path / "two.fmu")
+    events = [LoadChange(0.2, LESS, generator=1), FaultChange(0.61, DEFAULT_FAULT, generator=2)]
+    changes = [(0.2, of_each(LESS_R, [1])), (0.61, of_each({"mu": 0.05}, [2]))]
+    how = {"solver": "cvodes", "rtol": 1e-10, "atol": 1e-12, "waveform_dt": 1e-3}
+    ds = simulate_joint(unit, duration=1.2, load=loads, events=events, **how)
+    compared(path, tmp_path, ds, changes)
 
 
 @needs_compiler
@@ -360,7 +399,8 @@ def test_unit_by_model_exchange(built, asked, tmp_path):
     )
     names, t = ["N", "T4", "Wf", "SM"], ds["time"].values
     how = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-10, "first_step": 1e-6, "max_step": 1e-4}
-    v = exchanged(built("apu"), tmp_path, instants=t, names=names, changes=[(0.02, LESS_R)], **how)
+    how["changes"] = [(0.02, of_each(LESS_R))]
+    v = exchanged(built("apu"), tmp_path, instants=t, names=names, **how)
     close(v, names, ds)
 
 

@@ -7,7 +7,7 @@ unit's own ones a constant array beside it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,23 +35,35 @@ _EULER = 1e-6  # s; step of the example of a generator's rates
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """What a function is exported for.
+    """What a function or a model is exported for.
 
     Args:
         unit: the unit.
-        load, fault: of each generator, and their kinds choose the equations.
-        ambient: the day of the point that the example starts at.
+        load, fault: of each generator, or a list with one for each; their kinds choose the
+            equations.
+        ambient: the day of the point to start at.
     """
 
     unit: Apu
-    load: Load
-    fault: Fault | None
+    load: Load | Sequence[Load]
+    fault: Fault | Sequence[Fault | None] | None
     ambient: Ambient
+
+    @property
+    def loads(self) -> tuple[Load, ...]:
+        """The load of each generator."""
+        return self.unit.each("load", self.load)
+
+    @property
+    def faults(self) -> tuple[Fault | None, ...]:
+        """The fault of each generator."""
+        return self.unit.each("fault", self.fault)
 
     @derived
     def point(self) -> JointPoint:
-        """The steady point that the example starts at, under a balanced load."""
-        return self.unit.steady_state(self.load.balanced_part, ambient=self.ambient)
+        """The steady point to start at, healthy and under balanced loads."""
+        balanced = [load.balanced_part for load in self.loads]
+        return self.unit.steady_state(balanced, ambient=self.ambient)
 
     @property
     def gas(self) -> OperatingPoint:
@@ -180,10 +192,11 @@ def _of_generator(
     asked: Asked, name: str, doc: str, outputs: Outputs, which: str = "", **how: Any
 ) -> Exported:
     gen, at = asked.unit.generator, asked.point.generator
-    ss = gen.variant(asked.load, asked.fault)
+    load, fault = asked.loads[0], asked.faults[0]
+    ss = gen.variant(load, fault)
     whole = ss.family or ss
-    theta = gen.fault_vector(asked.load, asked.fault)
-    u = gen.inputs(asked.load, w_r=float(at.u[at.ss.u.index("w_r")]), V_ref=at.V_ref)
+    theta = gen.fault_vector(load, fault)
+    u = gen.inputs(load, w_r=float(at.u[at.ss.u.index("w_r")]), V_ref=at.V_ref)
     x = gen.transfer(at.x, at.ss, ss, u=at.u, theta=(), u_target=u, theta_target=theta)
     numbers = Signals(list(whole.theta)[len(ss.theta) :])
     known = {
@@ -204,7 +217,7 @@ def _of_generator(
 @_function("generator.f")
 def _gen_f(asked: Asked) -> Exported:
     doc = "right-hand side dx/dt with the algebraic unknowns eliminated."
-    rate = ("xdot", "x", _EULER * asked.load.fineness)
+    rate = ("xdot", "x", _EULER * asked.loads[0].fineness)
     return _of_generator(asked, "f", doc, lambda ss: [Vector("xdot", _rates(ss.x))], rate=rate)
 
 

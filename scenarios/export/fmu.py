@@ -18,15 +18,17 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.backend import find_compiler
 from apu_casadi.core.errors import BackendError, ParameterError
+from apu_casadi.unit.stepmeans import MEANS
 from scenarios.export.ccode import generated, number, work
 from scenarios.export.description import described, source_names, text_of
-from scenarios.export.fmumodel import CONSTANTS, FmuModel
+from scenarios.export.fmumodel import CONSTANTS, PARTS, FmuModel, Machine
 
 VERSIONS = (3, 2)
 _COMMON = ("unit.c", "unit.h")
 _FLAGS = ["-std=c99", "-O1", "-fPIC", "-shared", "-fvisibility=hidden", "-fno-math-errno"]
 _TIMEOUT = 900.0  # s
-_ABSENT = ["N_Z", "N_MEANS", "M_TH", "M_U", "M_X"]  # sizes of arrays that C wants not to be empty
+# sizes of arrays that C wants not to be empty
+_ABSENT = ["N_Z", "N_MEANS", "N_GENERATORS", "M_TH", "M_U"]
 
 
 def platform_folder(fmi: int) -> tuple[str, str]:
@@ -48,7 +50,7 @@ def sources(model: FmuModel, fmi: int, token: str) -> dict[str, str]:
     texts = {n: (folder / n).read_text(encoding="utf-8") for n in names}
     head, arrays = _model_h(model, token)
     code = generated("model", model.functions)
-    return {**texts, "model.h": head, "model.c": f'{code}\n#include "model.h"\n\n{arrays}'}
+    return {**texts, "model.h": head, "model.c": f'{code}\n#include "unit.h"\n\n{arrays}'}
 
 
 def _model_h(model: FmuModel, token: str) -> tuple[str, str]:
@@ -71,7 +73,28 @@ def _model_h(model: FmuModel, token: str) -> tuple[str, str]:
     lines += [f"#define {n} {v}" for n, v in constants.items()]
     lines += [f"extern {head};" for head, _ in made]
     lines += [f"int {f.name()}{takes}" for f in model.functions]
-    return "\n".join([*lines, "#endif", ""]), "\n".join(f"{h} =\n{v};" for h, v in made) + "\n"
+    defined = [*(f"{h} =\n{v};" for h, v in made), *_machines(model.machines)]
+    return "\n".join([*lines, "#endif", ""]), "\n".join([*defined, ""])
+
+
+def _machines(machines: Sequence[Machine]) -> list[str]:
+    """The table of generators, and its arrays."""
+    lines, rows = [], []
+    for k, m in enumerate(machines):
+        ss, own = m.faulty, m.healthy.x.names
+        parts: dict[str, Any] = {"healthy": ss.x.indices(own), "reset": m.new_states}
+        parts |= {"means": ss.y.indices(MEANS)}
+        arrays = {n: np.array(v, dtype=int) for n, v in parts.items()}
+        arrays |= {"nominal": ss.x.nominals, "numbers": np.array(ss.numbers)}
+        made = (_array(f"{n}_{k}", a) for n, a in arrays.items())
+        lines += [f"static {head} =\n{values};" for head, values in made]
+        both = {n: f"{{healthy{m.structure}_{n}, faulty{m.structure}_{n}}}" for n in PARTS}
+        row = both | {"size": f"{{{len(own)}, {len(ss.x)}}}"} | {n: f"{n}_{k}" for n in arrays}
+        counts = {"n_reset": len(m.new_states), "n_numbers": len(ss.numbers)}
+        counts |= {"n_inputs": len(m.inputs), "n_fault": len(m.faults), "n_outputs": len(ss.y)}
+        counts |= {"axis": m.axis, "angle": ss.x.index("theta_e"), "like": m.like, **m.at}
+        rows.append("{" + ",\n".join(f".{n} = {v}" for n, v in (row | counts).items()) + "}")
+    return [*lines, "const Equations MACHINES[] = {", ",\n".join(rows), "};"] if rows else []
 
 
 def _array(name: str, a: np.ndarray) -> tuple[str, str]:
@@ -83,9 +106,8 @@ def _array(name: str, a: np.ndarray) -> tuple[str, str]:
         if part.ndim > 1:
             return "{" + ",\n".join(braced(row) for row in part) + "}"
         values = [str(v) if whole else number(max(-1e300, min(1e300, v))) for v in part.tolist()]
-        return (
-            "{" + ",\n".join(", ".join(values[i : i + 4]) for i in range(0, len(values), 4)) + "}"
-        )
+        rows = (", ".join(values[i : i + 4]) for i in range(0, len(values), 4))
+        return "{" + ",\n".join(rows) + "}"
 
     return f"const {kind} {name}{shape}", braced(a if a.size else np.zeros(1, a.dtype))
 

@@ -24,6 +24,7 @@ from apu_casadi.gaspath.health import RUN_RANGE
 from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generatormodel import NOISE, GeneratorModel
+from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.stepmeans import MEANS
 from scenarios.export.cfunctions import Asked
@@ -67,6 +68,7 @@ class FmuModel:
         sources: its files beside those that all have.
         sizes: constants by name, whole numbers.
         arrays: constants by name, numbers.
+        machines: its generators.
     """
 
     name: str
@@ -76,6 +78,7 @@ class FmuModel:
     sources: tuple[str, ...]
     sizes: dict[str, int]
     arrays: dict[str, Any]
+    machines: tuple[Machine, ...] = ()
 
     def of(self, role: str) -> list[Variable]:
         """Return the variables of a role; a rate stands for each state."""
@@ -132,19 +135,25 @@ def _finished(
     outputs: Iterable[Signal],
     functions: Iterable[ca.Function],
     sources: str,
-    parts: Iterable[tuple[Mapping[str, int], Mapping[str, Any]]],
+    sizes: Mapping[str, int],
+    arrays: Mapping[str, Any],
+    machines: Sequence[Machine] = (),
 ) -> FmuModel:
     """Put a model together; what an input or a state tells already is no output."""
     taken, signals = {v.signal.name for v in given}, list(outputs)
     kept = [i for i, s in enumerate(signals) if s.name not in taken]
-    shown = _variables("output", (signals[i] for i in kept))
-    sizes: dict[str, int] = {}
-    arrays: dict[str, Any] = {"Y_OF": _places(kept)}
-    for more, numbers in parts:
-        sizes |= more
-        arrays |= numbers
-    whole = (*given, *shown)
-    return FmuModel(name, doc, whole, tuple(functions), tuple(sources.split()), sizes, arrays)
+    whole = (*given, *_variables("output", (signals[i] for i in kept)))
+    more, numbers = _of_machines(machines) if machines else ({}, {})
+    return FmuModel(
+        name,
+        doc,
+        whole,
+        (*functions, *{f.name(): f for m in machines for f in m.functions}.values()),
+        (*sources.split(), *(_MACHINE.split() if machines else ())),
+        {**sizes, **more},
+        {"Y_OF": _places(kept), **arrays, **numbers},
+        tuple(machines),
+    )
 
 
 def _places(indices: Sequence[int]) -> np.ndarray:
@@ -196,7 +205,7 @@ def gas_generator(asked: Asked) -> FmuModel:
         *_variables("state", gg.X, gas.x),
     ]
     doc = "Gas generator of an all-electric auxiliary power unit."
-    made = _gas_functions(gg), "gas_generator.c gas.c gas.h", [_gas_numbers(gg)]
+    made = _gas_functions(gg), "gas_generator.c gas.c gas.h", *_gas_numbers(gg)
     return _finished("gas_generator", doc, given, gg.Y, *made)
 
 
@@ -204,67 +213,106 @@ def gas_generator(asked: Asked) -> FmuModel:
 
 
 @dataclass(frozen=True, eq=False)
-class _Machine:
-    """A generator with one fault: its variables, and the numbers that the C code takes.
+class Machine:
+    """A generator with one fault: its variables, equations, and their places among all.
 
     Args:
+        structure: number of its equations, equal for generators of equal ones.
+        like: number, from 0, of the first generator with the same equations and numbers.
         healthy, faulty: its two sets of equations.
         states, inputs, faults: variables; inputs without the speed.
+        outputs: of the faulty equations.
+        at: first of its inputs, parameters, states and outputs, by ``u``, ``p``, ``x``, ``y``.
     """
 
+    structure: int
+    like: int
     healthy: GeneratorModel
     faulty: GeneratorModel
     states: list[Variable]
     inputs: list[Variable]
     faults: list[Variable]
+    outputs: list[Signal]
+    at: dict[str, int]
 
     @property
     def functions(self) -> list[ca.Function]:
         """Those of both sets of equations."""
-        return [*_parts("healthy", self.healthy), *_parts("faulty", self.faulty)]
+        both = (("healthy", self.healthy), ("faulty", self.faulty))
+        return [f for name, ss in both for f in _parts(f"{name}{self.structure}", ss)]
 
     @property
-    def numbers(self) -> tuple[dict[str, int], dict[str, Any]]:
-        """Sizes, and arrays by name."""
-        ss, own, method = self.faulty, self.healthy.x.names, radau(STAGES)
-        stage = [i for i, n in enumerate(ss.x.names) if n not in own]
-        n, names = len(ss.numbers), ss.theta.names
-        theta = max(len(s.shared.theta) for s in (self.healthy, ss))
-        sizes = {"M_X": len(ss.x), "M_XH": len(own), "M_U": len(ss.u), "M_Y": len(ss.y)}
-        sizes |= {"M_TH": theta, "M_FAULT": len(names), "N_MACHINE": n, "M_GIVEN": len(names) + n}
-        sizes |= {"M_AXIS": names.index(_AXIS) if _AXIS in names else -1, "N_RESET": len(stage)}
-        sizes |= {"M_INPUTS": len(self.inputs), "M_ANGLE": ss.x.index("theta_e")}
-        sizes |= {"N_MEANS": len(MEANS), "R_STAGES": STAGES, "R_PAIRS": STAGES // 2}
-        arrays: dict[str, Any] = {"M_NUMBERS": ss.numbers, "M_NOMINAL": ss.x.nominals}
-        arrays |= {"M_AT": _places(ss.x.indices(own)), "RESET": _places(stage)}
-        arrays |= {"MEAN_OF": _places(ss.y.indices(MEANS))}
-        arrays |= {"R_INVERSE": method.inverse, "R_WEIGHTS": method.weights}
-        arrays |= {"R_ERROR": method.error, "R_RE": method.values.real, "R_IM": method.values.imag}
-        arrays |= {"R_FROM_RE": method.of.real, "R_FROM_IM": method.of.imag}
-        return sizes, arrays | {"R_TO_RE": method.to.real, "R_TO_IM": method.to.imag}
+    def new_states(self) -> list[int]:
+        """Places of the states that the fault brings."""
+        return [i for i, n in enumerate(self.faulty.x.names) if n not in self.healthy.x]
+
+    @property
+    def axis(self) -> int:
+        """Place of the angle that turns the fault among its parameters; -1 without one."""
+        names = self.faulty.theta.names
+        return names.index(_AXIS) if _AXIS in names else -1
 
 
-def _machine(asked: Asked) -> _Machine:
-    gen, load, at = asked.unit.generator, asked.load, asked.point.generator
-    fault = asked.fault or DEFAULT_FAULT
+def _of_machines(machines: Sequence[Machine]) -> tuple[dict[str, int], dict[str, Any]]:
+    """Sizes that hold every generator, and the integrator's numbers."""
+    every = [ss for m in machines for ss in (m.healthy, m.faulty)]
+    sizes = {"N_GENERATORS": len(machines), "N_MEANS": len(MEANS)}
+    sizes |= {f"M_{k.upper()}": max(len(getattr(ss, k)) for ss in every) for k in "xuy"}
+    sizes["M_TH"] = max(len(ss.shared.theta) for ss in every)
+    sizes["M_GIVEN"] = max(len(ss.theta) + len(ss.numbers) for ss in every)
+    sizes |= {"R_STAGES": STAGES, "R_PAIRS": STAGES // 2}
+    m = radau(STAGES)
+    arrays = {"R_INVERSE": m.inverse, "R_WEIGHTS": m.weights, "R_ERROR": m.error}
+    arrays |= {"R_RE": m.values.real, "R_IM": m.values.imag, "R_FROM_RE": m.of.real}
+    arrays |= {"R_FROM_IM": m.of.imag, "R_TO_RE": m.to.real, "R_TO_IM": m.to.imag}
+    return sizes, arrays
+
+
+def _machines(asked: Asked, count: int, before: Mapping[str, int], named: bool) -> list[Machine]:
+    """Return the first generators of a unit; ``before``: variables that come before theirs."""
+    made: list[Machine] = []
+    at = dict(before)
+    for k in range(count):
+        m = _machine(asked, k, f"generator{k + 1}." if named else "", dict(at))
+        equal = (e for e in made if _equations(e) == _equations(m))
+        m = dataclasses.replace(m, structure=next((e.structure for e in equal), k))
+        shaft, mine = asked.unit.machines, (_equations(m), asked.unit.machines[k])
+        like = (i for i, e in enumerate(made) if (_equations(e), shaft[i]) == mine)
+        made.append(dataclasses.replace(m, like=next(like, k)))
+        for name, part in (("u", m.inputs), ("p", m.faults), ("x", m.states), ("y", m.outputs)):
+            at[name] += len(part)
+    return made
+
+
+def _equations(m: Machine) -> tuple[GeneratorModel, GeneratorModel]:
+    return m.healthy.shared, m.faulty.shared
+
+
+def _machine(asked: Asked, k: int, prefix: str, at: dict[str, int]) -> Machine:
+    gen, point, load = asked.unit.generators[k], asked.point.of(k + 1), asked.loads[k]
+    fault = asked.faults[k] or DEFAULT_FAULT
     healthy, faulty = gen.variant(load), gen.variant(load, fault)
     theta = dict(zip(faulty.theta.names, gen.fault_vector(load, fault).tolist(), strict=True))
     severity = _severity(fault, faulty)
-    if asked.fault is None:
+    if asked.faults[k] is None:
         theta[severity] = 0.0
-    u = gen.inputs(load, w_r=float(at.u[at.ss.u.index("w_r")]), V_ref=at.V_ref)
+    w_r = float(point.u[point.ss.u.index("w_r")])
+    u = gen.inputs(load, w_r=w_r, V_ref=point.V_ref)
     now: dict[str, Any] = {"u_target": u, "theta_target": tuple(theta.values())}
-    x = gen.transfer(at.x, at.ss, faulty, u=at.u, theta=(), **now)
-    ranges = {k.name: (k.lo, k.hi) for k in fault.keys if k.name in theta}
+    x = gen.transfer(point.x, point.ss, faulty, u=point.u, theta=(), **now)
+    ranges = {key.name: (key.lo, key.hi) for key in fault.keys if key.name in theta}
     ranges[severity] = 0.0, ranges.get(severity, _ANY)[1]
     n = len(faulty.u) - len(NOISE)
-    return _Machine(
-        healthy,
-        faulty,
-        _variables("state", faulty.x, x),
-        _variables("input", faulty.u[1:n], u[1:n]),
-        _variables("parameter", faulty.theta, theta.values(), ranges),
-    )
+    states = _variables("state", faulty.x, x)
+    inputs = _variables("input", faulty.u[1:n], u[1:n])
+    faults = _variables("parameter", faulty.theta, theta.values(), ranges)
+    x_, u_, p_ = ([_named(v, prefix) for v in part] for part in (states, inputs, faults))
+    outputs = [dataclasses.replace(s, name=prefix + s.name) for s in faulty.y]
+    return Machine(k, k, healthy, faulty, x_, u_, p_, outputs, at)
+
+
+def _named(v: Variable, prefix: str) -> Variable:
+    return v._replace(signal=dataclasses.replace(v.signal, name=prefix + v.signal.name))
 
 
 def _severity(fault: Fault, faulty: GeneratorModel) -> str:
@@ -287,42 +335,45 @@ def _parts(name: str, ss: GeneratorModel) -> list[ca.Function]:
     reduced = family.reduced if isinstance(family, GeneratorModel) else None
     follow = given if reduced is None else reduced[1](given)
     f, g = own.f(x, u, th), own.g(x, u, th)
-    made = {"f": f, "g": g, "jac": ca.densify(ca.jacobian(f, x))}
-    made = {k: ca.Function(f"{name}_{k}", [x, u, th], [e], {"cse": True}) for k, e in made.items()}
-    return [*made.values(), ca.Function(f"{name}_follow", [given], [follow], {"cse": True})]
+    made = dict(zip(PARTS, (f, g, ca.densify(ca.jacobian(f, x)), follow), strict=True))
+    return [
+        ca.Function(f"{name}_{k}", [given] if k == "follow" else [x, u, th], [e], {"cse": True})
+        for k, e in made.items()
+    ]
 
 
+PARTS = ("f", "g", "jacobian", "follow")
+"""Functions of a set of equations: rates, outputs, Jacobian, and what follows from parameters."""
 _MACHINE = "machine.c machine.h radau.c radau.h"
 
 
 @_model
 def generator(asked: Asked) -> FmuModel:
-    """One generator with exciter and load: speed, voltage reference and load as inputs."""
-    m, at = _machine(asked), asked.point.generator
+    """The first generator with exciter and load: speed, voltage reference and load as inputs."""
+    (m,), at = _machines(asked, 1, {"u": 1, "p": 0, "x": 0, "y": 0}, False), asked.point.generator
     speed = _variables("input", [at.ss.u["w_r"]], [at.u[at.ss.u.index("w_r")]])
     given = [*speed, *m.inputs, *m.faults, *m.states]
     doc = "Starter/generator with exciter, load and stator fault."
-    made = m.functions, f"generator.c {_MACHINE}", [m.numbers]
-    return _finished("generator", doc, given, m.faulty.y, *made)
+    return _finished("generator", doc, given, m.outputs, (), "generator.c", {}, {}, [m])
 
 
 # ------------------------------------------------------------------------------ the unit
 
 
-def _link_functions(link: Link, gg: GasGenerator) -> list[ca.Function]:
+def _link_functions(unit: Apu) -> list[ca.Function]:
     """Speed of the generators, fuel and power of the instant, and the exchange step of (1)-(3)."""
-    law, numbers = link.governor, link.numbers
-    N, P, h = ca.MX.sym("N"), ca.MX.sym("P"), ca.MX.sym("h")
-    x, tuned = ca.MX.sym("x", len(law.X)), ca.MX.sym("tuned", 1 + numbers.size - 4)
+    gg, law, n = unit.gas_generator, unit.governor, len(unit.machines)
+    links = [unit.link_of((k,)) for k in range(1, n + 1)]
+    N, P, h, x = (ca.MX.sym(k, m) for k, m in (("N", 1), ("P", n), ("h", 1), ("x", len(law.X))))
     air, z = ca.MX.sym("air", len(AMBIENT)), ca.MX.sym("z", len(gg.z))
-    theta = ca.MX.sym("theta", len(gg.family.theta))
-    first, *rest = ca.vertsplit(tuned)
-    own = link.with_numbers([first, *numbers[1:4].tolist(), *rest])
+    theta, tuned = ca.MX.sym("theta", len(gg.family.theta)), ca.MX.sym("tuned", len(_tuned(unit)))
+    N_ref, *values = ca.vertsplit(tuned)
+    own = Link(law.symbolic(**dict(zip(law.numbers, values, strict=True))), N_ref)
     now = own.fuel(N, ca.vertsplit(x))
-    feed = ca.vertcat(now.Wf, own.PW(P))
+    PW = sum((a.PW(p) for a, p in zip(links, ca.vertsplit(P), strict=True)), ca.MX(0))
 
     def machine(_N: Any, _slope: Any) -> tuple[Any, Any]:
-        return P, None
+        return PW, None
 
     def engine(Wf: Any, PW: Any) -> tuple[Any, Any]:
         N1, *made = gg.family.step(N, ca.vertcat(Wf, PW, air), theta, h, z)
@@ -331,41 +382,52 @@ def _link_functions(link: Link, gg: GasGenerator) -> list[ca.Function]:
     done = governed_step(own, PAPER, machine, engine, N=N, x=ca.vertsplit(x), h=h)
     N1, y, z1, residual = done.engine
     after = [N1, ca.vertcat(*done.governor), y, z1, residual]
+    feed, rates = ca.vertcat(now.Wf, PW), ca.vertcat(*now.rates)
     return [
-        ca.Function("link_speed", [N, tuned], [own.w_r(N)]),
-        ca.Function("link_now", [N, x, P, tuned], [feed, ca.vertcat(*now.rates)]),
+        ca.Function("link_speed", [N], [ca.vertcat(*(a.w_r(N) for a in links))]),
+        ca.Function("link_now", [N, x, P, tuned], [feed, rates]),
         ca.Function("exchange", [N, x, P, air, theta, tuned, h, z], after),
     ]
+
+
+def _tuned(unit: Apu) -> list[Variable]:
+    """Governed speed and the governor's numbers."""
+    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=unit.N_ref)
+    law, ranges = unit.governor, {"N_ref": _POSITIVE}
+    signals, values = [N_ref, *law.signals("governor")], [unit.N_ref, *law.numbers.values()]
+    return _variables("parameter", signals, values, ranges)
 
 
 @_model
 def apu(asked: Asked) -> FmuModel:
     """The whole unit: governor and the exchange of 20 ms inside, loads and the day as inputs."""
-    unit, m, gas = asked.unit, _machine(asked), asked.gas
+    unit, gas = asked.unit, asked.gas
     gg, law = unit.gas_generator, unit.governor
-    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=unit.N_ref)
     air = [float(gas.u[gg.U.index(n)]) for n in AMBIENT]
+    before = {"u": len(air), "p": len(gg.THETA), "x": len(gg.X) + len(law.X), "y": len(gg.Y)}
+    machines, tuned = _machines(asked, len(unit.machines), before, True), _tuned(unit)
     given = [
         *_variables("input", (gg.U[n] for n in AMBIENT), air, gg.input_ranges),
-        *m.inputs,
+        *(v for m in machines for v in m.inputs),
         *_health(gg, gas.theta),
-        *m.faults,
-        *_variables("parameter", [N_ref], [unit.N_ref]),
-        *_variables("parameter", law.signals("governor"), law.numbers.values()),
+        *(v for m in machines for v in m.faults),
+        *tuned,
         *_variables("state", gg.X, gas.x),
         *_variables("state", law.X, law.start(float(gas["Wf"]))),
-        *m.states,
+        *(v for m in machines for v in m.states),
     ]
-    outputs = [*gg.Y, *(_mean(s) if s.name in MEANS else s for s in m.faulty.y)]
-    own = {"N_GOVERNOR": len(law.X), "N_AMBIENT": len(air)}
-    functions = [f for f in _gas_functions(gg) if f.name() != "gas_step"]
-    functions += [*m.functions, *_link_functions(unit.link, gg)]
+    outputs = [*gg.Y, *(_mean(s) for m in machines for s in m.outputs)]
+    sizes, arrays = _gas_numbers(gg)
+    sizes |= {"N_GOVERNOR": len(law.X), "N_AMBIENT": len(air), "N_TUNED": len(tuned)}
+    functions = [f for f in _gas_functions(gg) if f.name() != "gas_step"] + _link_functions(unit)
     doc = "All-electric auxiliary power unit: gas generator, governor and generators."
-    made = functions, f"apu.c gas.c gas.h {_MACHINE}", [m.numbers, _gas_numbers(gg), (own, {})]
+    made = functions, "apu.c gas.c gas.h", sizes | {"N_RAW": len(outputs)}, arrays, machines
     return _finished("apu", doc, given, outputs, *made)
 
 
 def _mean(s: Signal) -> Signal:
+    if s.name.rpartition(".")[2] not in MEANS:
+        return s
     more = "; in co-simulation the mean over the exchange step"
     return dataclasses.replace(s, doc=s.doc + more)
 

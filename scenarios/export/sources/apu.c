@@ -8,21 +8,20 @@
 #include "machine.h"
 #include "radau.h"
 
-enum {
-  AT_GOVERNOR = AT_X + 1,
-  AT_MACHINE = AT_GOVERNOR + N_GOVERNOR,
-  AT_FAULT = AT_P + G_HEALTH,
-  AT_LINK = AT_FAULT + M_FAULT
-};
+enum { AT_GOVERNOR = AT_X + 1, AT_TUNED = AT_P + N_P - N_TUNED };
 
-static int turn(Unit *u)
+/* Take speed, inputs and faults; where a fault has come or gone, its states begin at zero. */
+static void turn(Unit *u, int reset)
 {
-  double w_r;
-  unit_call(u, link_speed, IN(u->v + AT_X, u->v + AT_LINK), OUT(&w_r));
-  return machine_set(u, w_r, u->v + AT_U + N_AMBIENT, u->v + AT_FAULT);
+  double w_r[N_GENERATORS];
+  int k;
+  unit_call(u, link_speed, IN(u->v + AT_X), OUT(w_r));
+  for (k = 0; k < N_GENERATORS; k++)
+    if (machine_turn(u, k, w_r[k]) && reset)
+      machine_reset(u, k);
 }
 
-/* Outputs: of the gas generator, then of the generator, with the means that are known. */
+/* Outputs: of the gas generator, then of the generators, with the means that are known. */
 static void outputs(Unit *u, const double *y)
 {
   int i;
@@ -30,28 +29,42 @@ static void outputs(Unit *u, const double *y)
     u->v[AT_Y + i] = y[Y_OF[i]];
 }
 
+/* Whether generator k does what the earlier one does that it equals. */
+static int same(const Unit *u, int k)
+{
+  const Equations *e = &MACHINES[k], *o = &MACHINES[e->like];
+  const Machine *m = &u->machine[k], *n = &u->machine[e->like];
+  return e->like < k && m->faulty == n->faulty && m->step == n->step &&
+         !memcmp(m->u, n->u, sizeof m->u) && !memcmp(m->theta, n->theta, sizeof m->theta) &&
+         !memcmp(u->v + AT_X + e->x, u->v + AT_X + o->x, (size_t)e->size[1] * sizeof(double));
+}
+
 int model_start(Unit *u)
 {
-  u->machine.step = FIRST;
+  int k;
+  for (k = 0; k < N_GENERATORS; k++)
+    u->machine[k].step = FIRST;
   return FINE;
 }
 
 int model_evaluate(Unit *u)
 {
-  double x[M_X], rates[M_X], y[G_Y + M_Y], theta[G_THETA], in[2 + N_AMBIENT];
-  double *y_machine = y + G_Y, *D = u->v + AT_D;
-  int status, i;
-  turn(u);
-  machine_pick(u, u->v + AT_MACHINE, x);
+  double x[M_X], rates[M_X], y[N_RAW], theta[G_THETA], in[2 + N_AMBIENT], P[N_GENERATORS];
+  double *D = u->v + AT_D;
+  int status = FINE, i, k;
+  turn(u, 0);
   for (i = 0; i < N_X; i++)
     D[i] = 0.0;
-  status = machine_rates(u, x, rates);
-  machine_put(u, rates, D + AT_MACHINE - AT_X);
+  for (k = 0; k < N_GENERATORS && status == FINE; k++) {
+    machine_pick(u, k, x);
+    status = machine_rates(u, k, x, rates);
+    machine_put(u, k, rates, AT_D);
+    if (status == FINE)
+      status = machine_outputs(u, k, x, y + MACHINES[k].y);
+    P[k] = y[MACHINES[k].y + MACHINES[k].means[0]];
+  }
   if (status == FINE)
-    status = machine_outputs(u, x, y_machine);
-  if (status == FINE)
-    status = unit_call(u, link_now,
-                       IN(u->v + AT_X, u->v + AT_GOVERNOR, y_machine + MEAN_OF[0], u->v + AT_LINK),
+    status = unit_call(u, link_now, IN(u->v + AT_X, u->v + AT_GOVERNOR, P, u->v + AT_TUNED),
                        OUT(in, D + AT_GOVERNOR - AT_X));
   if (status != FINE)
     return status;
@@ -69,44 +82,53 @@ int model_evaluate(Unit *u)
 
 int model_switch(Unit *u)
 {
-  if (turn(u)) {
-    int i;
-    for (i = 0; i < N_RESET; i++)
-      u->v[AT_MACHINE + RESET[i]] = 0.0;
-  }
-  u->machine.step = FIRST < u->machine.step ? FIRST : u->machine.step;
-  return FINE;
+  turn(u, 1);
+  return model_start(u);
 }
 
 int model_step(Unit *u, double h)
 {
-  double x[M_X], y[G_Y + M_Y], theta[G_THETA], after[1 + N_GOVERNOR], z[N_Z], residual;
-  double angle;
-  int status, i;
-  turn(u);
-  machine_pick(u, u->v + AT_MACHINE, x);
-  status = radau(u, x, h, u->means);
+  double x[M_X], y[N_RAW], theta[G_THETA], after[1 + N_GOVERNOR], z[N_Z], residual;
+  double P[N_GENERATORS], states[N_X];
+  int status = FINE, i, k, like[N_GENERATORS];
+  turn(u, 0);
+  for (k = 0; k < N_GENERATORS; k++)
+    like[k] = same(u, k) ? MACHINES[k].like : k;
+  for (k = 0; k < N_GENERATORS && status == FINE; k++) {
+    const Equations *e = &MACHINES[k];
+    const int first = like[k];
+    if (first == k) {
+      machine_pick(u, k, x);
+      status = radau(u, k, x, h, u->means[k]);
+      machine_put(u, k, x, AT_X);
+      if (status == FINE)
+        status = machine_outputs(u, k, x, y + e->y);
+      /* small, so that its cosine stays accurate over hours */
+      u->v[AT_X + e->x + e->angle] = remainder(u->v[AT_X + e->x + e->angle], 6.283185307179586);
+    } else {
+      memcpy(states, u->v + AT_X + MACHINES[first].x, (size_t)e->size[1] * sizeof(double));
+      memcpy(u->v + AT_X + e->x, states, (size_t)e->size[1] * sizeof(double));
+      memcpy(y + e->y, y + MACHINES[first].y, (size_t)e->n_outputs * sizeof(double));
+      memcpy(u->means[k], u->means[first], sizeof u->means[k]);
+      u->machine[k] = u->machine[first];
+    }
+    for (i = 0; i < N_MEANS; i++)
+      y[e->y + e->means[i]] = u->means[k][i];
+    P[k] = u->means[k][0];
+  }
   if (status != FINE)
     return status;
   gas_numbers(u->v + AT_P, theta);
   status = unit_call(u, exchange,
-                     IN(u->v + AT_X, u->v + AT_GOVERNOR, u->means, u->v + AT_U, theta,
-                        u->v + AT_LINK, &h, u->z),
+                     IN(u->v + AT_X, u->v + AT_GOVERNOR, P, u->v + AT_U, theta, u->v + AT_TUNED,
+                        &h, u->z),
                      OUT(after, after + 1, y, z, &residual));
   if (status == FINE)
     status = gas_check(u, residual, y);
-  if (status == FINE)
-    status = machine_outputs(u, x, y + G_Y);
   if (status != FINE)
     return status;
-  for (i = 0; i < N_MEANS; i++)
-    y[G_Y + MEAN_OF[i]] = u->means[i];
   memcpy(u->z, z, sizeof z);
   memcpy(u->v + AT_X, after, sizeof after);
-  machine_put(u, x, u->v + AT_MACHINE);
-  /* small, so that its cosine stays accurate over hours */
-  angle = u->v[AT_MACHINE + M_ANGLE];
-  u->v[AT_MACHINE + M_ANGLE] = remainder(angle, 6.283185307179586);
   outputs(u, y);
   return FINE;
 }

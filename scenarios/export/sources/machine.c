@@ -1,4 +1,4 @@
-/* The generator: two sets of equations, healthy and faulty, on one set of states.
+/* Generators: two sets of equations each, healthy and faulty, on one set of states.
 
    Where the fault's first parameter is zero the machine is healthy: the states of the fault rest
    at zero, as they start from zero when the fault comes, or when it moves to another phase. */
@@ -6,61 +6,77 @@
 
 #include <string.h>
 
-#define PICK(u, faulty_, healthy_) ((u)->machine.faulty ? (faulty_) : (healthy_))
+#define OWN(u, k, what) MACHINES[k].what[(u)->machine[k].faulty]
 
-/* Take speed, inputs (without speed) and fault; returns 1 if states of the fault are to be reset. */
-int machine_set(Unit *u, double w_r, const double *inputs, const double *fault)
+/* Take speed, inputs and fault; returns 1 if the fault has come, gone or moved. */
+int machine_turn(Unit *u, int k, double w_r)
 {
-  Machine *m = &u->machine;
+  const Equations *e = &MACHINES[k];
+  const double *fault = u->v + AT_P + e->p;
+  Machine *m = &u->machine[k];
   const int was = m->faulty;
   double given[M_GIVEN];
-  int moved = 0;
+  int n = 0, moved = 0;
   memset(m->u, 0, sizeof m->u);
   m->u[0] = w_r;
-  memcpy(m->u + 1, inputs, M_INPUTS * sizeof(double));
+  memcpy(m->u + 1, u->v + AT_U + e->u, (size_t)e->n_inputs * sizeof(double));
   m->faulty = fault[0] > 0.0;
-  if (M_AXIS >= 0) {
-    moved = was && m->faulty && m->axis != fault[M_AXIS < 0 ? 0 : M_AXIS];
-    m->axis = fault[M_AXIS < 0 ? 0 : M_AXIS];
+  if (e->axis >= 0) {
+    moved = was && m->faulty && m->axis != fault[e->axis];
+    m->axis = fault[e->axis];
   }
   if (m->faulty)
-    memcpy(given, fault, M_FAULT * sizeof(double));
-  memcpy(given + (m->faulty ? M_FAULT : 0), M_NUMBERS, N_MACHINE * sizeof(double));
-  unit_call(u, PICK(u, faulty_follow, healthy_follow), IN(given), OUT(m->theta));
+    for (; n < e->n_fault; n++)
+      given[n] = fault[n];
+  memcpy(given + n, e->numbers, (size_t)e->n_numbers * sizeof(double));
+  unit_call(u, OWN(u, k, follow), IN(given), OUT(m->theta));
   return was != m->faulty || moved;
 }
 
-int machine_size(const Unit *u) { return PICK(u, M_X, M_XH); }
-
-void machine_pick(const Unit *u, const double *all, double *own)
+void machine_reset(Unit *u, int k)
 {
   int i;
-  for (i = 0; i < machine_size(u); i++)
-    own[i] = all[PICK(u, i, M_AT[i])];
+  for (i = 0; i < MACHINES[k].n_reset; i++)
+    u->v[AT_X + MACHINES[k].x + MACHINES[k].reset[i]] = 0.0;
 }
 
-void machine_put(const Unit *u, const double *own, double *all)
+int machine_size(const Unit *u, int k) { return OWN(u, k, size); }
+
+static int place(const Unit *u, int k, int i)
+{
+  return u->machine[k].faulty ? i : MACHINES[k].healthy[i];
+}
+
+void machine_pick(const Unit *u, int k, double *own)
 {
   int i;
-  for (i = 0; i < machine_size(u); i++)
-    all[PICK(u, i, M_AT[i])] = own[i];
+  for (i = 0; i < machine_size(u, k); i++)
+    own[i] = u->v[AT_X + MACHINES[k].x + place(u, k, i)];
 }
 
-double machine_nominal(const Unit *u, int i) { (void)u; return M_NOMINAL[PICK(u, i, M_AT[i])]; }
-
-int machine_rates(Unit *u, const double *x, double *rates)
+void machine_put(Unit *u, int k, const double *own, int first)
 {
-  return unit_call(u, PICK(u, faulty_f, healthy_f), IN(x, u->machine.u, u->machine.theta),
-                   OUT(rates));
+  int i;
+  for (i = 0; i < machine_size(u, k); i++)
+    u->v[first + MACHINES[k].x + place(u, k, i)] = own[i];
 }
 
-int machine_outputs(Unit *u, const double *x, double *y)
+double machine_nominal(const Unit *u, int k, int i) { return MACHINES[k].nominal[place(u, k, i)]; }
+
+int machine_rates(Unit *u, int k, const double *x, double *rates)
 {
-  return unit_call(u, PICK(u, faulty_g, healthy_g), IN(x, u->machine.u, u->machine.theta), OUT(y));
+  const Machine *m = &u->machine[k];
+  return unit_call(u, OWN(u, k, f), IN(x, m->u, m->theta), OUT(rates));
 }
 
-int machine_jacobian(Unit *u, const double *x, double *J)
+int machine_outputs(Unit *u, int k, const double *x, double *y)
 {
-  return unit_call(u, PICK(u, faulty_jac, healthy_jac), IN(x, u->machine.u, u->machine.theta),
-                   OUT(J));
+  const Machine *m = &u->machine[k];
+  return unit_call(u, OWN(u, k, g), IN(x, m->u, m->theta), OUT(y));
+}
+
+int machine_jacobian(Unit *u, int k, const double *x, double *J)
+{
+  const Machine *m = &u->machine[k];
+  return unit_call(u, OWN(u, k, jacobian), IN(x, m->u, m->theta), OUT(J));
 }

@@ -126,7 +126,7 @@ static double norm(int n, const double *e, const double *scale)
 }
 
 /* Newton's iterations; Z and F at the end.  0: converged, 1: not, else a failure of f. */
-static int stages(Unit *u, int n, const double *x, double h, const double *scale,
+static int stages(Unit *u, int machine, int n, const double *x, double h, const double *scale,
                   const System *systems, double Z[R_STAGES][M_X], double F[R_STAGES][M_X])
 {
   double last = 0.0, rate = 1.0;
@@ -138,7 +138,7 @@ static int stages(Unit *u, int n, const double *x, double h, const double *scale
       double at[M_X];
       for (i = 0; i < n; i++)
         at[i] = x[i] + Z[j][i];
-      if (machine_rates(u, at, F[j]))
+      if (machine_rates(u, machine, at, F[j]))
         return 2;
     }
     for (j = 0; j < R_STAGES; j++)
@@ -183,14 +183,14 @@ static int stages(Unit *u, int n, const double *x, double h, const double *scale
   return 1;
 }
 
-int radau(Unit *u, double *x, double length, double *means)
+int radau(Unit *u, int machine, double *x, double length, double *means)
 {
   static const double least = 1e-13; /* s */
-  const int n = machine_size(u);
+  const int n = machine_size(u, machine);
   System systems[R_PAIRS + 1];
   double J[M_X * M_X], f0[M_X], scale[M_X], err[M_X], at[M_X], y[M_Y];
   double Z[R_STAGES][M_X], F[R_STAGES][M_X];
-  double done = 0.0, h = u->machine.step, made = 0.0;
+  double done = 0.0, h = u->machine[machine].step, made = 0.0;
   int i, j, fresh = 0, first = 1;
   for (i = 0; i < N_MEANS; i++)
     means[i] = 0.0;
@@ -201,17 +201,17 @@ int radau(Unit *u, double *x, double length, double *means)
     if (h > rest * (1.0 - 1e-9) || rest < 1e-12)
       h = rest;
     if (!fresh) {
-      if (machine_jacobian(u, x, J) || machine_rates(u, x, f0))
+      if (machine_jacobian(u, machine, x, J) || machine_rates(u, machine, x, f0))
         return DISCARD;
       for (i = 0; i < n; i++)
-        scale[i] = TOLERANCE * (machine_nominal(u, i) + fabs(x[i]));
+        scale[i] = TOLERANCE * (machine_nominal(u, machine, i) + fabs(x[i]));
       fresh = 1;
       made = 0.0;
     }
     if (h != made && prepare(systems, n, J, h))
       return unit_tell(u, DISCARD, "a step of %g s is singular", h);
     made = h;
-    status = stages(u, n, x, h, scale, systems, Z, F);
+    status = stages(u, machine, n, x, h, scale, systems, Z, F);
     if (status == 2)
       return DISCARD;
     if (status) {
@@ -227,7 +227,7 @@ int radau(Unit *u, double *x, double length, double *means)
       if (again) {
         for (i = 0; i < n; i++)
           at[i] = x[i] + err[i];
-        if (machine_rates(u, at, zero))
+        if (machine_rates(u, machine, at, zero))
           return DISCARD;
         f = zero;
       }
@@ -247,10 +247,10 @@ int radau(Unit *u, double *x, double length, double *means)
       for (j = 0; j < R_STAGES; j++) {
         for (i = 0; i < n; i++)
           at[i] = x[i] + Z[j][i];
-        if (machine_outputs(u, at, y))
+        if (machine_outputs(u, machine, at, y))
           return DISCARD;
         for (i = 0; i < N_MEANS; i++)
-          means[i] += h / length * R_WEIGHTS[j] * y[MEAN_OF[i]];
+          means[i] += h / length * R_WEIGHTS[j] * y[MACHINES[machine].means[i]];
       }
       for (i = 0; i < n; i++)
         x[i] += Z[R_STAGES - 1][i];
@@ -264,8 +264,8 @@ int radau(Unit *u, double *x, double length, double *means)
       double factor_ = 0.9 * pow(size > 1e-12 ? size : 1e-12, -1.0 / (R_STAGES + 1));
       factor_ = factor_ > 6.0 ? 6.0 : factor_ < 0.1 ? 0.1 : factor_;
       if (h < rest || size >= 1.0 || factor_ < 1.0)
-        u->machine.step = h * factor_;
-      h = u->machine.step;
+        u->machine[machine].step = h * factor_;
+      h = u->machine[machine].step;
     }
     if (!(h >= least))
       return unit_tell(u, DISCARD, "the generator's equations need steps below %g s", least);

@@ -2,7 +2,7 @@
 #define RADAU_H
 #include "unit.h"
 
-/* dx/dt = f(x) over [0, length], and the means of the outputs over it; see radau.c. */
-int radau(Unit *u, double *x, double length, double *means);
+/* Generator k over [0, length], and the means of its outputs over it; see radau.c. */
+int radau(Unit *u, int k, double *x, double length, double *means);
 
 #endif

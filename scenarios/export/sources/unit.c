@@ -11,7 +11,7 @@ void unit_reset(Unit *u)
   memcpy(u->v + AT_U, U_START, N_U * sizeof(double));
   memcpy(u->v + AT_P, P_START, N_P * sizeof(double));
   memcpy(u->v + AT_X, X_START, N_X * sizeof(double));
-  memset(&u->machine, 0, sizeof u->machine);
+  memset(u->machine, 0, sizeof u->machine);
   memset(u->z, 0, sizeof u->z);
   u->start = 0.0;
   u->phase = INITIAL;

@@ -23,7 +23,24 @@ enum { FINE = 0, DISCARD = 2, WRONG = 3 }; /* as the FMI's status */
 
 typedef int (*Function)(const double **arg, double **res, long long int *iw, double *w, int mem);
 
-/* The generator between two switches. */
+/* A generator: equations without and with its fault, and where its variables are. */
+typedef struct {
+  Function f[2], g[2], jacobian[2], follow[2];
+  int size[2];              /* states of each */
+  const int *healthy;       /* those of all states that the healthy equations have */
+  const int *reset;         /* those that the fault brings */
+  const int *means;         /* outputs that are averaged over a step */
+  const double *nominal, *numbers;
+  int n_reset, n_numbers, n_inputs, n_fault, n_outputs;
+  int axis;                 /* which of the fault's parameters turns it; -1: none */
+  int angle;                /* which state is the rotor's */
+  int u, p, x, y;           /* first of its inputs, parameters, states, outputs */
+  int like;                 /* first generator with the same equations and numbers */
+} Equations;
+
+extern const Equations MACHINES[];
+
+/* A generator between two switches. */
 typedef struct {
   int faulty;               /* which equations hold */
   double theta[M_TH];       /* what they take of the parameters */
@@ -42,8 +59,8 @@ struct Unit {
   int stale;                /* rates and outputs are to be computed anew */
   int changed;              /* inputs or parameters, since the last switch */
   double z[N_Z];            /* algebraic unknowns: where their next search starts */
-  double means[N_MEANS];    /* over the last exchange step */
-  Machine machine;
+  double means[N_GENERATORS][N_MEANS]; /* over the last exchange step */
+  Machine machine[N_GENERATORS];
   /* what does not belong to the state */
   void *host, *log;
   const double *arg[W_ARG];
