@@ -326,9 +326,9 @@ def test_gas_generator_by_model_exchange(built, asked, tmp_path):
 
 # ------------------------------------------------------------------------------ the unit
 
-JOINT = ["N", "T4", "PW", "Wf", "SM"]
+JOINT = ["N", "T4", "PW", "Wf", "SM", "P_total"]
 WAVES = ["v_a", "i_a", "i_b", "T_e"]
-MEANS = ["P_total", "P_e", "P_loss_fault"]
+MEANS = ["P_e", "P_loss_fault"]
 EVENTS = [
     LoadChange(0.2, LESS),
     HealthChange(0.4, {"f_eta_c": 0.98}),

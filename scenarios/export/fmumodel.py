@@ -138,9 +138,10 @@ def _finished(
     sizes: Mapping[str, int],
     arrays: Mapping[str, Any],
     machines: Sequence[Machine] = (),
+    hidden: Iterable[str] = (),
 ) -> FmuModel:
-    """Put a model together; what an input or a state tells already is no output."""
-    taken, signals = {v.signal.name for v in given}, list(outputs)
+    """Put a model together; no output is what is ``hidden`` or told by an input or a state."""
+    taken, signals = {*hidden, *(v.signal.name for v in given)}, list(outputs)
     kept = [i for i, s in enumerate(signals) if s.name not in taken]
     whole = (*given, *_variables("output", (signals[i] for i in kept)))
     more, numbers = _of_machines(machines) if machines else ({}, {})
@@ -404,7 +405,7 @@ def apu(asked: Asked) -> FmuModel:
     unit, gas = asked.unit, asked.gas
     gg, law = unit.gas_generator, unit.governor
     air = [float(gas.u[gg.U.index(n)]) for n in AMBIENT]
-    before = {"u": len(air), "p": len(gg.THETA), "x": len(gg.X) + len(law.X), "y": len(gg.Y)}
+    before = {"u": len(air), "p": len(gg.THETA), "x": len(gg.X) + len(law.X), "y": len(gg.Y) + 1}
     machines, tuned = _machines(asked, len(unit.machines), before, True), _tuned(unit)
     given = [
         *_variables("input", (gg.U[n] for n in AMBIENT), air, gg.input_ranges),
@@ -416,13 +417,15 @@ def apu(asked: Asked) -> FmuModel:
         *_variables("state", law.X, law.start(float(gas["Wf"]))),
         *(v for m in machines for v in m.states),
     ]
-    outputs = [*gg.Y, *(_mean(s) for m in machines for s in m.outputs)]
+    total = Signal(MEANS[0], "W", "mechanical power of all generators (8)")
+    outputs = [*gg.Y, _mean(total), *(_mean(s) for m in machines for s in m.outputs)]
+    hidden = [s.name for s in outputs if s.name.endswith(f".{total.name}")]  # each of two alike
     sizes, arrays = _gas_numbers(gg)
     sizes |= {"N_GOVERNOR": len(law.X), "N_AMBIENT": len(air), "N_TUNED": len(tuned)}
     functions = [f for f in _gas_functions(gg) if f.name() != "gas_step"] + _link_functions(unit)
     doc = "All-electric auxiliary power unit: gas generator, governor and generators."
     made = functions, "apu.c gas.c gas.h", sizes | {"N_RAW": len(outputs)}, arrays, machines
-    return _finished("apu", doc, given, outputs, *made)
+    return _finished("apu", doc, given, outputs, *made, hidden)
 
 
 def _mean(s: Signal) -> Signal:

@@ -21,10 +21,14 @@ static void turn(Unit *u, int reset)
       machine_reset(u, k);
 }
 
-/* Outputs: of the gas generator, then of the generators, with the means that are known. */
-static void outputs(Unit *u, const double *y)
+/* Outputs: of the gas generator, power of all generators, then each with the means that are
+   known; P is the power of two such generators. */
+static void outputs(Unit *u, double *y, const double *P)
 {
   int i;
+  y[G_Y] = 0.0;
+  for (i = 0; i < N_GENERATORS; i++)
+    y[G_Y] += P[i] / 2.0;
   for (i = 0; i < N_Y; i++)
     u->v[AT_Y + i] = y[Y_OF[i]];
 }
@@ -76,7 +80,7 @@ int model_evaluate(Unit *u)
   if (status == FINE)
     status = gas_check(u, y[G_RESIDUAL], y);
   if (status == FINE)
-    outputs(u, y);
+    outputs(u, y, P);
   return status;
 }
 
@@ -129,6 +133,6 @@ int model_step(Unit *u, double h)
     return status;
   memcpy(u->z, z, sizeof z);
   memcpy(u->v + AT_X, after, sizeof after);
-  outputs(u, y);
+  outputs(u, y, P);
   return FINE;
 }
