@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import files, netcdf3
+from apu_casadi.core import files, netcdf3, netcdf4
 from apu_casadi.core.errors import DataError, SignalError, nearest
 from apu_casadi.core.filearrays import is_lazy
 
@@ -208,7 +208,7 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
 
 
 def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
-    """Read a dataset that :func:`save` wrote.
+    """Read a dataset that :func:`save` wrote, or another one in netCDF 3 or 4.
 
     Args:
         path: of the file.
@@ -216,10 +216,12 @@ def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
             can be looked at; the file stays open with the dataset.  Otherwise all are read now.
 
     Raises:
-        DataError: the file is missing, is no netCDF 3 file, or is damaged.
+        DataError: the file is missing, is no netCDF file, or is damaged; netCDF 4 without h5netcdf.
     """
     path = Path(path)
     start, size = files.beginning(path, 8)
+    if start.startswith(netcdf4.MARK):
+        return netcdf4.read(path)
     if start[:3] != b"CDF":
         raise DataError(f"{path}: not a netCDF 3 file (it begins with {start!r})")
     try:

@@ -72,6 +72,10 @@ class MachineParameters(Parameters):
         return self.r_fd * V_peak / (self.w_rated * self.L_md)
 
 
+MACHINE = MachineParameters().signals("machine")
+"""The machine's parameters by dotted name, as ``machine.r_s``."""
+
+
 @dataclass(frozen=True)
 class ExciterParameters(Parameters):
     """IEEE AC5A, per unit of rated terminal voltage and of ``MachineParameters.V_fd_base``.
