@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,11 +47,14 @@ def fault_phase(ds: xr.Dataset, t: float) -> str:
 
 
 def made_with(ds: xr.Dataset) -> str:
-    """Tell loads, ambient conditions, solver, exchange, seed and version of a run, if recorded."""
+    """Tell unit, loads, day, solver, exchange, seed and version of a run, if recorded."""
     words = []
     loads = list(dict.fromkeys(str(r.get("load")) for r in _rows(ds, "loads")))
     if len(loads) > 3:
         loads[2:] = [f"{len(loads) - 2} more"]
+    engine = scenario_of(ds).get("engine")
+    if engine:
+        words.append(f"Unit {Path(str(engine)).stem}")
     if loads:
         words.append(f"Load of each generator {', then '.join(loads)}")
     try:

@@ -242,6 +242,7 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         phase = PHASES[found - 1] if found else None
         rows.append({**place, "values": values, "faulty_phase": phase})
     about = {"scenario": scenario["name"], "title": scenario.get("title", "")}
+    about |= {k: scenario[k] for k in ("engine", "governor") if k in scenario}
     found_out = {"short_circuit": _short_circuit(e), "health": _health(e)}
     out = {**about, "seed": e.attrs["seed"], **made_with(e), "phases": rows, **found_out}
     return {**out, "cross_talk": _cross_talk(e)}
@@ -264,7 +265,9 @@ def made_words(r: Mapping[str, Any]) -> str:
     by = {"solver": None, "exchange": None, "dt": 0.0} | (r.get("truth_solver") or {})
     version = r["apu_casadi_version"]
     values = {"solver": str(by["solver"]), "exchange": str(by["exchange"]), "ms": 1e3 * by["dt"]}
-    return TEXT.text("made", day=day_words(r["ambient"]), loads=loads, version=version, **values)
+    unit = f" Unit {Path(r['engine']).stem}." if "engine" in r else ""
+    day = day_words(r["ambient"])
+    return TEXT.text("made", day=day, loads=loads, version=version, **values) + unit
 
 
 def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:
