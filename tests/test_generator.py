@@ -114,7 +114,6 @@ def test_steady_state_by_voltage_and_by_reference_agree():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"load": SeriesLoad.from_power(1e5, unbalance=(1, 1, 2))}, r"unbalanced.*switch"),
         ({"load": KW225, "V_t": 230.0, "V_ref": 1.0}, r"not both"),
         ({"load": SeriesLoad.from_power(2e6)}, r"no regulated steady state.*ceiling 7.3"),
         ({"load": KW225, "V_t": 900.0}, r"needs V_R = .*outside \[-7.3, 7.3\]"),

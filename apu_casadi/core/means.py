@@ -21,7 +21,14 @@ within microseconds is in the value, which is that of the settled waveform.
   rotation only.  Its three values are one, from the mean of the three squares, which does not
   ripple at all; so also while voltages change, and in steps of any length.
 
-Phasors are the fundamental by least squares with the same weight.
+Phasors are the fundamental by least squares with the same weight; in a symmetric machine they are
+those of the means on the rotor's axes, which do not ripple.
+
+**Symmetrical components** (Fortescue 1918) follow from the phasors of every step,
+
+    V_1 = (V_a + a V_b + a^2 V_c)/3,  V_2 = (V_a + a^2 V_b + a V_c)/3,  V_0 = (V_a + V_b + V_c)/3,
+
+with a = exp(j 2 pi/3); angles are those ahead of the rotor angle's cosine.
 """
 
 from __future__ import annotations
@@ -49,6 +56,13 @@ MOMENTS = tuple(f"~{q}*{f}1" for q in PHASORS.values() for f in ("cos", "sin"))
 #: What a symmetric machine has instead of ``SQUARES``; it does not ripple.  The last is the mean of
 #: the weight itself: what an integrator makes of that cancels.
 COMMON = ("~v^2", "~i^2", "~1")
+#: And instead of ``MOMENTS``: what is on the rotor's axes.
+AXES = ("~v_q", "~v_d", "~i_q", "~i_d")
+#: Symmetrical components by name: rms of positive, negative and zero sequence, ...
+COMPONENTS = tuple(f"{q}_{k}" for q in "VI" for k in (1, 2, 0))
+#: ... their angles, and the ratios of the negative one to the positive one.
+UNBALANCE = ("V_2_over_V_1", "I_2_over_I_1")
+SEQUENCES = (*COMPONENTS, *(f"{n}_angle" for n in COMPONENTS), *UNBALANCE)
 #: Least turn of the rotor, electrical periods, in a step whose squares give an rms value.
 LEAST = 1.0
 
@@ -57,7 +71,8 @@ class Term(NamedTuple):
     """What is to be averaged: ``base`` to a power, times cos or sin of k theta_e, weighted or not.
 
     Args:
-        base: name of an output, or ``"1"``; ``"v"`` or ``"i"``, squared: the mean over the phases.
+        base: name of an output, or ``"1"``; ``"v"`` or ``"i"``, squared: the mean over the phases;
+            ``"v_q"``, ``"v_d"``, ``"i_q"``, ``"i_d"``: on the rotor's axes.
         power: 1 or 2.
         trig, k: ``"cos"`` or ``"sin"`` and the harmonic; ``""`` and 0 without one.
         weighted: whether :func:`window` weights it.
@@ -85,10 +100,15 @@ class Term(NamedTuple):
         weight, base, square, trig, k = found.groups()
         return cls(base, 2 if square else 1, trig or "", int(k or 0), bool(weight))
 
-    def value(self, ss: StateSpace, y: Any) -> Any:
-        """The output to its power, without harmonic and weight; ``y`` are the outputs."""
+    def value(self, ss: StateSpace, x: Any, y: Any) -> Any:
+        """The output to its power, without harmonic and weight, from states and outputs."""
         if self.base in ("v", "i"):
             return sum(y[ss.y.index(f"{self.base}_{p}")] ** 2 for p in PHASES) / 3.0
+        if f"~{self.base}" in AXES:
+            turn = ca.cos if self.base[2] == "q" else ca.sin
+            axes = (x[ss.x.index("theta_e")] - 2 * math.pi / 3 * k for k in range(3))
+            phases = (y[ss.y.index(f"{self.base[0]}_{p}")] for p in PHASES)
+            return 2.0 / 3.0 * sum(turn(a) * v for a, v in zip(axes, phases, strict=True))
         return 1.0 if self.base == "1" else y[ss.y.index(self.base)] ** self.power
 
     def nominal(self, ss: StateSpace) -> float:
@@ -98,13 +118,14 @@ class Term(NamedTuple):
         integral is then near zero for long, and a relative tolerance of it would double the
         integrator's work.
         """
-        base = f"{self.base}_a" if self.base in ("v", "i") else self.base
+        axes = self.base in ("v", "i") or f"~{self.base}" in AXES
+        base = f"{self.base[0]}_a" if axes else self.base
         size = 1.0 if base == "1" else ss.y[base].nominal ** self.power
         return size * (100.0 if self.trig else 10.0 if self.weighted else 1.0)
 
     def expression(self, ss: StateSpace, x: Any, y: Any, tau: Any) -> Any:
         """What the mean is of; ``tau`` is the share of the step that has passed."""
-        value = self.value(ss, y)
+        value = self.value(ss, x, y)
         if self.trig:
             angle = self.k * x[ss.x.index("theta_e")]
             value = value * (ca.cos(angle) if self.trig == "cos" else ca.sin(angle))
@@ -129,7 +150,7 @@ def wanted(*, phasors: bool, short: bool, symmetric: bool) -> tuple[str, ...]:
         short: whether a step may be shorter than an electrical period.
     """
     if symmetric:
-        return (*COMMON, *(MOMENTS if phasors else ()))
+        return (*COMMON, *(AXES if phasors else ()))
     return (*SQUARES, *HARMONICS, *(MOMENTS if phasors or short else ()))
 
 
@@ -195,14 +216,35 @@ def _fundamental(means: Mapping[str, np.ndarray], c2: np.ndarray, s2: np.ndarray
 
 def _positive(means: Mapping[str, np.ndarray]) -> np.ndarray:
     """Phasors of the positive sequence, which is all that a symmetric machine has."""
-    turns = np.exp(2j * math.pi / 3 * np.arange(3))
     rows = []
     for q in "vi":
-        moments = [means[f"~{q}_{p}*cos1"] - 1j * means[f"~{q}_{p}*sin1"] for p in PHASES]
-        one = math.sqrt(2.0) / 3.0 * sum(m * t for m, t in zip(moments, turns, strict=True))
-        for t in turns:
-            rows += [(one / t).real, (one / t).imag]
+        one = (means[f"~{q}_q"] - 1j * means[f"~{q}_d"]) / (math.sqrt(2.0) * means["~1"])
+        for back in np.exp(-2j * math.pi / 3 * np.arange(3)):
+            rows += [(one * back).real, (one * back).imag]
     return np.array(rows)
+
+
+def sequences(parts: np.ndarray, *, symmetric: bool = False) -> np.ndarray:
+    """Return symmetrical components in the order of ``SEQUENCES`` from phasors.
+
+    Args:
+        parts: phasors in the order of ``PARTS``, shape (12, ...).
+        symmetric: whether there is a positive sequence only; the others are then zero, and have
+            the angle zero.  A ratio is NaN where there is no positive sequence.
+    """
+    a = np.exp(2j * math.pi / 3)
+    rows = [(1, a, a.conjugate()), (1, a.conjugate(), a), (1, 1, 1)]
+    phasors, found = np.asarray(parts)[0::2] + 1j * np.asarray(parts)[1::2], []
+    for q in (phasors[:3], phasors[3:]):  # no matrix products: their last bits depend on the shape
+        for k, row in enumerate(rows):
+            total = sum((c * p for c, p in zip(row, q, strict=True)), 0.0 * q[0]) / 3.0
+            found.append(np.zeros_like(total) if symmetric and k else total)
+    size = np.sqrt([f.real**2 + f.imag**2 for f in found])
+    angle = np.arctan2([f.imag for f in found], [f.real for f in found])
+    positive = size[0::3]
+    none = np.full(positive.shape, np.nan)
+    ratio = np.divide(size[1::3], positive, out=none, where=positive > 0)
+    return np.concatenate([size, angle, ratio])
 
 
 def as_dict(names: Sequence[str], means: np.ndarray) -> dict[str, np.ndarray]:

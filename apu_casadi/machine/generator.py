@@ -27,13 +27,18 @@ from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import wrsg
+from apu_casadi.machine.atrest import AtRest, GeneratorPoint
 from apu_casadi.machine.faults.fault import FAULTS, Fault, FaultStructure
 from apu_casadi.machine.generatormodel import GeneratorModel, Structure, variant
 from apu_casadi.machine.loads.load import LOADS, Load, LoadStructure
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
+from apu_casadi.machine.periodic import Closing, Turn, solve_periodic
 from apu_casadi.machine.wrsg import Windings
 
+__all__ = ["Generator", "GeneratorPoint", "fault_of_kind", "load_of_kind"]
+
 NEUTRALS = ("grounded", "isolated")
+EXCITATIONS = ("regulated", "constant")
 
 SAME_INSTANT = 1e-9  # s; switches closer than this are one
 #: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to
@@ -44,28 +49,6 @@ SPIKE = 3.0
 V_TABLE_7 = (229.6704 + 229.6903 + 229.6704) / 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class GeneratorPoint:
-    """A balanced steady state of the healthy generator.
-
-    Args:
-        ss: the variant it belongs to.
-        x, u: state (nx,) and inputs (nu,).
-        V_ref: voltage reference that holds it, per unit.
-        V_t: terminal voltage, V rms per phase.
-        y: outputs by name at the starting rotor angle.
-        residual: largest state rate over nominal value (rotor angle apart), 1/s.
-    """
-
-    ss: GeneratorModel
-    x: np.ndarray
-    u: np.ndarray
-    V_ref: float
-    V_t: float
-    y: dict[str, float]
-    residual: float
-
-
 @dataclass(frozen=True)
 class Generator(Parametric):
     """One starter/generator with its exciter; the load comes with each study.
@@ -74,18 +57,23 @@ class Generator(Parametric):
         machine, exciter: parameter sets.
         neutral: ``"grounded"`` (four wires, as in aircraft) joins the star points of machine and
             load; ``"isolated"`` leaves the load's star point free.
+        excitation: ``"regulated"`` by the AC5A, or ``"constant"``: the field voltage stays what it
+            is at the start, as in an open-loop test.
 
     Raises:
-        ParameterError: unknown neutral.
+        ParameterError: unknown neutral or excitation.
     """
 
     machine: MachineParameters = field(default_factory=MachineParameters)
     exciter: ExciterParameters = field(default_factory=ExciterParameters)
     neutral: str = "grounded"
+    excitation: str = "regulated"
 
     def __post_init__(self) -> None:
-        if self.neutral not in NEUTRALS:
-            raise ParameterError(f"neutral {self.neutral!r} {nearest(self.neutral, NEUTRALS)}")
+        for what, known in (("neutral", NEUTRALS), ("excitation", EXCITATIONS)):
+            value = getattr(self, what)
+            if value not in known:
+                raise ParameterError(f"{what} {value!r} {nearest(value, known)}")
 
     # -- variants ---------------------------------------------------------------------------
 
@@ -111,7 +99,8 @@ class Generator(Parametric):
         return _variant(self, self._structure(beside, found))
 
     def _structure(self, load: Load, fault: FaultStructure | None = None) -> Structure:
-        return Structure(LoadStructure.of(load), fault, self.neutral, self.exciter.absent)
+        how = (self.neutral, self.exciter.absent, self.excitation)
+        return Structure(LoadStructure.of(load), fault, *how)
 
     def fault_kind(self, load: Load, fault: Fault | None) -> str | None:
         """Return which equations a fault needs beside this load."""
@@ -227,81 +216,81 @@ class Generator(Parametric):
         p = self.machine
         R = 3.0 * p.V_rated_rms**2 / p.P_rated
         V_t = V_TABLE_7 * p.V_rated_rms / 230.0
-        E_fd = self._field(V_t, complex(R), p.w_rated)[0] / p.V_fd_base
+        E_fd = self._rest.field(V_t, complex(R), p.w_rated)[0] / p.V_fd_base
         V_ref = ac5a.exciter_steady(self.exciter, E_fd=E_fd, V_t=V_t / p.V_rated_rms)[1]
         return float(V_ref)
 
-    def _field(self, V_t: float, Z: complex, w_r: float) -> tuple[float, Windings]:
-        """Return V_fd (V) and the steady currents for a terminal voltage (V rms) and impedance.
-
-        (5)-(7) at rest with Z = R + j X are linear in i_fd:
-            (R + r_s) i_q + (X + w_r L_d) i_d = w_r L_md i_fd,  (R + r_s) i_d = (X + w_r L_q) i_q.
-        """
-        p = self.machine
-        X_d, X_q = Z.imag + w_r * (p.L_md + p.L_ls), Z.imag + w_r * (p.L_mq + p.L_ls)
-        R_t = Z.real + p.r_s
-        i_q = R_t / (R_t**2 + X_d * X_q)  # for w_r L_md i_fd = 1 V
-        i_d = X_q * i_q / R_t
-        V_unit = abs(Z) * math.hypot(i_q, i_d)
-        scale = math.sqrt(2.0) * V_t / V_unit
-        i_fd = scale / (w_r * p.L_md)
-        return p.r_fd * i_fd, Windings(scale * i_q, scale * i_d, 0.0, i_fd, 0.0, 0.0)
+    @property
+    def _rest(self) -> AtRest:
+        return AtRest(self.machine, self.exciter)
 
     def steady_state(
         self,
         load: Load,
+        fault: Fault | None = None,
         *,
         w_r: float | None = None,
         V_t: float | None = None,
         V_ref: float | None = None,
+        V_fd: float | None = None,
         theta_e: float = 0.0,
     ) -> GeneratorPoint:
-        """Return the healthy generator's steady state with a balanced load.
+        """Return the generator's steady state; a periodic one if anything is unbalanced.
+
+        A healthy machine with a balanced load rests on the rotor's axes.  With a fault or an
+        unbalanced load states and outputs repeat with the turn (:mod:`.periodic`).
 
         Args:
-            load: a balanced load; from an unbalanced one or a fault, simulate long enough instead.
+            load, fault: what holds.
             w_r: electrical speed, rad/s; default rated.
-            V_t: terminal voltage, V rms per phase; V_ref follows.  Or
-            V_ref: voltage reference, per unit; V_t follows.  Default :attr:`V_ref_default`.
+            V_t: terminal voltage, V rms per phase (its mean, where it ripples); V_ref follows.  Or
+            V_ref: voltage reference, per unit; V_t follows.  Default :attr:`V_ref_default`.  Or
+            V_fd: field voltage, V, referred to the stator (its mean, where it ripples).
             theta_e: rotor angle to start from, rad.
 
         Raises:
-            OperatingPointError: an unbalanced load, both voltages given, a regulator limit, or a
-                residual above 1e-6 1/s.
+            OperatingPointError: two voltages given, a regulator limit with a balanced load, a load
+                that the field cannot carry, or a residual above 1e-6 1/s (of a periodic state
+                1e-7 per rad).
         """
-        p, e = self.machine, self.exciter
+        p = self.machine
         w_r = p.w_rated if w_r is None else number("w_r", w_r, error=OperatingPointError)
-        V_t, V_ref = (
-            None if v is None else number(n, v, error=OperatingPointError)
-            for n, v in (("V_t", V_t), ("V_ref", V_ref))
-        )
+        theta_e = number("theta_e", theta_e, error=OperatingPointError)
+        voltages = {"V_t": V_t, "V_ref": V_ref, "V_fd": V_fd}
+        given = {
+            n: number(n, v, error=OperatingPointError) for n, v in voltages.items() if v is not None
+        }
         if not (math.isfinite(w_r) and w_r > 0):
             raise OperatingPointError(f"w_r must be > 0 rad/s (electrical), got {w_r!r}")
-        if V_t is not None and V_ref is not None:
-            raise OperatingPointError("give V_t or V_ref, not both: each determines the other")
-        if not load.balanced:
-            raise OperatingPointError(
-                f"no closed steady state with the unbalanced {load!r}: start from a balanced load "
-                "and switch"
-            )
+        if len(given) > 1:
+            names = " or ".join(given)
+            raise OperatingPointError(f"give {names}, not both: each determines the other")
+        ((name, value),) = given.items() or [("V_ref", self.V_ref_default)]
+        if not value > 0:
+            what = {"V_t": "terminal voltage", "V_fd": "field voltage"}.get(name, name)
+            unit = "" if name == "V_ref" else " V"
+            raise OperatingPointError(f"{what} must be > 0, got {value!r}{unit}")
+        if fault is None and load.balanced:
+            return self._balanced(load, w_r, name, value, theta_e)
+        return self._periodic(load, fault, w_r, name, value, theta_e)
 
-        if V_t is None:
-            V_t = self._regulated(load, w_r, self.V_ref_default if V_ref is None else V_ref)
+    def _balanced(
+        self, load: Load, w_r: float, name: str, value: float, theta_e: float
+    ) -> GeneratorPoint:
+        e, rest = self.exciter, self._rest
+        V_t = value
+        if name != "V_t":
+            V_t = (rest.regulated if name == "V_ref" else rest.excited)(load, w_r, value)
         if not V_t > 0:
             raise OperatingPointError(f"terminal voltage must be > 0, got {V_t!r} V")
-        i, states, ref = self._at_rest(load, w_r, V_t)
-        if not e.V_R_min <= states.V_R <= e.V_R_max:
+        i, states, ref = rest.at(load, w_r, V_t)
+        if self.excitation == "regulated" and not e.V_R_min <= states.V_R <= e.V_R_max:
             raise OperatingPointError(
                 f"holding {V_t:.5g} V with {load!r} at w_r = {w_r:.5g} rad/s needs "
                 f"V_R = {states.V_R:.4g}, outside [{e.V_R_min:g}, {e.V_R_max:g}]"
             )
         ss = self.state_space(load)
-        lam = wrsg.flux_linkages(p, i)
-        values: dict[str, Any] = {f"lam_{n}": v for n, v in lam._asdict().items()}
-        values |= {n: v for n, v in states._asdict().items() if v is not None}
-        values["theta_e"] = theta_e
-        values |= load.steady(w_r, V_t, i.stator)
-        x = ss.x.pack({n: values[n] for n in ss.x.names})
+        x = self._packed(ss, load, i, states, theta_e, w_r, V_t)
         u = self.inputs(load, w_r=w_r, V_ref=ref)
         rate = ss.f(x, u, []).full().ravel() / ss.x.nominals
         rate[ss.x.index("theta_e")] = 0.0
@@ -315,35 +304,73 @@ class Generator(Parametric):
         y = ss.y.unpack(ss.g(x, u, []).full().ravel())
         return GeneratorPoint(ss, x, u, ref, V_t, y, float(abs(rate[worst])))
 
-    def _at_rest(
-        self, load: Load, w_r: float, V_t: float
-    ) -> tuple[Windings, ac5a.ExciterState, float]:
-        """Return currents, exciter and V_ref at rest with a terminal voltage, V rms."""
-        p = self.machine
-        V_fd, i = self._field(V_t, load.impedance(w_r, V_t), w_r)
-        E_fd = V_fd / p.V_fd_base
-        return i, *ac5a.exciter_steady(self.exciter, E_fd=E_fd, V_t=V_t / p.V_rated_rms)
+    def _packed(
+        self,
+        ss: GeneratorModel,
+        load: Load,
+        i: Windings,
+        states: ac5a.ExciterState,
+        theta_e: float,
+        w_r: float,
+        V_t: float,
+    ) -> np.ndarray:
+        """Return the state of a variant from currents and exciter at rest, zero where not told."""
+        lam = wrsg.flux_linkages(self.machine, i)
+        values: dict[str, Any] = {f"lam_{n}": v for n, v in lam._asdict().items()}
+        values |= {n: v for n, v in states._asdict().items() if v is not None}
+        values |= {"theta_e": theta_e, **load.steady(w_r, V_t, i.stator)}
+        return ss.x.pack({n: values.get(n, 0.0) for n in ss.x.names})
 
-    def _regulated(self, load: Load, w_r: float, V_ref: float) -> float:
-        """Return the terminal voltage, V rms, that the regulator holds with ``V_ref``.
+    def _periodic(
+        self,
+        load: Load,
+        fault: Fault | None,
+        w_r: float,
+        name: str,
+        value: float,
+        theta_e: float,
+    ) -> GeneratorPoint:
+        """Solve for the periodic state, from the one at rest of the load's balanced part."""
+        p, e, rest = self.machine, self.exciter, self._rest
+        ss, vector = self.variant(load, fault), self.fault_vector(load, fault)
+        near, V = load.balanced_part, p.V_rated_rms if name != "V_t" else value
+        i, states, ref = rest.at(near, w_r, V)
+        x = self._packed(ss, near, i, states, theta_e, w_r, V)
 
-        V_t = V_ref - V_R / K_A with 0 <= V_R <= V_R_max at rest, so the root is bracketed.
-        """
-        import scipy.optimize
+        def miss(V_t: float, E: float) -> tuple[float, float, float]:
+            if name == "V_t":
+                return (V_t - value) / p.V_rated_rms, 1.0 / p.V_rated_rms, 0.0
+            if name == "V_fd":
+                return E - value / p.V_fd_base, 0.0, 1.0
+            _, now = ac5a.exciter_steady(e, E_fd=E, V_t=V_t / p.V_rated_rms)
+            _, then = ac5a.exciter_steady(e, E_fd=E + (h := 1e-6), V_t=V_t / p.V_rated_rms)
+            return now - value, 1.0 / p.V_rated_rms, (then - now) / h
 
-        rated, e = self.machine.V_rated_rms, self.exciter
-
-        def excess(V: float) -> float:
-            return self._at_rest(load, w_r, V)[2] - V_ref
-
-        low, high = max((V_ref - e.V_R_max / e.K_A) * rated, 1e-6 * rated), V_ref * rated
-        if high > low and not excess(low) <= 0 <= excess(high):
-            raise OperatingPointError(
-                f"no regulated steady state for {load!r} at V_ref = {V_ref:.5g}, "
-                f"w_r = {w_r:.5g} rad/s: even at {low:.4g} V the regulator would need "
-                f"V_R = {self._at_rest(load, w_r, low)[1].V_R:.4g}, ceiling {e.V_R_max:g}"
-            )
-        return float(scipy.optimize.brentq(excess, low, high, xtol=1e-12, rtol=1e-15))
+        held = self.excitation == "constant"
+        E = value / p.V_fd_base if name == "V_fd" else states.E_fd
+        ref = value if name == "V_ref" else ref
+        u = self.inputs(load, w_r=w_r, V_ref=ref)
+        closing = Closing(held, E, ref, name == ("V_fd" if held else "V_ref"), miss)
+        reversing = ("lam_s0", *(fault.reversing if fault else ()), *load.reversing)
+        found = solve_periodic(ss, x, u, vector, closing, reversing)
+        states_ = found.x
+        V_t = Turn.of(ss, states_, u, vector).mean("V_t")
+        if held:  # the regulator is not there; its states are those of a field at rest
+            at, ref = ac5a.exciter_steady(e, E_fd=found.value, V_t=V_t / p.V_rated_rms)
+            for n, v in at._asdict().items():
+                if v is not None:
+                    states_[ss.x.index(n)] = v
+        else:
+            ref = found.value
+        u = self.inputs(load, w_r=w_r, V_ref=ref)
+        y = ss.y.unpack(ss.g(states_[:, 0], u, vector).full().ravel())
+        V_R = states_[ss.x.index("V_R")]
+        note = ""
+        if not held and not (e.V_R_min < V_R.min() and V_R.max() < e.V_R_max * (1 - 1e-9)):
+            note = f"the voltage regulator is at its limit: V_R = {V_R.mean():.4g}"
+        return GeneratorPoint(
+            ss, states_[:, 0], u, ref, V_t, y, found.defect, vector, states_, note
+        )
 
     # -- standalone studies -----------------------------------------------------------------
 
@@ -352,9 +379,13 @@ class Generator(Parametric):
         load: Load,
         t_end: float,
         *,
+        fault: Fault | None = None,
         switches: Sequence[tuple[float, Load | Fault | Mapping[str, float] | None]] = (),
         w_r: float | None = None,
         V_ref: float | None = None,
+        V_t: float | None = None,
+        V_fd: float | None = None,
+        theta_e: float = 0.0,
         dt_out: float = 50e-6,
         solver: str = "auto",
         rtol: float = simulation.RTOL,
@@ -363,12 +394,12 @@ class Generator(Parametric):
         """Simulate from the steady state with ``load`` through load and fault switches.
 
         Args:
-            load: balanced load at the start.
+            load, fault: at the start, in their steady state.
             t_end: end, s.
             switches: pairs (instant in s, what comes): a load replaces the load, a fault
                 replaces the fault, None clears it, a mapping changes inputs (``w_r``, ``V_ref``,
                 process noise).  Several that share an instant are one switch, whatever their order.
-            w_r, V_ref: as for :meth:`steady_state`.
+            w_r, V_ref, V_t, V_fd, theta_e: as for :meth:`steady_state`.
             dt_out: output interval, s.
             solver, rtol, atol: as for :func:`apu_casadi.core.simulation.simulate`.
 
@@ -376,16 +407,16 @@ class Generator(Parametric):
             xarray.Dataset: see :func:`apu_casadi.core.simulation.simulate`; attributes hold V_ref,
             the switches and, as a JSON list, ``warnings`` (:meth:`spike`).
         """
-        point = self.steady_state(load, w_r=w_r, V_ref=V_ref)
+        how = {"w_r": w_r, "V_ref": V_ref, "V_t": V_t, "V_fd": V_fd}
+        point = self.steady_state(load, fault, **how, theta_e=theta_e)
         n = round(t_end / dt_out)
         if n < 1:
             raise ParameterError(f"t_end = {t_end:g} s is shorter than dt_out = {dt_out:g} s")
         grid = np.arange(n + 1) * dt_out
         if t_end - grid[-1] > 1e-9 * dt_out:
             grid = np.append(grid, t_end)
-        fault: Fault | None = None
         other: dict[str, float] = {"w_r": point.u[0], "V_ref": point.V_ref}
-        plan, ss, u, theta = [], point.ss, point.u, np.zeros(0)
+        plan, ss, u, theta = [], point.ss, point.u, point.theta
         fed, told = [load], list[str]()
         for t, changes in _instants(switches):
             fault = changes.get("fault", fault)
@@ -400,8 +431,9 @@ class Generator(Parametric):
             ss, u, theta = new, u_new, theta_new
         fine = min(each.fineness for each in fed)
         rtol, atol = fine * rtol, fine * atol
+        numbers: dict[str, Any] = {"solver": solver, "rtol": rtol, "atol": atol}
         data = simulation.simulate(
-            point.ss, point.x, grid, point.u, switches=plan, solver=solver, rtol=rtol, atol=atol
+            point.ss, point.x, grid, point.u, point.theta, switches=plan, **numbers
         )
         data.attrs |= {
             "V_ref": point.V_ref,

@@ -120,7 +120,7 @@ class Structure(Parametric):
     """What the equations of a generator depend on, beside numbers.
 
     Args:
-        load, fault, neutral: as of the generator.
+        load, fault, neutral, excitation: as of the generator.
         absent: parameters of the exciter that do not count (:attr:`ExciterParameters.absent`).
     """
 
@@ -128,12 +128,14 @@ class Structure(Parametric):
     fault: FaultStructure | None
     neutral: str
     absent: tuple[str, ...] = ()
+    excitation: str = "regulated"
 
     @property
     def name(self) -> str:
         """Name of the model."""
         parts = ["generator", self.load.kind, self.fault.kind if self.fault else "healthy"]
-        return "_".join(parts + ([] if self.grounded else ["isolated"]))
+        parts += [] if self.grounded else ["isolated"]
+        return "_".join(parts + ([] if self.excitation == "regulated" else ["constant_field"]))
 
     @property
     def grounded(self) -> bool:
@@ -212,7 +214,7 @@ def family(structure: Structure) -> GeneratorModel:
     e = structure.exciter.symbolic(**_by_field(of_exciter, ev))
     V_t, V_ref = ca.SX.sym("V_t"), ca.SX.sym("V_ref")
     ode, alg, y = equations(structure, p, e, x, z, u, th)
-    dex = exciter_rates(p, e, x, V_t, V_ref)
+    dex = exciter_rates(structure, p, e, x, V_t, V_ref)
     ode_v, alg_v, y_v = X.stack(ode), ca.vertcat(*alg), OUTPUTS.stack(y)
     z_expr = solve_linear(ca.jacobian(alg_v, zv), -ca.substitute(alg_v, zv, ca.SX.zeros(len(Z))))
     f_v, g_v = ca.substitute([ode_v, y_v], [zv], [z_expr])
@@ -277,9 +279,16 @@ def variant(structure: Structure, p: MachineParameters, e: ExciterParameters) ->
 
 
 def exciter_rates(
-    p: MachineParameters, e: ExciterParameters, x: dict[str, Any], V_t: Any, V_ref: Any
+    structure: Structure,
+    p: MachineParameters,
+    e: ExciterParameters,
+    x: dict[str, Any],
+    V_t: Any,
+    V_ref: Any,
 ) -> dict[str, Any]:
     """Return the rates of the exciter's states by name, from V_t in V rms."""
+    if structure.excitation == "constant":
+        return {n: ca.SX(0) for n in ac5a.ExciterState._fields if n in x}
     ex = ac5a.ExciterState(*(x.get(n) for n in ac5a.ExciterState._fields))
     dex = ac5a.exciter_rates(e, ex, V_t=V_t / p.V_rated_rms, V_ref=V_ref)
     return {n: d for n, d in dex._asdict().items() if d is not None}
@@ -336,7 +345,7 @@ def equations(
     # exciter
     V_space = ca.sqrt(v_qd0.q**2 + v_qd0.d**2 + (1e-6 * p.V_rated_rms) ** 2)
     V_t = V_space / math.sqrt(2.0)
-    dex = exciter_rates(p, e, x, V_t, u["V_ref"])
+    dex = exciter_rates(structure, p, e, x, V_t, u["V_ref"])
 
     ode = {f"lam_{n}": d for n, d in dlam._asdict().items() if f"lam_{n}" in x}
     ode |= {**dex, "theta_e": w_r, **load.rates(at_load), **(fault.rates(at) if fault else {})}

@@ -13,7 +13,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apu_casadi.core.means import PARTS, PHASES, PHASORS, RMS, as_dict, settled, wanted
+from apu_casadi.core.means import (
+    COMPONENTS,
+    PARTS,
+    PHASES,
+    PHASORS,
+    RMS,
+    SEQUENCES,
+    UNBALANCE,
+    as_dict,
+    sequences,
+    settled,
+    wanted,
+)
 from apu_casadi.core.signals import Signal
 from apu_casadi.machine.generator import Generator, GeneratorPoint
 
@@ -49,39 +61,37 @@ class RawMeans(NamedTuple):
 
 
 class StepMeans:
-    """What is averaged over the steps of one generator, and kept.
+    """What is averaged over the steps of equal generators, and kept.
 
     Args:
         gen: the generator.
-        phasors: whether phasors are wanted too.
+        phasors: whether phasors are kept too.
+        of: which generators, in words.
+        pairs: number of them over two.
     """
 
     gen: Generator
     phasors: bool
     kept: tuple[str, ...]
 
-    def __init__(self, gen: Generator, phasors: bool) -> None:
-        self.gen, self.phasors = gen, phasors
-        self.kept = (*MEANS, *RMS, *(PARTS if phasors else ()))
+    def __init__(
+        self, gen: Generator, phasors: bool, of: str = "the two generators", pairs: float = 1.0
+    ) -> None:
+        self.gen, self.phasors, self._of, self._pairs = gen, phasors, of, pairs
+        self.kept = (*MEANS, *RMS, *SEQUENCES, *(PARTS if phasors else ()))
         # largest power of the torques over eq. (8), both, and the instant
         self.excess: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
     def quad(self, *, short: bool, symmetric: bool) -> tuple[str, ...]:
         """What is averaged; ``short``: a step may be shorter than an electrical period."""
-        means = wanted(phasors=self.phasors, short=short, symmetric=symmetric)
+        means = wanted(phasors=True, short=short, symmetric=symmetric)
         return (*MEANS, *means, "T_e")
 
     def at_rest(self, point: GeneratorPoint) -> np.ndarray:
         """What a step's means would be in the steady state of a balanced load."""
-        y = point.y
-        means = [*(y[n] for n in MEANS), *rms_at_rest(point).values()]
-        if self.phasors:
-            for q in "vi":
-                for p, ahead, behind in ("acb", "bac", "cba"):
-                    # at rotor angle zero, where a steady state starts: v_a = a cos + b sin, and
-                    # the other phases are a third of a turn before and behind it
-                    b = (y[f"{q}_{ahead}"] - y[f"{q}_{behind}"]) / math.sqrt(3.0)
-                    means += [y[f"{q}_{p}"] / math.sqrt(2.0), -b / math.sqrt(2.0)]
+        parts = phasors_at_rest(point)
+        means = [*(point.y[n] for n in MEANS), *rms_at_rest(point).values()]
+        means += [*sequences(parts, symmetric=True), *(parts if self.phasors else ())]
         return np.array(means)
 
     def settle(self, raw: Sequence[RawMeans]) -> np.ndarray:
@@ -95,24 +105,28 @@ class StepMeans:
         turn, w_r = (np.repeat(x, steps) for x in ([r.turn for r in raw], [r.w_r for r in raw]))
         t = np.concatenate([np.atleast_1d(r.t) for r in raw])
         by_name = as_dict(raw[0].quad, values)
-        more = settled(by_name, turn=turn, symmetric=raw[0].symmetric, phasors=self.phasors)
+        more = settled(by_name, turn=turn, symmetric=raw[0].symmetric, phasors=True)
+        rms, parts = more[: len(RMS)], more[len(RMS) :]
         torque = 2.0 * by_name["T_e"] * w_r / self.gen.machine.n_pp
         excess = torque - by_name["P_total"]
         k = int(np.argmax(excess))
         if excess[k] > self.excess[0]:
             at = (excess[k], torque[k], by_name["P_total"][k], t[k])
             self.excess = tuple(map(float, at))
-        return np.concatenate([values[: len(MEANS)], more])
+        of_symmetry = sequences(parts, symmetric=raw[0].symmetric)
+        kept = (values[: len(MEANS)], rms, of_symmetry, *((parts,) if self.phasors else ()))
+        return np.concatenate(kept)
 
     @property
     def warnings(self) -> list[str]:
         """What must be known of the steps settled so far."""
-        more, torque, power, t = self.excess
-        if more <= EXCESS * 2.0 * self.gen.machine.P_rated:
+        *powers, t = self.excess
+        more, torque, power = (self._pairs * P for P in powers)
+        if more <= EXCESS * self._pairs * 2.0 * self.gen.machine.P_rated:
             return []
         return [
             f"eq. (8) gives too little: in the step that ends at t = {t:.6g} s the torque of "
-            f"the two generators takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
+            f"{self._of} takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
             f"the gas generator is loaded, {power / 1e3:.4g} kW; {more / 1e3:.3g} kW are more "
             f"than {100 * EXCESS:g} % of the rated power. Eq. (8) holds output and extra loss "
             "of the fault only: near a short circuit the machine's own loss is missing"
@@ -125,13 +139,35 @@ def rms_at_rest(point: GeneratorPoint) -> dict[str, float]:
     return {name: point.y["V_t"] if name[0] == "V" else I for name in RMS}
 
 
+def phasors_at_rest(point: GeneratorPoint) -> np.ndarray:
+    """Phasors in the steady state of a balanced load, in the order of ``PARTS``."""
+    means = []
+    for q in "vi":
+        for p, ahead, behind in ("acb", "bac", "cba"):
+            # at rotor angle zero, where a steady state starts: v_a = a cos + b sin, and
+            # the other phases are a third of a turn before and behind it
+            b = (point.y[f"{q}_{ahead}"] - point.y[f"{q}_{behind}"]) / math.sqrt(3.0)
+            means += [point.y[f"{q}_{p}"] / math.sqrt(2.0), -b / math.sqrt(2.0)]
+    return np.array(means)
+
+
 def phasor_signals() -> list[Signal]:
-    """Name, unit and meaning of the phasors of a step."""
+    """Name, unit and meaning of the phasors and the symmetrical components of a step."""
     kinds = {"V": ("V", "voltage"), "I": ("A", "current")}
     parts = {"re": "along the rotor angle's cosine", "im": "ahead of it by a quarter turn"}
-    return [
+    order = dict(zip("120", ("positive", "negative", "zero"), strict=True))
+    made = [
         Signal(f"{name}_{part}", unit, f"phase {name[2]} {what}, fundamental, rms, {where}")
         for name in PHASORS
         for unit, what in (kinds[name[0]],)
         for part, where in parts.items()
     ]
+    for name in COMPONENTS:
+        (unit, what), sequence = kinds[name[0]], f"{order[name[2]]} sequence of the"
+        made += [
+            Signal(name, unit, f"{sequence} {what}, fundamental, rms"),
+            Signal(f"{name}_angle", "rad", f"{sequence} {what}, angle ahead of the rotor's"),
+        ]
+    for name, (_, what) in zip(UNBALANCE, kinds.values(), strict=True):
+        made.append(Signal(name, "1", f"negative over positive sequence of the {what}"))
+    return made
