@@ -132,6 +132,41 @@ T5_max = { value = 700.0, unit = "degC" }
     assert gas == {"gas_generator", "compressor_map", "turbine_map", "limits"}
 
 
+def test_several_generators(tmp_path):
+    """One table for all, or one for each: a further one is the first but for what it says."""
+    path = tmp_path / "several.toml"
+    path.write_text("[generator]\ncount = 3\nneutral = 'isolated'\n")
+    three = read_unit(path)
+    assert three.unit == Apu().change({"generator.count": 3, "generator.neutral": "isolated"})
+    assert "generator.count" not in {a.name for a in three.assumed}
+    path.write_text("""
+[coupling]
+eta_gtSg = 0.99
+[[generator]]
+[generator.machine]
+r_s = 0.005
+[[generator]]
+neutral = "isolated"
+machine.P_rated = { value = 60, unit = "kW", source = "plate" }
+[generator.coupling]
+gear = 3.2
+""")
+    two = read_unit(path)
+    a, b = two.unit.machines
+    assert (a.generator.machine.r_s, b.generator.machine.r_s) == (0.005, 0.005)
+    assert (a.generator.machine.P_rated, b.generator.machine.P_rated) == (225e3, 60e3)
+    assert (a.generator.neutral, b.generator.neutral) == ("grounded", "isolated")
+    assert (a.coupling.eta_gtSg, b.coupling.eta_gtSg, b.coupling.gear) == (0.99, 0.99, 3.2)
+    assert two.sources == {"generator2.machine.P_rated": "plate"}
+    assert not {"machine.r_s", "coupling.eta_gtSg"} & {n.name for n in two.assumed}
+    again = tmp_path / "again.toml"
+    for e in (three, two):
+        write_unit(e, again)
+        assert read_unit(again).unit == e.unit and read_unit(again).assumed == ()
+    path.write_text("[[generator]]\n")
+    assert len(read_unit(path).unit.machines) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -145,7 +180,11 @@ T5_max = { value = 700.0, unit = "degC" }
         ("[generator.exciter]\nK_A = 'high'", r"\[generator.exciter\]: .*K_A \[1\].*number"),
         ("[generator]\nneutral = 'open'", r"\[generator\]: neutral = 'open' .*isolated"),
         ("generator = 3", r"\[generator\]: a table is expected, got 3"),
-        ("[[generator]]\n[[generator]]\nneutral = 'isolated'", r"\[\[generator\]\] tables differ"),
+        ("[generator]\ncount = 5", r"\[generator\]: count = 5; a unit has 1 to 4 generators"),
+        ("[generator]\ncount = 2.0", r"\[generator\]: count = 2\.0; a unit has"),
+        ("generator = []", r"no \[\[generator\]\]; a unit has 1 to 4"),
+        (5 * "[[generator]]\n", r"\[\[generator\]\] 5: count = 1; a unit has 1 to 4"),
+        ("[[generator]]\n[generator.machine]\nr = 1", r"\[\[generator.machine\]\] 1: unknown 'r'"),
         ("[coupling]\ngear = 0.0", r"\[coupling\]: .*gear \[1\] = 0 is outside"),
         ("[coupling]\neta_gt = 1.0", r"\[coupling\]: unknown 'eta_gt' .*eta_gtSg"),
         ("[limits]\nT4max = 1", r"\[limits\]: unknown 'T4max' .*T4_max"),

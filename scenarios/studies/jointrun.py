@@ -12,6 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,8 +32,6 @@ from scenarios.shell.template import Template
 from scenarios.studies.registration import series
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import xarray as xr
 
 __all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
