@@ -132,8 +132,9 @@ T5_max = { value = 700.0, unit = "degC" }
     assert gas == {"gas_generator", "compressor_map", "turbine_map", "limits"}
 
 
-def test_several_generators(tmp_path):
+def test_several_generators(tmp_path, capsys, monkeypatch):
     """One table for all, or one for each: a further one is the first but for what it says."""
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "several.toml"
     path.write_text("[generator]\ncount = 3\nneutral = 'isolated'\n")
     three = read_unit(path)
@@ -163,6 +164,13 @@ gear = 3.2
     for e in (three, two):
         write_unit(e, again)
         assert read_unit(again).unit == e.unit and read_unit(again).assumed == ()
+    assert main(["trim", "--engine", str(again), "--load", "50e3", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    one, other = report["generators"]
+    assert report["generator"] == one and one["P_total"] != other["P_total"]
+    assert main(["estimate", "joint", "--engine", str(again), "--scenario", "quiet"]) == 2
+    said = capsys.readouterr().err
+    assert "the joint estimation needs equal generators; these differ: ['generator2." in said
     path.write_text("[[generator]]\n")
     assert len(read_unit(path).unit.machines) == 1
 

@@ -151,9 +151,9 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
     given: dict[str, Any] = {**s.start(), "ambient": s.ambient, "events": s.events()}
     fine: dict[str, Any] = {"dt": FINE, "exchange": "corrected", "waveform_dt": WAVEFORM}
     fine["solver"] = "cvodes"
-    ds = simulate_joint(
-        registry.unit_for(s), duration=s.duration, progress=progress, **given, **fine
-    )
+    unit = registry.unit_for(s)
+    unit.refuse_different("the joint estimation")
+    ds = simulate_joint(unit, duration=s.duration, progress=progress, **given, **fine)
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     return ds
