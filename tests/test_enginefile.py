@@ -312,7 +312,7 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
         "deck --altitude 0 --mach 0 --json": None,
         "linearise --no-figures --json": None,
         "identify --json": None,
-        "calibrate bench.csv --free compressor_map.a_W --json": None,
+        "calibrate bench.csv --free compressor_map.a_W --json --write-engine mine.toml": None,
         "fit data.csv --steady --altitude 0 --json": None,
         "run short.toml --no-figures --json": None,
         "campaign --base short.toml --runs 1 --workers 1 --json": None,
@@ -332,6 +332,18 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
         assert ("machine.r_s" in by_name) != alone, command
         assert ("gas_generator.LHV" in by_name) == ("--voltage" not in command), command
         assert "APS5000" not in out and "36050" not in out
+    assert (
+        main(["run", "short.toml", "--no-figures", "--quiet", "--out", ".", "--solver", "cvodes"])
+        == 0
+    )
+    capsys.readouterr()
+    assert main(["fit", "short.nc", "--estimate", "f_eta_c", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["read_as"]
+    assert "short.nc is a run of tpe331: give --engine tpe331" in said
+    mine = read_unit("mine.toml")
+    assert mine.sources["compressor_map.a_W"] == "fitted to bench.csv (apu calibrate)"
+    assert mine.unit.parameters()["compressor_map.a_W"] == pytest.approx(0.0, abs=1e-6)
+    assert mine.sources["gas_generator.W2"] == "[1]" and mine.assumed == ()
     deck = results.load("deck.nc")
     assert float(deck["PW"].values[-1]) == 746e3 and deck.attrs["engine"] == "tpe331"
     assert main(["trim", "--engine", "tpe331", "--power", "5e5"]) == 0
