@@ -40,7 +40,7 @@ from apu_casadi.machine.faults import ttsc
 from apu_casadi.machine.generatormodel import ANGLE, DRIVES
 from apu_casadi.machine.generatormodel import FLUXES as _ALL_FLUXES
 from apu_casadi.machine.generatormodel import OUTPUTS as GENERATOR
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.machinedata import MachineParameters, require_linear
 from apu_casadi.machine.park import (
     PHASE_ANGLE,
     Abc,
@@ -351,10 +351,11 @@ def terminal_model(p: MachineParameters, fault: str = "shunts") -> StateSpace:
             theta = mu, k_rf, kappa, phase_angle).
 
     Raises:
-        ParameterError: unknown fault.
+        ParameterError: unknown fault, or a machine that saturates.
     """
     if fault not in FAULTS:
         raise ParameterError(f"fault {fault!r} {nearest(str(fault), FAULTS)}")
+    require_linear(p, "the terminal model")
     leaky = fault == "leaky"
     X = FLUXES + Signals([I_FAULT] if leaky else []) + Signals([ANGLE])
     TH = LEAKY if leaky else SHUNTS
