@@ -11,15 +11,18 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from apu_casadi.core.profiles.points import FILE_KEYS as FILE_KEYS_OF_POINTS
+from apu_casadi.core.profiles.points import OfPoints
+from apu_casadi.core.profiles.profile import PROFILES
 from apu_casadi.core.register import Key
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH_FACTORS
-from apu_casadi.machine.faults.fault import FAULTS
+from apu_casadi.machine.faults.fault import FAULTS, Fault
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO
 from scenarios.reading import DEFAULT_FAULT, names_of
-from scenarios.schema import EXCHANGES, FILE_KEYS, Change, Phase, Scenario
+from scenarios.schema import CHANGES, EXCHANGES, FILE_KEYS, Change, Phase, Scenario
 
 Table = dict[str, Any]
 _NONE = {"const": "none", "description": "healthy again"}
@@ -27,7 +30,13 @@ _NONE = {"const": "none", "description": "healthy again"}
 
 def file_schema() -> Table:
     """Return the schema (JSON Schema, draft 7) of a scenario file."""
-    definitions = {"load": _load(), "fault": _fault(), "health": _health()}
+    definitions = {
+        "load": _load(),
+        "fault": _fault(),
+        "health": _health(),
+        "profile": _profile(),
+        "N_ref_rpm": _varies(_number(0.0, open_lo=True, unit="r/min")),
+    }
     table = _object(_scenario(), ("name", "duration", "phase"))
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "apu-casadi scenario"}
     return head | table | {"definitions": definitions}
@@ -66,6 +75,12 @@ def _number(
     return table | ({"description": words} if words else {})
 
 
+def _varies(number: Table) -> Table:
+    """Return a number, or a profile in its place."""
+    made: Table = {"anyOf": [number, {"$ref": "#/definitions/profile"}]}
+    return made | {k: number[k] for k in ("description",) if k in number}
+
+
 def _key(key: Key) -> Table:
     if key.choices:
         return {"enum": list(key.choices), "description": key.doc}
@@ -79,8 +94,28 @@ def _key(key: Key) -> Table:
 def _part(kind: str, keys: Sequence[Key], cls: type, *, optional: bool = False) -> Table:
     needed = [k.name for k in keys if k.default is ...]
     required = needed if optional else ["kind", *needed]
-    table = {"kind": {"const": kind}, **{k.name: _key(k) for k in keys}}
+    own = {k.name: _key(k) if k.choices else _varies(_key(k)) for k in keys}
+    table = {"kind": {"const": kind}, **own}
     return _object(table, required, description=(cls.__doc__ or kind).split("\n")[0])
+
+
+def _profile() -> Table:
+    """Return the kinds of profiles; what has all keys of a kind need not name it."""
+    numbers = {"type": "array", "items": {"type": "number"}, "minItems": 1}
+    text = {"type": "string", "minLength": 1}
+    each = []
+    for kind, cls in PROFILES.items():
+        ways = [{k.name: _key(k) for k in cls.keys}]
+        if issubclass(cls, OfPoints):
+            ways = [{"times": numbers, "values": numbers}, dict.fromkeys(FILE_KEYS_OF_POINTS, text)]
+        told = cls.told_by(dict.fromkeys((*ways[0], "file")))
+        for own in ways:
+            needed = [k.name for k in cls.keys if k.default is ... and k.name in own]
+            needed = needed or ["file"]
+            required = needed if told else ["kind", *needed]
+            words = (cls.__doc__ or kind).split("\n")[0]
+            each.append(_object({"kind": {"const": kind}, **own}, required, description=words))
+    return {"anyOf": each}
 
 
 def _load() -> Table:
@@ -90,13 +125,21 @@ def _load() -> Table:
 
 def _fault() -> Table:
     each = ((kind, FAULTS[kind]) for kind in FAULTS)
-    kinds = [_part(k, cls.keys, cls, optional=k == DEFAULT_FAULT) for k, cls in each]
-    return {"oneOf": [*kinds, _NONE]}
+    kinds = []
+    for kind, cls in each:
+        other = [tuple(new if k.name == n else k for k in cls.keys) for n, new in _instead(cls)]
+        kinds += [_part(kind, k, cls, optional=kind == DEFAULT_FAULT) for k in (cls.keys, *other)]
+    return {"anyOf": [*kinds, _NONE]}
+
+
+def _instead(cls: type[Fault]) -> Sequence[tuple[str, Key]]:
+    """Return keys that may be replaced, each with what replaces it, which is then needed."""
+    return [(n, dataclasses.replace(k, default=...)) for n, k in cls.instead.items()]
 
 
 def _health() -> Table:
     limits: Table = {"lo": HEALTH_LO, "hi": HEALTH_HI, "open_lo": True}
-    factors = {n: _number(**limits, doc=f.doc) for n, f in HEALTH_FACTORS.items()}
+    factors = {n: _varies(_number(**limits, doc=f.doc)) for n, f in HEALTH_FACTORS.items()}
     return {"oneOf": [_object(factors), _NONE]}
 
 
@@ -114,7 +157,7 @@ def _row(cls: type) -> Table:
     """Return phases or events."""
     own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]
     text = {n: {"type": "string", "minLength": 1} for n in own if n == "name"}
-    changes = {n: {"$ref": f"#/definitions/{n}"} for n in ("load", "health", "fault")}
+    changes = {n: {"$ref": f"#/definitions/{n}"} for n in CHANGES}
     item = _object(text | _numbers(cls) | changes, own)
     return {"type": "array", "items": item, "description": (cls.__doc__ or "").split("\n")[0]}
 
@@ -150,7 +193,9 @@ def _parameters() -> Table:
 def _scenario() -> Table:
     docs = docs_of(Scenario)
     texts = {"type": "array", "items": {"type": "string"}}
-    ambient = {n: _number(c.lo, c.hi, unit=c.unit, doc=c.doc) for n, c in CONDITIONS.items()}
+    ambient = {
+        n: _varies(_number(c.lo, c.hi, unit=c.unit, doc=c.doc)) for n, c in CONDITIONS.items()
+    }
     table = _numbers(Scenario) | {
         "name": {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9_-]*$", "maxLength": 100},
         "title": {"type": "string"},

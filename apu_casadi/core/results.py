@@ -1,7 +1,11 @@
 """Labelled results: datasets whose every variable has a unit and a meaning, kept as netCDF.
 
 A joint run has two time coordinates: ``time`` [s], the exchange grid of gas generator and machine,
-and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for).
+and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for).  Where generators
+differ during the run, what belongs to one of them (``I_a_rms``, ``P_e``, ``mu``, ``v_a``) has the
+dimension ``generator`` before that of time, with their numbers from 1 as coordinate; where all stay
+alike, as in the paper, it has not: then it is that of each.  ``P_total`` and ``P_inst`` are the
+unit's.  :func:`of_generator` gives the second form of either.
 """
 
 from __future__ import annotations
@@ -85,6 +89,9 @@ CHANNELS: Mapping[str, tuple[str, str]] = {
 }
 """Unit and meaning of every variable that a joint run may hold, by name."""
 
+GENERATOR = "generator"
+"""Dimension of what generators have of their own, where they differ; numbers from 1."""
+_TOLD = ("units", "long_name")
 _TIMES = {
     "time": ("s", "time on the exchange grid"),
     "time_w": ("s", "time of the waveform samples"),
@@ -97,15 +104,17 @@ def dataset(
     *,
     signals: Iterable[Signal] = (),
     attrs: Mapping[str, str | int | float] | None = None,
+    generators: int = 0,
 ) -> xr.Dataset:
     """Build a labelled dataset from arrays.
 
     Args:
         times: time coordinates [s] by name, each strictly increasing, shape (n,).
-        values: per time coordinate, arrays of shape (n,), also lazy ones of
+        values: per time coordinate, arrays of shape (n,) or (generators, n), also lazy ones of
             :mod:`apu_casadi.core.filearrays`, or scalars by variable name.
         signals: units and meanings; they come before those of :data:`CHANNELS`.
         attrs: attributes of the dataset; text or numbers.
+        generators: their number, for what each has of its own.
 
     Returns:
         xarray.Dataset with ``units`` and ``long_name`` on every variable and coordinate.
@@ -142,12 +151,44 @@ def dataset(
             if name in variables:
                 raise SignalError(f"{name}: given on {variables[name][0]} and on {dim}")
             a = value if is_lazy(value) else np.asarray(value, dtype=float)
+            if a.shape == (generators, n):
+                coords.setdefault(GENERATOR, _numbers(generators))
+                variables[name] = ((GENERATOR, dim), a, dict(zip(_TOLD, known[name], strict=True)))
+                continue
             if a.shape not in ((), (n,)):
                 raise SignalError(f"{name}: shape ({n},) as {dim} expected, got {a.shape}")
             unit, doc = known[name]
             a = np.full(n, float(a)) if a.ndim == 0 else a
             variables[name] = (dim, a, {"units": unit, "long_name": doc})
     return xr.Dataset(variables, coords=coords, attrs=dict(attrs or {}))
+
+
+def _numbers(n: int) -> tuple[str, np.ndarray, dict[str, str]]:
+    """Return the coordinate of n generators."""
+    numbers = np.arange(1, n + 1, dtype=np.int32)
+    return GENERATOR, numbers, {"units": "1", "long_name": "number of the generator"}
+
+
+def generators_of(ds: xr.Dataset) -> tuple[int, ...]:
+    """Return the numbers of a run's generators that differ; (1,) where all are alike."""
+    return tuple(ds[GENERATOR].values.tolist()) if GENERATOR in ds.coords else (1,)
+
+
+def of_generator(ds: xr.Dataset, number: int = 1) -> xr.Dataset:
+    """Return a run as one of its generators has it, without the dimension ``generator``.
+
+    Works for runs whose generators are alike, and for files from before there was a dimension.
+
+    Raises:
+        DataError: there is no such generator.
+    """
+    if GENERATOR in ds.coords:
+        if number not in ds[GENERATOR].values:
+            raise DataError(f"{_source(ds)}generator {number}: {generators_of(ds)} are there")
+        return ds.sel({GENERATOR: number}, drop=True)
+    if not 1 <= number <= int(ds.attrs.get("generators", 2)):
+        raise DataError(f"{_source(ds)}generator {number}: there are {ds.attrs['generators']}")
+    return ds
 
 
 def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:

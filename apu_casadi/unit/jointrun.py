@@ -20,9 +20,10 @@ from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Ambient, Event, Holding
 from apu_casadi.unit.exchange import PAPER, governed_step
-from apu_casadi.unit.integrators import WAVEFORMS, Settings
+from apu_casadi.unit.integrators import Settings
 from apu_casadi.unit.jointstep import BLOCK
-from apu_casadi.unit.machinestep import MachineMade, MachineStep
+from apu_casadi.unit.machines import Machines
+from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Row
 
@@ -36,13 +37,14 @@ class Asked:
     """What a run is asked for; see :func:`apu_casadi.unit.multirate.simulate_joint`.
 
     Args:
-        load, fault, ambient, health: from the start; all health factors by name.
+        loads, faults: of each generator from the start.
+        ambient, health: from the start; all health factors by name.
         grid: exchange instants, s.
         phasors, noise, seed, hook: as there.
     """
 
-    load: Load
-    fault: Fault | None
+    loads: tuple[Load, ...]
+    faults: tuple[Fault | None, ...]
     ambient: Ambient
     health: dict[str, float]
     grid: np.ndarray
@@ -65,7 +67,7 @@ class JointRun:
     settings: Settings
     now: Holding
     point: JointPoint
-    machine: MachineStep
+    machines: Machines
     x: np.ndarray
     u: np.ndarray
     theta: np.ndarray
@@ -77,10 +79,10 @@ class JointRun:
         self, apu: Apu, asked: Asked, settings: Settings, rng: np.random.Generator
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
-        start = asked.load.balanced_part
-        self.now = Holding(asked.load, asked.fault, asked.health)
+        start = [load.balanced_part for load in asked.loads]
+        self.now = Holding(asked.loads, asked.faults, asked.health)
         self.point = apu.steady_state(start, ambient=asked.ambient, health=self.now.factors)
-        self.machine = MachineStep(apu, self.point.generator, start, settings, asked.phasors)
+        self.machines = Machines(apu, self.point, self.now, settings, asked.phasors)
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)
@@ -92,17 +94,15 @@ class JointRun:
 
     def at_start(self) -> Row:
         """What is recorded of the first instant."""
-        point = self.point.generator
-        means = self.machine.means.at_rest(point)
-        w = np.array([[point.y[n]] for n in WAVEFORMS])
-        return Row(self.y, means, self.now.factors, None, np.zeros(1), w)
+        at_rest = self.machines.at_rest(self.point)
+        return Row(self.y, at_rest, self.now.factors, np.zeros(1))
 
     def switch(self, events: Sequence[Event], t: float) -> None:
         """Take the events of an instant, s, which are one switch, whatever their order."""
         before, self.now = self.now, self.now.after(events)
         if self.now.factors is not before.factors:
             self.theta = self.apu.gas_generator.THETA.pack(self.now.factors)
-        if self.machine.switch(self.now.load, self.now.fault, t) or events:
+        if self.machines.switch(self.now, t) or events:
             self.slope = None
 
     def advance(self, k: int, until: float) -> tuple[int, Row]:
@@ -113,26 +113,28 @@ class JointRun:
 
     def _block(self, k: int) -> tuple[int, Row]:
         grid = self.asked.grid[k : k + BLOCK + 1]
-        done, made = self.machine.block(self.x, self.z, self.governor, self.u, self.theta, grid)
+        done, made = self.machines.block(self.x, self.z, self.governor, self.u, self.theta, grid)
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
         return BLOCK, self._row(done.y, made)
 
-    def _row(self, y: np.ndarray, made: MachineMade) -> Row:
-        return Row(y, made.means, self.now.factors, self.machine.phase.fault, made.t, made.w)
+    def _row(self, y: np.ndarray, made: list[MachineMade]) -> Row:
+        t = made[0].t
+        if self.settings.waveform_dt is not None:
+            for other in made[1:]:  # equal but for rounding: no generator goes before another
+                t = np.maximum(t, other.t)
+        return Row(y, self.machines.rows(made), self.now.factors, t)
 
     def _step(self, k: int) -> tuple[int, Row]:
         noise, way, gg = self.asked.noise, self.settings.way, self.apu.gas_generator
         if noise.w1 or noise.w2:
-            draw = self._rng.standard_normal
-            self.machine.disturb(noise.w1 * draw(3), noise.w2 * draw(3))
+            self.machines.disturb(self._rng.standard_normal, noise.w1, noise.w2)
         t0, N = float(self.asked.grid[k]), float(self.x[0])
         h = float(self.asked.grid[k + 1] - self.asked.grid[k])
         u, theta = self.u, self.theta
 
-        def machine(N: float, slope: float) -> tuple[float, MachineMade]:
-            made = self.machine.step(N, slope, h, t0)
-            return made.means.values[0, 0], made
+        def machine(N: float, slope: float) -> tuple[float, list[MachineMade]]:
+            return self.machines.step(N, slope, h, t0)
 
         def engine(Wf: float, PW: float) -> tuple[float, tuple[np.ndarray, ...]]:
             u[0], u[1] = Wf, PW
@@ -143,7 +145,7 @@ class JointRun:
         slope = self.slope or 0.0
         try:
             done = governed_step(
-                self.apu.link,
+                self.apu.shaft,
                 way,
                 machine,
                 engine,
@@ -153,7 +155,7 @@ class JointRun:
                 slope=slope,
                 passes=passes,
             )
-            self.machine.accept(done.machine, h)
+            self.machines.accept(done.machine, h)
             row = self._went_on(k + 1, done.machine, *done.engine)
         except SimulationError as error:
             raise self._explained(error, k, N) from None
@@ -161,7 +163,7 @@ class JointRun:
         return 1, row
 
     def _went_on(
-        self, k: int, made: MachineMade, x: np.ndarray, y: np.ndarray, z: np.ndarray
+        self, k: int, made: list[MachineMade], x: np.ndarray, y: np.ndarray, z: np.ndarray
     ) -> Row:
         """Take over the gas generator's step, with state noise and hook before its output."""
         noise, hook = self.asked.noise.N, self.asked.hook
@@ -169,7 +171,7 @@ class JointRun:
             x = x + noise * self._rng.standard_normal(1)
             if hook is not None:
                 # it may simulate the same unit: views of buffers would change
-                made = made._replace(w=made.w.copy())
+                made = [m._replace(w=m.w.copy()) for m in made]
                 x = np.asarray(hook(k, x), float).reshape(1)
             y, z = self.apu.gas_generator.output(x, self.u, self.theta, z0=z)
         self.x, self.y, self.z = x, y, z

@@ -46,6 +46,7 @@ from apu_casadi.unit.events import Ambient, Event, all_factors, in_order
 from apu_casadi.unit.exchange import EXCHANGES
 from apu_casadi.unit.integrators import SOLVERS, WAVEFORMS, Settings, ramped
 from apu_casadi.unit.jointrun import Asked, JointRun
+from apu_casadi.unit.machines import kinds, means_of
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Recorder, stored_severities
 from apu_casadi.unit.stepmeans import MEANS
@@ -87,10 +88,10 @@ def simulate_joint(
     apu: Apu,
     *,
     duration: float,
-    load: Load,
+    load: Load | Sequence[Load],
     ambient: Ambient | None = None,
     health: Mapping[str, float] | None = None,
-    fault: Fault | None = None,
+    fault: Fault | Sequence[Fault | None] | Mapping[int, Fault | None] | None = None,
     events: Sequence[Event] = (),
     dt: float = 0.02,
     exchange: str = "paper",
@@ -107,13 +108,14 @@ def simulate_joint(
     storage: str | os.PathLike[str] = "auto",
     warn_exchange: bool = True,
 ) -> xr.Dataset:
-    """Simulate gas generator, two generators and governor together, from a steady start.
+    """Simulate gas generator, generators and governor together, from a steady start.
 
     Nothing moves before the first event.  A fault or an unbalanced load given for the start acts
     from t = 0 on the steady healthy, balanced unit.
 
     Args:
-        apu, load, fault: the unit; load and fault of each generator from the start.
+        apu, load, fault: the unit; load and fault from the start, of all generators, or a list with
+            one for each; for the fault also a mapping by number of the generator, from 1.
         duration, dt: of the run, and exchange step, s.
         ambient, health: day (the default one if not given), and factors by name.
         events: :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`.
@@ -130,7 +132,8 @@ def simulate_joint(
 
     Returns:
         xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms), see
-        :mod:`apu_casadi.core.results`.  Attributes: what was asked, ``exchange_error`` (NaN with
+        :mod:`apu_casadi.core.results`; what belongs to a generator also on ``generator`` where
+        they do not stay equal.  Attributes: what was asked, ``exchange_error`` (NaN with
         state noise or a hook), ``validity`` and ``warnings``.
 
     Warns:
@@ -143,10 +146,10 @@ def simulate_joint(
     noise = Noise() if noise is None else noise
     duration = number("duration", duration, error=ScenarioError)
     settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
-    events = in_order(events, duration)
+    events = in_order(events, duration, generators=len(apu.machines))
     asked = Asked(
-        load=load,
-        fault=fault,
+        loads=apu.each("load", load),
+        faults=apu.each("fault", _by_number(apu, fault)),
         ambient=Ambient() if ambient is None else ambient,
         health=all_factors(health),
         grid=exchange_grid(duration, settings.dt, events),
@@ -157,12 +160,24 @@ def simulate_joint(
     )
     rng = np.random.default_rng(seed)
     system = JointRun(apu, asked, settings, rng)
-    samples, means = system.machine.samples(asked.grid), system.machine.means
-    severities = stored_severities(events, asked.fault)
+    samples = system.machines.samples(asked.grid)
+    means = {k: means_of(apu, k, phasors) for k in kinds(apu, system.now, events)}
+    severities = stored_severities(events, *asked.faults)
     record = Recorder(apu.gas_generator, asked.grid, samples, means, storage, severities)
     record.put(0, 1, system.at_start())
     run(system, asked.grid, events, record=record.put, progress=progress)
     return _concluded(system, record, rng, exchange, events, warn_exchange, attrs or {})
+
+
+def _by_number(apu: Apu, fault: Any) -> Any:
+    """Return a mapping of faults by number as a list."""
+    if not isinstance(fault, Mapping):
+        return fault
+    n = len(apu.machines)
+    for k in fault:
+        if k not in range(1, n + 1):
+            raise ScenarioError(f"fault: generator {k!r}, but the unit has 1 to {n}")
+    return [fault.get(k) for k in range(1, n + 1)]
 
 
 def _settings(
@@ -199,9 +214,9 @@ def _concluded(
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
     """Make the dataset of a run, with what must be known of it in attributes and warnings."""
-    apu, asked, settings, machine = system.apu, system.asked, system.settings, system.machine
+    apu, asked, settings, machines = system.apu, system.asked, system.settings, system.machines
     rows, grid = record.instants(), asked.grid
-    N, Wf, P_e = (np.asarray(rows[n]) for n in ("N", "Wf", "P_e"))
+    N, Wf = (np.asarray(rows[n]) for n in ("N", "Wf"))
     lost = math.nan
     # state noise is drawn for each step: no other exchange has it
     if asked.hook is None and not asked.noise.N:
@@ -212,25 +227,28 @@ def _concluded(
         "atol": settings.atol,
         "dt": settings.dt,
         "exchange": exchange,
-        "nsteps_generator": machine.nsteps,
-        "steps_propagated": machine.propagated,
+        "nsteps_generator": machines.nsteps,
+        "steps_propagated": machines.propagated,
         "residual_max": record.residual_max(),
         "seed": asked.seed,
-        "V_ref": machine.V_ref,
+        "V_ref": machines.V_ref,
     }
     told = runrecord.asked(
-        load=asked.load,
-        fault=asked.fault,
+        loads=asked.loads,
+        faults=asked.faults,
         ambient=asked.ambient,
         events=events,
         seed=asked.seed,
     )
     told = {"solver": json.dumps(status), **told, "exchange_error": lost, **attrs}
     ds = record.collect(apu, rows, asked.noise, rng, told)
-    notes = [ApuWarning(words) for words in machine.warnings]
+    notes = [ApuWarning(words) for words in (*machines.spikes, *record.warnings)]
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
     starved = validity.fuel_limited(apu, grid, N, Wf)
-    unserved = validity.unserved(asked.load, events, grid, P_e)
-    notes += [ValidityWarning(words) for words in (starved, unserved) if words]
+    unserved = [
+        validity.unserved(asked.loads[k[0] - 1], events, grid, P_e, k, of_all=len(record.of) == 1)
+        for k, P_e in record.of_each("P_e", rows).items()
+    ]
+    notes += [ValidityWarning(words) for words in (starved, *unserved) if words]
     found = validity.departures(apu.gas_generator, grid, rows)
     return validity.conclude(ds, found, notes, stacklevel=4)

@@ -7,6 +7,7 @@ sum (:func:`upcrossing_rate`).
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from scipy import optimize
@@ -50,6 +51,12 @@ def windowed_nis(
     return out[0], np.round(out[1])
 
 
+@lru_cache(maxsize=1)
+def _gauss() -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of Gauss and Legendre on (-1, 1); to find them costs an eigenproblem."""
+    return np.polynomial.legendre.leggauss(400)
+
+
 def upcrossing_rate(threshold: float, dof: int, window: int) -> float:
     """Return how often, for each sample, a moving sum of chi-squared values rises past a threshold.
 
@@ -67,7 +74,7 @@ def upcrossing_rate(threshold: float, dof: int, window: int) -> float:
         return float(consistency.below(threshold, dof) * consistency.above(threshold, dof))
     # a = c - t^2: smooth at the edge also for one degree of freedom; beyond 40 sd nothing is left
     reach = math.sqrt(min(threshold, dof + 40 * math.sqrt(2 * dof) + 80))
-    t, w = np.polynomial.legendre.leggauss(400)
+    t, w = _gauss()
     t, w = reach / 2 * (t + 1), reach / 2 * w
     shared = consistency.density(threshold - t**2, dof * (window - 1))
     one = consistency.below(t**2, dof) * consistency.above(t**2, dof)

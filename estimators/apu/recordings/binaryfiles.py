@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,14 +10,20 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from estimators.apu.recordings.columns import Column, cut, header, parsed
+from apu_casadi.core.units import header, unit_of
+from estimators.apu.recordings.columns import Column, Tell, cut, parsed
 
-__all__ = ["netcdf_columns", "parquet_columns"]
+__all__ = [
+    "dataset_columns",
+    "frame_columns",
+    "netcdf_columns",
+    "parquet_columns",
+    "time_dims",
+    "typed",
+]
 
-Tell = Callable[[str], None]
 
-
-def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
+def typed(path: Path | str, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
     """Make a column of an array, or of a pandas series, of any type.
 
     Raises:
@@ -87,6 +92,11 @@ def parquet_columns(path: Path, tell: Tell) -> list[Column]:
         frame = pd.read_parquet(path, engine=engine)
     except Exception as e:  # damaged files fail with any type
         raise DataError(f"{path}: damaged Parquet file ({type(e).__name__}: {e})") from None
+    return frame_columns(path, frame, tell)
+
+
+def frame_columns(path: Path | str, frame: Any, tell: Tell) -> list[Column]:
+    """Return the columns of a pandas.DataFrame, those of its index first."""
     columns = []
     for level in range(frame.index.nlevels):
         values = frame.index.get_level_values(level)
@@ -108,14 +118,12 @@ def parquet_columns(path: Path, tell: Tell) -> list[Column]:
     return columns
 
 
-def _label(path: Path, label: Any) -> tuple[str, Any]:
+def _label(path: Path | str, label: Any) -> tuple[str, Any]:
     """Name and unit of a column; of several levels the first is the name, the second the unit."""
     if not isinstance(label, tuple):
         return header(str(label))
     parts = [str(p).strip() for p in label if str(p).strip()]
     if len(parts) == 2:
-        from apu_casadi.core.units import unit_of
-
         unit = parts[1].strip("[]()")
         if unit_of(unit) is not None:
             return parts[0], unit
@@ -130,19 +138,39 @@ def _label(path: Path, label: Any) -> tuple[str, Any]:
 # ------------------------------------------------------------------------------ netCDF
 
 
-def netcdf_columns(path: Path, tell: Tell) -> tuple[list[Column], dict[str, str]]:
+def netcdf_columns(
+    path: Path, tell: Tell, dim: str | None = None
+) -> tuple[list[Column], dict[str, str]]:
     """Read a netCDF file; return its columns, and why other variables are none."""
-    import xarray as xr
+    return dataset_columns(path, open_netcdf(path), tell, dim)
 
+
+def open_netcdf(path: Path) -> Any:
+    """Return the dataset of a netCDF 3 or 4 file, times as the file has them."""
     from apu_casadi.core.results import load
 
     with path.open("rb") as f:
         start = f.read(4)
-    data = _netcdf4(path) if start == b"\x89HDF" else load(path)
-    sizes = {d: int(n) for d, n in data.sizes.items()}
+    return _netcdf4(path) if start == b"\x89HDF" else load(path)
+
+
+def time_dims(data: Any) -> list[str]:
+    """Dimensions along which a dataset has columns, the longest last."""
+    found = [d for d in data.sizes if any(v.dims == (d,) for v in data.data_vars.values())]
+    return sorted(map(str, found), key=lambda d: int(data.sizes[d]))
+
+
+def dataset_columns(
+    path: Path | str, data: Any, tell: Tell, dim: str | None = None
+) -> tuple[list[Column], dict[str, str]]:
+    """Return the columns of an xarray.Dataset along one dimension, and why other ones are none."""
+    import xarray as xr
+
+    sizes = {str(d): int(n) for d, n in data.sizes.items()}
     if not sizes:
         raise DataError(f"{path}: no data rows")
-    dim = "time" if "time" in sizes else max(sizes, key=lambda d: sizes[d])
+    if dim is None:
+        dim = "time" if "time" in sizes else max(sizes, key=lambda d: sizes[d])
     out, others = [], {}
     for name in [*data.coords, *data.data_vars]:
         v = data[name].squeeze([d for d in data[name].dims if d != dim and sizes[d] == 1])
