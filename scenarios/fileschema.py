@@ -11,23 +11,38 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from apu_casadi.core.profiles.points import FILE_KEYS as FILE_KEYS_OF_POINTS
+from apu_casadi.core.profiles.points import OfPoints
+from apu_casadi.core.profiles.profile import PROFILES
 from apu_casadi.core.register import Key
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH_FACTORS
-from apu_casadi.machine.faults.fault import FAULTS
+from apu_casadi.machine.faults.fault import FAULTS, Fault
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
-from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO
+from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST
 from scenarios.reading import DEFAULT_FAULT, names_of
-from scenarios.schema import EXCHANGES, FILE_KEYS, Change, Phase, Scenario
+from scenarios.schema import CHANGES, EXCHANGES, FILE_KEYS, Change, Phase, Scenario
 
 Table = dict[str, Any]
+_GENERATOR = {"$ref": "#/definitions/generator"}
+_HEALED = ("kind", "generator")
 _NONE = {"const": "none", "description": "healthy again"}
 
 
 def file_schema() -> Table:
     """Return the schema (JSON Schema, draft 7) of a scenario file."""
-    definitions = {"load": _load(), "fault": _fault(), "health": _health()}
+    number = {"type": "integer", "minimum": 1, "maximum": MOST, "description": "of a generator"}
+    one_load = _load()
+    several = {"type": "array", "items": one_load, "minItems": 1, "maxItems": MOST}
+    definitions = {
+        "load": {"anyOf": [one_load, several | {"description": "one for each generator"}]},
+        "fault": _fault(),
+        "generator": number,
+        "health": _health(),
+        "profile": _profile(),
+        "N_ref_rpm": _varies(_number(0.0, open_lo=True, unit="r/min")),
+    }
     table = _object(_scenario(), ("name", "duration", "phase"))
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "apu-casadi scenario"}
     return head | table | {"definitions": definitions}
@@ -66,6 +81,12 @@ def _number(
     return table | ({"description": words} if words else {})
 
 
+def _varies(number: Table) -> Table:
+    """Return a number, or a profile in its place."""
+    made: Table = {"anyOf": [number, {"$ref": "#/definitions/profile"}]}
+    return made | {k: number[k] for k in ("description",) if k in number}
+
+
 def _key(key: Key) -> Table:
     if key.choices:
         return {"enum": list(key.choices), "description": key.doc}
@@ -79,8 +100,28 @@ def _key(key: Key) -> Table:
 def _part(kind: str, keys: Sequence[Key], cls: type, *, optional: bool = False) -> Table:
     needed = [k.name for k in keys if k.default is ...]
     required = needed if optional else ["kind", *needed]
-    table = {"kind": {"const": kind}, **{k.name: _key(k) for k in keys}}
+    own = {k.name: _key(k) if k.choices else _varies(_key(k)) for k in keys}
+    table = {"kind": {"const": kind}, **own}
     return _object(table, required, description=(cls.__doc__ or kind).split("\n")[0])
+
+
+def _profile() -> Table:
+    """Return the kinds of profiles; what has all keys of a kind need not name it."""
+    numbers = {"type": "array", "items": {"type": "number"}, "minItems": 1}
+    text = {"type": "string", "minLength": 1}
+    each = []
+    for kind, cls in PROFILES.items():
+        ways = [{k.name: _key(k) for k in cls.keys}]
+        if issubclass(cls, OfPoints):
+            ways = [{"times": numbers, "values": numbers}, dict.fromkeys(FILE_KEYS_OF_POINTS, text)]
+        told = cls.told_by(dict.fromkeys((*ways[0], "file")))
+        for own in ways:
+            needed = [k.name for k in cls.keys if k.default is ... and k.name in own]
+            needed = needed or ["file"]
+            required = needed if told else ["kind", *needed]
+            words = (cls.__doc__ or kind).split("\n")[0]
+            each.append(_object({"kind": {"const": kind}, **own}, required, description=words))
+    return {"anyOf": each}
 
 
 def _load() -> Table:
@@ -89,14 +130,27 @@ def _load() -> Table:
 
 
 def _fault() -> Table:
-    each = ((kind, FAULTS[kind]) for kind in FAULTS)
-    kinds = [_part(k, cls.keys, cls, optional=k == DEFAULT_FAULT) for k, cls in each]
-    return {"oneOf": [*kinds, _NONE]}
+    kinds, of_one = [], [_object({"kind": {"const": "none"}, "generator": _GENERATOR}, _HEALED)]
+    for kind, cls in ((kind, FAULTS[kind]) for kind in FAULTS):
+        other = [tuple(new if k.name == n else k for k in cls.keys) for n, new in _instead(cls)]
+        for keys in (cls.keys, *other):
+            made = _part(kind, keys, cls, optional=kind == DEFAULT_FAULT)
+            kinds.append(made)
+            own = {**made["properties"], "generator": _GENERATOR}
+            required = [*made.get("required", ()), "generator"]
+            of_one.append(made | {"properties": own, "required": required})
+    several = {"type": "array", "items": {"anyOf": of_one}, "minItems": 1, "maxItems": MOST}
+    return {"anyOf": [*kinds, *of_one, several, _NONE]}
+
+
+def _instead(cls: type[Fault]) -> Sequence[tuple[str, Key]]:
+    """Return keys that may be replaced, each with what replaces it, which is then needed."""
+    return [(n, dataclasses.replace(k, default=...)) for n, k in cls.instead.items()]
 
 
 def _health() -> Table:
     limits: Table = {"lo": HEALTH_LO, "hi": HEALTH_HI, "open_lo": True}
-    factors = {n: _number(**limits, doc=f.doc) for n, f in HEALTH_FACTORS.items()}
+    factors = {n: _varies(_number(**limits, doc=f.doc)) for n, f in HEALTH_FACTORS.items()}
     return {"oneOf": [_object(factors), _NONE]}
 
 
@@ -114,7 +168,8 @@ def _row(cls: type) -> Table:
     """Return phases or events."""
     own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]
     text = {n: {"type": "string", "minLength": 1} for n in own if n == "name"}
-    changes = {n: {"$ref": f"#/definitions/{n}"} for n in ("load", "health", "fault")}
+    names = [n for n in names_of(cls) if n in (*CHANGES, "generator")]
+    changes = {n: {"$ref": f"#/definitions/{n}"} for n in names}
     item = _object(text | _numbers(cls) | changes, own)
     return {"type": "array", "items": item, "description": (cls.__doc__ or "").split("\n")[0]}
 
@@ -144,13 +199,22 @@ def _parameters() -> Table:
         part, _, last = name.partition(".")
         table[name] = one
         table.setdefault(part, _object({}))["properties"][last] = one
-    return _object(table)
+    own = {n: table[n] for n in ("machine", "exciter", "coupling")}
+    own["neutral"] = table["generator.neutral"]
+    dotted = "|".join(f"{s}\\.{n}" for s in own if s != "neutral" for n in own[s]["properties"])
+    patterns = {
+        f"^generator[1-{MOST}]$": _object(own),
+        rf"^generator[1-{MOST}]\.({dotted}|neutral)$": {"type": ["number", "string"]},
+    }
+    return _object(table, patternProperties=patterns)
 
 
 def _scenario() -> Table:
     docs = docs_of(Scenario)
     texts = {"type": "array", "items": {"type": "string"}}
-    ambient = {n: _number(c.lo, c.hi, unit=c.unit, doc=c.doc) for n, c in CONDITIONS.items()}
+    ambient = {
+        n: _varies(_number(c.lo, c.hi, unit=c.unit, doc=c.doc)) for n, c in CONDITIONS.items()
+    }
     table = _numbers(Scenario) | {
         "name": {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9_-]*$", "maxLength": 100},
         "title": {"type": "string"},

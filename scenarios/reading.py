@@ -9,12 +9,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
-from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table
-from apu_casadi.machine.loads.load import LOADS, Load, load_from_table
+from apu_casadi.core.profiles.profile import Profile, Varying, profile_from_table
+from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table, fault_of
+from apu_casadi.machine.loads.load import LOADS, Load, load_from_table, load_of
+from apu_casadi.unit.events import MOST
 from scenarios import extensions
 
 if TYPE_CHECKING:
@@ -102,13 +105,52 @@ def load_parts(paths: Collection[str]) -> None:
         extensions.load(paths)
 
 
-def read_load(data: Any, place: str = "load") -> Load:
+def read_profile(value: Any, place: str, folder: str = "") -> Any:
+    """Return the profile that a table describes; what is no table is returned as it is.
+
+    Raises:
+        ScenarioError: no profile, or a wrong key or value of one; or a file that is wrong.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    with inside(place):
+        return profile_from_table(value, place, folder)
+
+
+def files_seen_from(folder: Path, value: Any) -> Any:
+    """Return tables with the files of their profiles seen from a folder."""
+    if isinstance(value, list):
+        return [files_seen_from(folder, v) for v in value]
+    if not isinstance(value, Mapping):
+        return value
+    table = {k: files_seen_from(folder, v) for k, v in value.items()}
+    if isinstance(table.get("file"), str) and table["file"]:
+        table["file"] = str(folder / table["file"])
+    return table
+
+
+def of_profiles(made_of: Any, table: Mapping[str, Any]) -> Any:
+    """Return what changes in time if there are profiles among the values, else None.
+
+    Its values are checked at the bounds of each profile.
+    """
+    table = {k: read_profile(v, k) for k, v in table.items()}
+    changing = {k for k, v in table.items() if isinstance(v, Profile)}
+    if not changing:
+        return None
+    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+    return Varying(made_of, tuple(plain.items())).check()
+
+
+def read_load(data: Any, place: str = "load") -> Load | Varying[Load]:
     """Return the load that a table describes by ``kind`` and the keys of that kind.
+
+    A value that is a table itself is a profile, and the load one that changes in time.
 
     Raises:
         ScenarioError: an unknown kind, a key that it does not take or lacks, a wrong value.
     """
-    if isinstance(data, Load):
+    if isinstance(data, Load | Varying):
         return data
     with inside(place):
         require(isinstance(data, Mapping), "kind", f"missing: a table is expected: {data!r}")
@@ -117,31 +159,35 @@ def read_load(data: Any, place: str = "load") -> Load:
         takes = ("kind", *(k.name for k in LOADS[kind].tables[kind]))
         for k in data:
             require(k in every or k in takes, str(k), f"unknown key {nearest(str(k), takes)}")
-        return load_from_table(data)
+        return of_profiles(load_of, data) or load_from_table(data)
 
 
-def read_fault(data: Any, place: str = "fault") -> Fault:
+def read_fault(data: Any, place: str = "fault") -> Fault | Varying[Fault | None]:
     """Return the fault that a table describes; without ``kind`` it is a turn-to-turn short circuit.
+
+    A value that is a table itself is a profile, and the fault one that changes in time.
 
     Raises:
         ScenarioError: an unknown kind, a key that it does not take or lacks, a wrong value.
     """
-    if isinstance(data, Fault):
+    if isinstance(data, Fault | Varying):
         return data
     if not isinstance(data, Mapping):
         names = ", ".join(k.name for k in FAULTS[DEFAULT_FAULT].keys)
         text = f'a table with {names}, or "none", is expected, got {data!r}'
         raise PlacedError(place, text)
     with inside(place):
-        keys = FAULTS[_kind(data, FAULTS, DEFAULT_FAULT)].keys
+        kind = FAULTS[_kind(data, FAULTS, DEFAULT_FAULT)]
+        other = {n: k.name for n, k in kind.instead.items()}
         for k in data:
-            takes = ("kind", *(key.name for key in keys))
+            takes = ("kind", *(key.name for key in kind.keys), *other.values())
             require(k in takes, str(k), f"unknown key {nearest(str(k), takes)}")
-        needed = [k.name for k in keys if k.default is ...]
+        needed = [k.name for k in kind.keys if k.default is ...]
         for n in needed:
             both = f"{' and '.join(needed)} are both needed for a severity"
-            require(n in data, n, f"missing: {both if len(needed) == 2 else 'needed'}")
-        return fault_from_table(data, DEFAULT_FAULT)
+            there = n in data or other.get(n) in data
+            require(there, n, f"missing: {both if len(needed) == 2 else 'needed'}")
+        return of_profiles(fault_of, data) or fault_from_table(data, DEFAULT_FAULT)
 
 
 def _kind(data: Mapping[str, Any], known: Mapping[str, Any], default: str | None = None) -> str:
@@ -150,6 +196,80 @@ def _kind(data: Mapping[str, Any], known: Mapping[str, Any], default: str | None
     kind = text_of(data.get("kind", default), "kind")
     require(kind in known, "kind", f"unknown {kind!r} {nearest(kind, known)}")
     return kind
+
+
+class FaultOf(NamedTuple):
+    """The fault of one generator, or None: it is healthy."""
+
+    generator: int
+    fault: Fault | Varying[Fault | None] | None
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table that :func:`read_faults` reads."""
+        own = {"kind": "none"} if self.fault is None else self.fault.to_table()
+        return {"generator": self.generator, **own}
+
+
+def number_of(value: Any, place: str) -> int:
+    """Return the number of a generator."""
+    whole = isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST
+    require(whole, place, f"the number of a generator, 1 to {MOST}, is expected, got {value!r}")
+    return int(value)
+
+
+def read_loads(data: Any) -> Any:
+    """Return the load of all generators, or a tuple with one for each where a list is given.
+
+    Raises:
+        ScenarioError: as :func:`read_load`, or an empty list or one that is too long.
+    """
+    if not isinstance(data, list | tuple):
+        return read_load(data)
+    n = len(data)
+    require(1 <= n <= MOST, "load", f"1 to {MOST} loads, one for each generator, got {n}")
+    return tuple(read_load(each, f"load[{i}]") for i, each in enumerate(data, 1))
+
+
+def read_faults(data: Any) -> Any:
+    """Return the fault of all generators, or those of single ones, each a :class:`FaultOf`.
+
+    Args:
+        data: a fault or its table; one with ``generator``, or a list of such; in Python also a
+            mapping by number of the generator.
+
+    Raises:
+        ScenarioError: as :func:`read_fault`, or two faults of one generator.
+    """
+    if isinstance(data, Mapping) and data and all(isinstance(k, int) for k in data):
+        rows: list[Any] = [FaultOf(k, v) for k, v in data.items()]
+    elif isinstance(data, list | tuple):
+        rows = list(data)
+    elif isinstance(data, Mapping) and "generator" in data:
+        rows = [data]
+    else:
+        return read_fault(data)
+    require(bool(rows), "fault", "an empty list")
+    one = len(rows) == 1 and isinstance(data, Mapping)
+    found: dict[int, FaultOf] = {}
+    for i, row in enumerate(rows, 1):
+        place = "fault" if one else f"fault[{i}]"
+        made = _fault_of(row, place)
+        twice = f"generator {made.generator} has a fault already; a machine has one at a time"
+        require(made.generator not in found, f"{place}.generator", twice)
+        found[made.generator] = made
+    return tuple(found[k] for k in sorted(found))
+
+
+def _fault_of(row: Any, place: str) -> FaultOf:
+    if isinstance(row, FaultOf):
+        k, fault = number_of(row.generator, f"{place}.generator"), row.fault
+        healthy = fault is None or isinstance(fault, str)
+        return FaultOf(k, None if healthy else read_fault(fault, place))
+    missing = "missing: which generator has it? Without a list, a fault is of all"
+    require(isinstance(row, Mapping) and "generator" in row, f"{place}.generator", missing)
+    own = {k: v for k, v in row.items() if k != "generator"}
+    number = number_of(row["generator"], f"{place}.generator")
+    return FaultOf(number, None if own == {"kind": "none"} else read_fault(own, place))
 
 
 def read_noise(data: Any) -> Noise:

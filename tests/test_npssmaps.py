@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 import re
 
@@ -183,10 +184,12 @@ def test_what_is_not_read_is_told(write):
 
 def test_damaged_files_are_refused_or_read_never_lost(write):
     """Cut anywhere, tokens swapped, numbers replaced: an error of the package, or the same map."""
-    table, rng = shipped("axi5"), random.Random(1)
+    t, rng = shipped("axi5"), random.Random(1)
+    part = {n: getattr(t, n)[3:8, :5] for n in ("W", "PR", "eta")}
+    table = dataclasses.replace(t, N=t.N[3:8], beta=t.beta[:5], beta_ref=None, **part)
     text = npss(table)
     tokens = re.split(r"(\s+)", text)
-    for k in range(120):
+    for k in range(90):
         if k % 3 == 0:
             damaged = text[: rng.randrange(len(text))]
         elif k % 3 == 1:

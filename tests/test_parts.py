@@ -17,10 +17,12 @@ from apu_casadi.machine.faults.fault import FAULTS, fault_from_table
 from apu_casadi.machine.faults.fieldshort import FieldShort
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator, fault_of_kind, load_of_kind
+from apu_casadi.machine.loads.bypower import load_by_power
 from apu_casadi.machine.loads.capacitor import CapacitorLoad
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.load import LOADS, load_from_table
 from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.loads.openphase import OpenPhase
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.propagation import Propagator
@@ -167,6 +169,85 @@ def test_power_balance_of_the_field_fault():
     healthy = GEN.steady_state(load.balanced_part)
     assert mean(y["V_fd"]) == pytest.approx(healthy.y["V_fd"], rel=0.01)
     assert mean(y["i_fd"]) == pytest.approx(healthy.y["i_fd"] / 0.75, rel=0.01)
+
+
+# -- a load by its power, an open phase -------------------------------------------------------
+
+
+def test_a_load_by_power_leads_or_lags():
+    """P and Q at rated voltage are as asked for, with the sign of the word; also from a table."""
+    for word, sign in (("lagging", 1.0), ("leading", -1.0)):
+        load = load_by_power(90e3, 0.8, word, unbalance=(1.2, 1.0, 0.8))
+        S = sum(230.0**2 / z.conjugate() for z in load.Z_rated)
+        assert pytest.approx(complex(90e3, sign * 90e3 * 0.75), rel=1e-12) == S
+        table = {"kind": "power", "power_kW": 90, "power_factor": 0.8, "current": word}
+        assert load_from_table({**table, "unbalance": [1.2, 1.0, 0.8]}) == load
+        assert load_from_table(load.to_table()) == load
+    assert load_by_power(100e3, 1.0, "leading") == KW100
+    assert load_from_table({"kind": "power", "power_kW": 100}) == KW100
+    with pytest.raises(ParameterError, match=r"current 'leding'.*'leading'"):
+        load_by_power(1e5, 0.9, "leding")
+    with pytest.raises(ScenarioError, match=r"^current: unknown 'ahead'"):
+        load_from_table({"kind": "power", "power_kW": 10, "current": "ahead"})
+
+
+@pytest.mark.parametrize("gen", [GEN, ISOLATED], ids=["grounded", "isolated"])
+def test_an_open_phase_by_phasors(gen):
+    """At rest no current but the voltmeter's in b; the others by phasors of their impedances.
+
+    Grounded each by its own voltage; isolated in series between a and c.
+    """
+    load = OpenPhase(SeriesLoad.from_power(120e3, 0.9), "b")
+    turn = gen.steady_state(load).turn
+    V, I = ({k: turn.phasor(f"{q}_{k}") for k in "abc"} for q in "vi")
+    Z = complex(load.rest.R[0], W * load.rest.L[0])
+    assert turn.rms("i_b") == pytest.approx(turn.rms("v_b") / 1e4, rel=0.01 if gen is GEN else 2)
+    if gen is GEN:
+        for k in "ac":
+            assert I[k] == pytest.approx(V[k] / Z, rel=1e-9)
+    else:
+        assert I["a"] == pytest.approx((V["a"] - V["c"]) / (2 * Z), rel=1e-3)
+        assert abs(I["a"] + I["c"]) < 1e-3 * abs(I["a"])
+    assert turn.rms("v_b") > 200.0
+
+
+def test_an_open_phase_is_the_series_load_with_a_bleed():
+    """Same inputs, same state; a short circuit in the open phase sees no inductance there."""
+    load = OpenPhase(SeriesLoad.from_power(100e3, 0.9), "c", R_open=2e3)
+    R, L = load.rest.R[0], load.rest.L[0]
+    same = SeriesLoad(R=(R, R, 2e3), L=(L, L, 0.0))
+    assert load.inputs == same.inputs and load.kind == same.kind
+    for k in "abc":
+        fault = Ttsc(0.05, 20.0, phase=k)
+        assert fault.kind(load, "grounded") == fault.kind(same, "grounded")
+    assert load.balanced_part == load.rest
+    assert load.label == "100 kW, power factor 0.9, phase c open"
+
+
+def test_an_open_phase_in_files():
+    table = {"kind": "open_phase", "power_kW": 100.0, "power_factor": 0.9, "phase": "b"}
+    load = load_from_table(table)
+    assert load == OpenPhase(SeriesLoad.from_power(100e3, 0.9), "b")
+    assert load_from_table(load.to_table()) == load
+    for wrong, words in (
+        ({"phase": "d"}, r"^phase: unknown 'd'"),
+        ({"power_kW": -1}, r"^power_kW"),
+        ({"R_ohm": 3}, r"^R_ohm: not a key"),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            load_from_table({**table, **wrong})
+    del table["phase"]
+    with pytest.raises(ScenarioError, match=r"^phase: missing"):
+        load_from_table(table)
+    with pytest.raises(ScenarioError, match="no words"):
+        OpenPhase(SeriesLoad(R=(1.0, 2.0, 3.0))).to_table()
+    for how, words in (
+        ({"phase": "x"}, "must be 'a', 'b' or 'c'"),
+        ({"R_open": 1e7}, "beyond 1e"),
+        ({"rest": LEADING}, "must be a SeriesLoad"),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            OpenPhase(**{"rest": KW100, **how})
 
 
 # -- any part ---------------------------------------------------------------------------------

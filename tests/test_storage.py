@@ -19,6 +19,7 @@ from apu_casadi.core.errors import DataError
 from apu_casadi.core.filearrays import File, RowFile, lazy
 from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit import recorder
+from apu_casadi.unit.machines import Of
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.stepmeans import StepMeans
 
@@ -250,13 +251,12 @@ def test_the_last_instant_is_at_hand_wherever_results_are(storage, tmp_path, mon
     gg, K = Apu().gas_generator, 25
     n = len(gg.Y)
     where = "memory" if storage == "memory" else tmp_path
-    means = StepMeans(Apu().generator, False)
+    means = {(1, 2): StepMeans(Apu().generator, False)}
     book = recorder.Recorder(gg, np.arange(K) * 0.02, 0, means, where)
     for k in range(K):
         y, factors = np.arange(n) + 100.0 * k, dict.fromkeys("abcd", 1.0)
-        values = np.full(len(means.kept), 4.0 * k)
-        row = recorder.Row(y, values, factors, None, np.zeros(1), np.zeros((11, 1)))
-        book.put(k, 1, row)
+        of = Of((1, 2), np.full(len(means[1, 2].kept), 4.0 * k), None, np.zeros((11, 1)))
+        book.put(k, 1, recorder.Row(y, [of], factors, np.zeros(1)))
         assert book.last().tolist() == (np.arange(n) + 100.0 * k).tolist()
     rows = book.instants()
     assert np.asarray(rows[gg.Y.names[2]]).tolist() == [2 + 100.0 * k for k in range(K)]

@@ -8,6 +8,7 @@ needs the memory of one.
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import threading
@@ -206,29 +207,31 @@ class RowFile:
             ) from e
         self.file: File = File(f, f"temporary file in {place}")
         ends = np.cumsum([0, *lengths.values()])
-        self._rows = {
-            name: (int(8 * at), n) for (name, n), at in zip(lengths.items(), ends, strict=False)
+        self._rows: dict[str, tuple[int, tuple[int, ...]]] = {
+            name: (int(8 * at), (n,)) for (name, n), at in zip(lengths.items(), ends, strict=False)
         }
 
     def write(self, name: str, start: int, values: np.ndarray) -> None:
         """Write values into a row from its element ``start``."""
-        at, n = self._rows[name]
-        a = np.ascontiguousarray(values, dtype=float)
+        at, shape = self._rows[name]
+        a, n = np.ascontiguousarray(values, dtype=float), math.prod(shape)
         if start < 0 or start + a.size > n:
             raise DataError(f"row {name}: elements {start} to {start + a.size} of {n}")
-        self.file.write(at + 8 * start, memoryview(a).cast("B") if a.size else b"")
+        self.file.write(at + 8 * start, memoryview(a.reshape(-1)).cast("B") if a.size else b"")
 
     def add(self, name: str, values: np.ndarray) -> Any:
-        """Write one more row at the end of the file; return it as a lazy array."""
-        self._rows[name] = (self.size, values.size)
+        """Write one more row or array at the end of the file; return it as a lazy array."""
+        self._rows[name] = (self.size, values.shape)
         self.size += 8 * values.size
         self.write(name, 0, values)
         return self.array(name)
 
-    def array(self, name: str) -> Any:
-        """Return a row as a lazy array."""
-        at, n = self._rows[name]
-        return lazy(self.file, at, (n,), np.dtype(float))
+    def array(self, *names: str) -> Any:
+        """Return a row as a lazy array; several of one length that follow each other as 2-D."""
+        at, shape = self._rows[names[0]]
+        if len(names) > 1:
+            shape = (len(names), *shape)
+        return lazy(self.file, at, shape, np.dtype(float))
 
 
 def pieces(variable: xr.Variable, chunk: int = CHUNK) -> Iterator[np.ndarray]:

@@ -1,7 +1,11 @@
 """Labelled results: datasets whose every variable has a unit and a meaning, kept as netCDF.
 
 A joint run has two time coordinates: ``time`` [s], the exchange grid of gas generator and machine,
-and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for).
+and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for).  Where generators
+differ during the run, what belongs to one of them (``I_a_rms``, ``P_e``, ``mu``, ``v_a``) has the
+dimension ``generator`` before that of time, with their numbers from 1 as coordinate; where all stay
+alike, as in the paper, it has not: then it is that of each.  ``P_total`` and ``P_inst`` are the
+unit's.  :func:`of_generator` gives the second form of either.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import files, netcdf3
+from apu_casadi.core import files, netcdf3, netcdf4
 from apu_casadi.core.errors import DataError, SignalError, nearest
 from apu_casadi.core.filearrays import is_lazy
 
@@ -85,6 +89,9 @@ CHANNELS: Mapping[str, tuple[str, str]] = {
 }
 """Unit and meaning of every variable that a joint run may hold, by name."""
 
+GENERATOR = "generator"
+"""Dimension of what generators have of their own, where they differ; numbers from 1."""
+_TOLD = ("units", "long_name")
 _TIMES = {
     "time": ("s", "time on the exchange grid"),
     "time_w": ("s", "time of the waveform samples"),
@@ -97,15 +104,17 @@ def dataset(
     *,
     signals: Iterable[Signal] = (),
     attrs: Mapping[str, str | int | float] | None = None,
+    generators: int = 0,
 ) -> xr.Dataset:
     """Build a labelled dataset from arrays.
 
     Args:
         times: time coordinates [s] by name, each strictly increasing, shape (n,).
-        values: per time coordinate, arrays of shape (n,), also lazy ones of
+        values: per time coordinate, arrays of shape (n,) or (generators, n), also lazy ones of
             :mod:`apu_casadi.core.filearrays`, or scalars by variable name.
         signals: units and meanings; they come before those of :data:`CHANNELS`.
         attrs: attributes of the dataset; text or numbers.
+        generators: their number, for what each has of its own.
 
     Returns:
         xarray.Dataset with ``units`` and ``long_name`` on every variable and coordinate.
@@ -142,12 +151,44 @@ def dataset(
             if name in variables:
                 raise SignalError(f"{name}: given on {variables[name][0]} and on {dim}")
             a = value if is_lazy(value) else np.asarray(value, dtype=float)
+            if a.shape == (generators, n):
+                coords.setdefault(GENERATOR, _numbers(generators))
+                variables[name] = ((GENERATOR, dim), a, dict(zip(_TOLD, known[name], strict=True)))
+                continue
             if a.shape not in ((), (n,)):
                 raise SignalError(f"{name}: shape ({n},) as {dim} expected, got {a.shape}")
             unit, doc = known[name]
             a = np.full(n, float(a)) if a.ndim == 0 else a
             variables[name] = (dim, a, {"units": unit, "long_name": doc})
     return xr.Dataset(variables, coords=coords, attrs=dict(attrs or {}))
+
+
+def _numbers(n: int) -> tuple[str, np.ndarray, dict[str, str]]:
+    """Return the coordinate of n generators."""
+    numbers = np.arange(1, n + 1, dtype=np.int32)
+    return GENERATOR, numbers, {"units": "1", "long_name": "number of the generator"}
+
+
+def generators_of(ds: xr.Dataset) -> tuple[int, ...]:
+    """Return the numbers of a run's generators that differ; (1,) where all are alike."""
+    return tuple(ds[GENERATOR].values.tolist()) if GENERATOR in ds.coords else (1,)
+
+
+def of_generator(ds: xr.Dataset, number: int = 1) -> xr.Dataset:
+    """Return a run as one of its generators has it, without the dimension ``generator``.
+
+    Works for runs whose generators are alike, and for files from before there was a dimension.
+
+    Raises:
+        DataError: there is no such generator.
+    """
+    if GENERATOR in ds.coords:
+        if number not in ds[GENERATOR].values:
+            raise DataError(f"{_source(ds)}generator {number}: {generators_of(ds)} are there")
+        return ds.sel({GENERATOR: number}, drop=True)
+    if not 1 <= number <= int(ds.attrs.get("generators", 2)):
+        raise DataError(f"{_source(ds)}generator {number}: there are {ds.attrs['generators']}")
+    return ds
 
 
 def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
@@ -167,7 +208,7 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
 
 
 def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
-    """Read a dataset that :func:`save` wrote.
+    """Read a dataset that :func:`save` wrote, or another one in netCDF 3 or 4.
 
     Args:
         path: of the file.
@@ -175,10 +216,12 @@ def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
             can be looked at; the file stays open with the dataset.  Otherwise all are read now.
 
     Raises:
-        DataError: the file is missing, is no netCDF 3 file, or is damaged.
+        DataError: the file is missing, is no netCDF file, or is damaged; netCDF 4 without h5netcdf.
     """
     path = Path(path)
     start, size = files.beginning(path, 8)
+    if start.startswith(netcdf4.MARK):
+        return netcdf4.read(path)
     if start[:3] != b"CDF":
         raise DataError(f"{path}: not a netCDF 3 file (it begins with {start!r})")
     try:
@@ -261,12 +304,10 @@ _MEANS = (
     ("T4", "T4", 1.0),
     ("T5", "T5", 1.0),
     ("SM_percent", "SM", 100.0),
-    *((f"V_{p}_rms", f"V_{p}_rms", 1.0) for p in "abc"),
-    *((f"I_{p}_rms", f"I_{p}_rms", 1.0) for p in "abc"),
-    ("P_e", "P_e", 1.0),
-    ("P_loss_fault", "P_loss_fault", 1.0),
 )
+_MEANS_OF_EACH = (*(f"{q}_{p}_rms" for q in "VI" for p in "abc"), "P_e", "P_loss_fault")
 _HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
+_SEVERITY = ("mu", "k_rf", "kappa")
 _HEALTHY_NAN = ("k_rf", "kappa")
 
 
@@ -294,10 +335,10 @@ class _Columns:
         return values
 
 
-def _holding(ds: xr.Dataset, attribute: str, key: str, end: float) -> str | None:
-    """Return what the run's attribute says of the time just before ``end`` [s]."""
+def _holding(ds: xr.Dataset, attribute: str, key: str, end: float, number: int) -> str | None:
+    """Return what the run's attribute says of a generator just before ``end`` [s]."""
     try:
-        rows = json.loads(ds.attrs[attribute])
+        rows = [r for r in json.loads(ds.attrs[attribute]) if r.get(GENERATOR, number) == number]
         held = [r for r in rows if float(r["t"]) < end - 1e-9]
         return None if held[-1][key] is None else str(held[-1][key])
     except (KeyError, TypeError, ValueError, IndexError):
@@ -314,18 +355,21 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
     (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
     and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
+    Where generators differ, all that is of a generator is in ``generators`` instead: a list with
+    one table for each, which has its number as ``generator``.
 
     Raises:
         DataError: a variable is missing, is not finite or no number, or a phase holds no sample.
     """
-    needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
+    needed = [v for _, v, _ in _MEANS] + [*_MEANS_OF_EACH, *_SEVERITY, *_HEALTH]
     missing = [v for v in needed if v not in ds]
     if missing:
         raise DataError(f"{_source(ds)}the dataset lacks {', '.join(missing)}")
     spans = phases(ds)
     t = ds["time"].values
     tol = 1e-9
-    col = _Columns(ds)
+    col, numbers = _Columns(ds), generators_of(ds)
+    each = {k: _Columns(of_generator(ds, k)) for k in numbers}
     rows = []
     for k, p in enumerate(spans):
         # a sample is the end of a step: the one at a boundary belongs to the earlier phase
@@ -348,8 +392,29 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         row["SM_percent_min"] = float(inside["SM"].min() * 100.0)
         end = int(np.flatnonzero(tail)[-1])
         row.update({v: float(col[v][end]) for v in _HEALTH})
-        row.update(severity(*(float(col[v][end]) for v in ("mu", "k_rf", "kappa"))))
-        row["fault_phase"] = _holding(ds, "faults", "phase", p["end"]) if row["mu"] else None
-        row["load"] = _holding(ds, "loads", "load", p["end"])
+        of_each = [
+            _of_one(each[k], tail, end) | _held(ds, each[k], end, p["end"], k) for k in numbers
+        ]
+        if GENERATOR in ds.coords:
+            row["generators"] = [
+                {GENERATOR: k, **own} for k, own in zip(numbers, of_each, strict=True)
+            ]
+        else:
+            row |= of_each[0]
         rows.append(row)
     return rows
+
+
+def _of_one(col: _Columns, tail: np.ndarray, end: int) -> dict[str, Any]:
+    """Return means over the end of a phase of one generator, and the severity of its fault."""
+    means = {v: float(np.mean(col[v][tail])) for v in _MEANS_OF_EACH}
+    return means | severity(*(float(col[v][end]) for v in _SEVERITY))
+
+
+def _held(ds: xr.Dataset, col: _Columns, end: int, t: float, number: int) -> dict[str, Any]:
+    """Return phase of the fault and load of a generator at the end of a phase."""
+    faulty = col["mu"][end]
+    return {
+        "fault_phase": _holding(ds, "faults", "phase", t, number) if faulty else None,
+        "load": _holding(ds, "loads", "load", t, number),
+    }

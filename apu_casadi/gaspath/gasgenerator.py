@@ -10,7 +10,7 @@ Rotor speed is the one state.  The improved method of the paper (IGDM, Algorithm
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Never
 
@@ -20,6 +20,7 @@ import numpy as np
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import OperatingPointError, ParameterError, SimulationError, nearest
+from apu_casadi.core.profiles.profile import Profile, held
 from apu_casadi.core.runloop import run
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
@@ -405,33 +406,50 @@ class GasGenerator(Parametric):
     def run(
         self,
         start: GasGeneratorState,
-        inputs: np.ndarray,
-        theta: np.ndarray | None = None,
+        inputs: np.ndarray | Mapping[str, float | Profile],
+        theta: np.ndarray | Mapping[str, float | Profile] | None = None,
         *,
         hook: Callable[[int, np.ndarray], np.ndarray] | None = None,
         output_noise: Callable[[int], np.ndarray] | None = None,
         dt: float | None = None,
+        steps: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Run Algorithm 2: update the state, let ``hook`` process it, compute the output.
 
         Args:
             start: from :func:`apu_casadi.gaspath.steady.trimming.initialise`.
-            inputs: u at t_1 ... t_K, shape (6, K), columns packed by ``U``.
-            theta: health factors, shape (4,) or (4, K); those of ``start`` by default.
+            inputs: u at t_1 ... t_K, shape (6, K), columns packed by ``U``; or numbers and profiles
+                by name, held over each step at their value in its middle, also where a profile
+                jumps inside; names that are not given keep what ``start`` has.
+            theta: health factors, shape (4,) or (4, K), or numbers and profiles by name; those of
+                ``start`` by default.
             hook: ``StateProcess``: (k, x(k)) -> x(k); state noise, Monte Carlo, an estimator.
             output_noise: k -> v(k), shape (ny,), added to y.
             dt: step, s.
+            steps: K, where ``inputs`` are by name.
 
         Returns:
             x of shape (1, K+1) and y of shape (ny, K+1), the start included.
+
+        Raises:
+            SignalError: an unknown name.
+            OperatingPointError: inputs by name that are out of range.
+            SimulationError: a wrong shape, or a step that cannot be solved.
         """
+        dt = self.dt if dt is None else dt
+        if isinstance(inputs, Mapping):
+            if steps is None or steps < 1:
+                raise SimulationError(f"steps = {steps!r}: inputs by name need a number of steps")
+            inputs = held(self.U, inputs, start.u, dt * (np.arange(steps) + 0.5))
+            self.check_inputs(inputs)
         inputs = np.asarray(inputs, float)
         if inputs.ndim != 2 or inputs.shape[0] != len(self.U):
             raise SimulationError(f"inputs: shape ({len(self.U)}, K) expected, got {inputs.shape}")
         K = inputs.shape[1]
+        if isinstance(theta, Mapping):
+            theta = held(self.THETA, theta, start.theta, dt * (np.arange(K) + 0.5))
         th = start.theta if theta is None else np.asarray(theta, float)
         th = np.broadcast_to(th.reshape(len(self.THETA), -1), (len(self.THETA), K))
-        dt = self.dt if dt is None else dt
         system = _Discrete(self, start, inputs, th, hook, dt)
         rows = [(system.x, system.y)]
 

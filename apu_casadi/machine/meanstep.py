@@ -30,7 +30,14 @@ from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import exciter_step, hoisted, leap
-from apu_casadi.machine.transition import SPEED_RANGE, cached_table, parity, symmetry
+from apu_casadi.machine.transition import (
+    NODES,
+    SPEED_RANGE,
+    cached_table,
+    nominal_entries,
+    parity,
+    symmetry,
+)
 from apu_casadi.machine.weights import end_weights, through
 
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
@@ -42,6 +49,9 @@ HARMONICS = (12, 20, 30)  # of the rotor angle that a function takes; the first 
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
+#: Largest change of transition matrices from step to step, nominal units, of loads and faults that
+#: change in time: what follows such a jump falls between the samples, and means err by 1e-6 of it.
+SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
 END_TOL = 1e-5  # nominal units: doubt about the state at the end, whose error is much smaller
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
 _PHASES = 5  # rotor angles that tell the harmonics 0, 1, 2 apart
@@ -462,6 +472,7 @@ class MeanStep(Rebuilt):
         dt: length of every step, s.
         quad: what is averaged over the step, see :mod:`apu_casadi.core.means`.
         within: where this step begins in a longer one, and which share of it it is; for weights.
+        harmonics: of the rotor angle, at least so many; what has equal ones has equal layouts.
 
     Raises:
         NotApplicable: the model is not linear in its windings, a series does not converge or has
@@ -474,6 +485,7 @@ class MeanStep(Rebuilt):
     theta: np.ndarray
     constant: bool
     parameters: np.ndarray
+    harmonics: int
     layout: tuple[Any, ...]
     advance: Any
     limits: np.ndarray
@@ -491,10 +503,11 @@ class MeanStep(Rebuilt):
         dt: float,
         quad: Sequence[str],
         within: tuple[float, float] = (0.0, 1.0),
+        harmonics: int = 0,
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
         if not ss.linear:
-            raise NotApplicable(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: {ss.nonlinear}")
         self.ss, self.dt, self.quad = ss, dt, tuple(quad)
         given = np.array(theta, dtype=float)
         self.theta = ss.full(given)
@@ -504,27 +517,56 @@ class MeanStep(Rebuilt):
         self.constant = symmetry(ss, u, given, w_rated)
         if self.constant:
             tables = [cached_table(ss, u, given, w_rated, h=dt * share / 4) for _, share in PANELS]
-            series, harmonics = [t.even.ravel() for t in tables], 0
+            series, self.harmonics = [t.even.ravel() for t in tables], 0
         else:
             angle = 2 * math.pi / STRIDES
             tables = [cached_table(ss, u, given, w_rated, angle=angle)]
-            harmonics = next((k for k in HARMONICS if k >= tables[0].harmonics), 0)
-            if not harmonics:
+            least = max(harmonics, tables[0].harmonics)
+            self.harmonics = next((k for k in HARMONICS if k >= least), 0)
+            if not self.harmonics:
                 raise NotApplicable(
                     f"{ss.name}: {tables[0].harmonics} harmonics of the rotor angle, "
                     f"{HARMONICS[-1]} fit"
                 )
-            full = [(tables[0].even, harmonics + 2), (tables[0].odd, harmonics)]
-            series = [_filled(part, terms) for part, terms in full]
+            table = tables[0].filled(self.harmonics)
+            # terms, then powers, then entries
+            series = [part.transpose(2, 0, 1).ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
         self.parameters = np.concatenate([*series, self._range, within])
         turn = None if self.constant else _turn(dt, w_rated)  # panels are shares of the step
-        self.layout = (ss.shared, self.quad, turn, harmonics)
+        self.layout = (ss.shared, self.quad, turn, self.harmonics)
         self.advance = _function(*self.layout)
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]
         self.limits = np.array([drive] if self.constant else [drive, END_TOL])
         self._iw = ss.u.index("w_r")
         self._compiled: Caller | None = None
+
+    # -- other numbers of the same structure (:mod:`apu_casadi.machine.course`) -----------------
+
+    @property
+    def smooth(self) -> float:
+        """Largest change of transition matrices from step to step, nominal units."""
+        return SMOOTH["constant" if self.constant else "periodic"]
+
+    @property
+    def vector(self) -> np.ndarray:
+        """What the compiled function knows of the load and the fault, beside theta."""
+        return self.parameters
+
+    @property
+    def units(self) -> np.ndarray:
+        """Factors that turn it to nominal units; zero for what is no transition matrix."""
+        even, odd = nominal_entries(self.ss, 1)
+        if self.constant:
+            parts = [np.tile(even, len(PANELS) * NODES)]
+        else:
+            terms = self.harmonics + 2, self.harmonics
+            parts = [np.repeat(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
+        return np.concatenate([*parts, np.zeros(4)])
+
+    def put(self, vector: np.ndarray, theta: np.ndarray) -> None:
+        """Go on with other numbers: those of :attr:`vector`, and theta in full."""
+        self.parameters, self.theta = vector, theta
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the tables."""
@@ -552,10 +594,3 @@ class MeanStep(Rebuilt):
                 f"{miss.tolist()} > {self.limits.tolist()}, or values that are not finite"
             )
         return x, mean
-
-
-def _filled(part: np.ndarray, terms: int) -> np.ndarray:
-    """Series of a table with zeros up to ``terms``; terms, then powers, then entries."""
-    full = np.zeros((part.shape[2], part.shape[0], terms))
-    full[:, :, : part.shape[1]] = part.transpose(2, 0, 1)
-    return full.ravel()

@@ -24,7 +24,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -44,6 +45,7 @@ from apu_casadi.machine.transition import (
     SPEED_RANGE,
     Table,
     cached_table,
+    nominal_entries,
     parity,
     split,
     symmetry,
@@ -338,6 +340,7 @@ class Propagator(Rebuilt):
         outputs: outputs to be returned at the samples.
         quad: what is averaged over the step, see :mod:`apu_casadi.core.means`.
         fine: the exciter steps at every sample; for the steps that the usual strides refuse.
+        harmonics: of the rotor angle, at least so many.
 
     Raises:
         NotApplicable: the model is not linear in its windings, or the series does not converge;
@@ -370,10 +373,11 @@ class Propagator(Rebuilt):
         outputs: Sequence[str] = (),
         quad: Sequence[str] = (),
         fine: bool = False,
+        harmonics: int = 0,
     ) -> None:
         """Compute or fetch the table, build or fetch the functions."""
         if not ss.linear:
-            raise NotApplicable(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: {ss.nonlinear}")
         if n_out < 10:
             raise NotApplicable(f"{ss.name}: at least 10 samples are needed, got {n_out}")
         self.ss, self.n_out, self.dt = ss, n_out, dt
@@ -383,7 +387,8 @@ class Propagator(Rebuilt):
         self.theta = ss.full(given)
         self.constant = constant = symmetry(ss, u, given, w_rated)
         plan = strides(n_out, self.h, constant, fine)
-        self.table = cached_table(ss, u, given, w_rated, h=self.h, leaps=plan.m)
+        table = cached_table(ss, u, given, w_rated, h=self.h, leaps=plan.m)
+        self.table = table.filled(max(harmonics, table.harmonics))
         # what ``function`` depends on
         self.layout = (ss.shared, n_out, plan, self.outputs, self.quad, constant)
         self.function = _advance(*self.layout)
@@ -407,6 +412,37 @@ class Propagator(Rebuilt):
     def parameters(self) -> np.ndarray:
         """What :attr:`advance` takes as ``series``."""
         return np.append(self.table.even.ravel(), [self.table.centre, self.table.half])
+
+    # -- other numbers of the same structure (:mod:`apu_casadi.machine.course`) -----------------
+
+    #: Largest change of transition matrices from step to step, nominal units; samples resolve it.
+    smooth: ClassVar[float] = 1e-2
+
+    @property
+    def harmonics(self) -> int:
+        """Harmonics of the rotor angle that the table has; 0 where the angle does not matter."""
+        return self.table.harmonics
+
+    @property
+    def vector(self) -> np.ndarray:
+        """The table as one vector."""
+        parts = (self.table.even, self.table.odd)
+        return self.parameters if self.constant else np.concatenate([p.ravel() for p in parts])
+
+    @property
+    def units(self) -> np.ndarray:
+        """Factors that turn it to nominal units; zero for what is no transition matrix."""
+        each = nominal_entries(self.ss, self.layout[2].m)
+        parts = zip((self.table.even, self.table.odd), each, strict=True)
+        rows = [np.broadcast_to(scale, part.shape).ravel() for part, scale in parts]
+        return np.append(rows[0], [0.0, 0.0]) if self.constant else np.concatenate(rows)
+
+    def put(self, vector: np.ndarray, theta: np.ndarray) -> None:
+        """Go on with other numbers: those of :attr:`vector`, and theta in full."""
+        shapes, n = (self.table.even.shape, self.table.odd.shape), self.table.even.size
+        parts = vector[:n], vector[n : n + self.table.odd.size]
+        even, odd = (p.reshape(s) for p, s in zip(parts, shapes, strict=True))
+        self.table, self.theta = replace(self.table, even=even, odd=odd), theta
 
     def valid(self, w_r: float) -> bool:
         """Whether the speed, rad/s electrical, lies in the range of the table."""

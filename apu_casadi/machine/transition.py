@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -270,6 +270,24 @@ class Table:
             for part in (self.even, self.odd)
         )
         return even, odd
+
+    def filled(self, harmonics: int) -> Table:
+        """Return the same with zeros up to a number of harmonics."""
+        if harmonics == self.harmonics or not self.harmonics:
+            return self
+        whole = []
+        for part, pairs in ((self.even, harmonics // 2 + 1), (self.odd, (harmonics + 1) // 2)):
+            full = np.zeros((NODES, 2 * pairs, part.shape[2]))
+            full[:, : part.shape[1]] = part
+            whole.append(full)
+        return replace(self, even=whole[0], odd=whole[1], harmonics=harmonics)
+
+
+def nominal_entries(ss: GeneratorModel, leaps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return factors that turn the even and the odd entries of a table to nominal units."""
+    kinds = parity(ss, leaps)
+    scale = np.tile(_scale(ss)[: len(ss.linear)].T.ravel(), leaps)
+    return scale[kinds.even], scale[kinds.odd]
 
 
 def transition_table(

@@ -61,6 +61,7 @@ class Link:
         N_ref: governed rotor speed, rad/s.
         gear, eta_gtSg, n_pp: speed ratio and power transfer of the gearbox, pole pairs of the
             generators; by default nothing lies between.
+        pairs: number of generators over two, since the model's P_total is the power of two.
     """
 
     governor: Governor
@@ -68,14 +69,15 @@ class Link:
     gear: Any = 1.0
     eta_gtSg: Any = 1.0
     n_pp: Any = 1
+    pairs: Any = 1.0
 
     def w_r(self, N: Any) -> Any:
         """Electrical speed of the generators, rad/s, at rotor speed N (eq. 2)."""
         return self.n_pp * N / self.gear
 
     def PW(self, P_total: Any) -> Any:
-        """Shaft power, W, that the two generators' mean power P_total asks for (eq. 1)."""
-        return P_total / self.eta_gtSg
+        """Shaft power, W, that the mean power P_total of each two generators asks for (eq. 1)."""
+        return self.pairs * P_total / self.eta_gtSg
 
     def fuel(self, N: Any, x: Sequence[Any]) -> Governed:
         """Fuel of the instant, and the rates of the governor's states."""
@@ -97,14 +99,14 @@ class Link:
     @property
     def numbers(self) -> np.ndarray:
         """Its numbers in the order that :meth:`with_numbers` takes."""
-        own = [self.N_ref, self.gear, self.eta_gtSg, self.n_pp]
+        own = [self.N_ref, self.gear, self.eta_gtSg, self.n_pp, self.pairs]
         return np.array([*own, *self.governor.numbers.values()], dtype=float)
 
     def with_numbers(self, values: Sequence[Any]) -> Link:
         """Return the same link with other numbers, or symbols."""
         names = self.governor.numbers
-        law = self.governor.symbolic(**dict(zip(names, values[4:], strict=True)))
-        return Link(law, *values[:4])
+        law = self.governor.symbolic(**dict(zip(names, values[5:], strict=True)))
+        return Link(law, *values[:5])
 
 
 def moved(x: Sequence[Any], h: Any, rates: Sequence[Any]) -> tuple[Any, ...]:

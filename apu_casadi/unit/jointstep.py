@@ -5,7 +5,7 @@ of the generators, governor, and the gas generator's discrete step, over a block
 For phases in which nothing is switched: with waveforms (:mod:`apu_casadi.machine.propagation`)
 where the machine's coefficients do not depend on the rotor angle, without them
 (:mod:`apu_casadi.machine.meanstep`) always.  What Python does between the steps of the ordinary
-loop costs as much as the models themselves.
+loop costs as much as the models themselves.  Generators that differ stand side by side in it.
 
 Gains and limits of the governor, gearbox and governed speed are inputs of the function.
 """
@@ -13,8 +13,9 @@ Gains and limits of the governor, gearbox and governed speed are inputs of the f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -23,7 +24,6 @@ from apu_casadi.core.backend import backend_in_use, compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.sharing import Rebuilt, keep
-from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.machine.meanstep import MeanStep
@@ -34,146 +34,215 @@ from apu_casadi.unit.exchange import PAPER, Link, governed_step
 BLOCK = 10  # exchange steps in one call
 
 
+Fast: TypeAlias = Propagator | MeanStep
+
+
+class MachineBlock(NamedTuple):
+    """What a block of exchange steps gave of equal generators.
+
+    Args:
+        x: state at the end.
+        means: over each step, shape (quantities, BLOCK).
+        waves: samples, shape (outputs, BLOCK * n_out).
+
+    ``means`` and ``waves`` are overwritten by the thread's next block.
+    """
+
+    x: np.ndarray
+    means: np.ndarray
+    waves: np.ndarray
+
+
 class BlockResult(NamedTuple):
     """What a block of exchange steps gave.
 
     Args:
-        N, z, governor, x_sg: states at the end: rotor speed (1,), cycle unknowns, governor,
-            generator.
-        y: gas generator's outputs after each step, shape (ny, BLOCK).
-        means: means over each step, shape (quantities, BLOCK).
-        waves: samples, shape (outputs, BLOCK * n_out).
-
-    ``y``, ``means`` and ``waves`` are overwritten by the thread's next block.
+        N, z, governor: states at the end: rotor speed (1,), cycle unknowns, governor.
+        y: gas generator's outputs after each step, shape (ny, BLOCK); overwritten by the thread's
+            next block.
+        machines: the generators, each group of equal ones once.
     """
 
     N: np.ndarray
     z: np.ndarray
     governor: tuple[float, ...]
-    x_sg: np.ndarray
     y: np.ndarray
-    means: np.ndarray
-    waves: np.ndarray
+    machines: list[MachineBlock]
+
+
+class _Machine(NamedTuple):
+    """Symbols of one group of generators."""
+
+    u: ca.MX
+    theta: ca.MX
+    numbers: ca.MX
+    series: ca.MX
+    dt: ca.MX
+
+    @classmethod
+    def of(cls, k: int, fast: Fast, link: Link) -> _Machine:
+        sizes = {"u_sg": len(fast.ss.u), "theta_sg": len(fast.ss.shared.theta)}
+        sizes |= {"numbers": link.numbers.size, "series": fast.advance.numel_in(1), "dt": 1}
+        return cls(*(ca.MX.sym(f"{name}_{k}", n) for name, n in sizes.items()))
 
 
 def block_function(
-    advance: ca.Function, ss: StateSpace, gas_step: ca.Function, link: Link, name: str
+    machines: Sequence[Fast], gas_step: ca.Function, link: Link, name: str, *, wide: bool = False
 ) -> ca.Function:
-    """Build the block: (carry, u, theta, u_sg, theta_sg, numbers, series, dt) -> (last, y, ...).
+    """Build the block: (carry, u, theta, [u_sg, theta_sg, numbers, series, dt]) -> (last, y, ...).
 
-    ``carry`` holds N, z, and the states of governor and generator; after outputs and means comes
-    for each step what is to be checked: errors of the machine's step, residual of the cycle,
-    speed; last, the waveforms if there are any.
+    ``carry`` holds N, z, and the states of governor and generators.  Outputs and the residual of
+    the cycle in each step are followed for each group of equal generators by means, by what is to
+    be checked, errors of its step and electrical speed, and by waveforms if there are any.
 
     Args:
-        advance: the machine's step, (x, series, u, theta, dt) -> (x, [samples], means, errors).
-        ss: the machine's model; theta of the block are those of the families.
+        machines: what propagates each group; its ``advance`` is (x, series, u, theta, dt) ->
+            (x, [samples], means, errors), and theta of the block are those of the families.
         gas_step: (N, u, theta, dt, z) -> (N, y, z, residual).
-        link: gearbox and governor; its numbers are inputs.
+        link: gearbox and governor of any group; the numbers of each are inputs.
         name: of the function.
+        wide: whether all that is held over a step comes in ``BLOCK`` columns, one for each.
     """
     law, (n_u, n_theta, n_z) = link.governor, (gas_step.numel_in(i) for i in (1, 2, 4))
-    ends = np.cumsum([0, 1, n_z, len(law.X), len(ss.x)]).tolist()
-    carry, u = ca.MX.sym("carry", ends[-1]), ca.MX.sym("u", n_u)
-    theta, u_sg = ca.MX.sym("theta", n_theta), ca.MX.sym("u_sg", len(ss.u))
-    theta_sg = ca.MX.sym("theta_sg", len(ss.shared.theta))
-    numbers = ca.MX.sym("numbers", link.numbers.size)
-    series, dt = ca.MX.sym("series", advance.numel_in(1)), ca.MX.sym("dt")
-    held = [u, theta, u_sg, theta_sg, numbers, series, dt]
+    n_x = [len(m.ss.x) for m in machines]
+    ends = np.cumsum([0, 1, n_z, len(law.X), *n_x]).tolist()
+    carry, u, theta = (ca.MX.sym(*s) for s in (("carry", ends[-1]), ("u", n_u), ("theta", n_theta)))
+    given = [_Machine.of(k, m, link) for k, m in enumerate(machines)]
+    held = [u, theta, *(s for own in given for s in own)]
 
-    N, z, x_gov, x_sg = (carry[i:j] for i, j in pairwise(ends))
-    own, at = link.with_numbers(ca.vertsplit(numbers)), ss.x.index("theta_e")
-    w_r = own.w_r(N)
+    N, z, x_gov, *x_sg = (carry[i:j] for i, j in pairwise(ends))
+    own = [link.with_numbers(ca.vertsplit(g.numbers)) for g in given]
+    shaft = Link(own[0].governor, own[0].N_ref)
 
-    def machine(_N: ca.MX, _slope: ca.MX) -> tuple[ca.MX, list[ca.MX]]:
-        u_now = ca.MX(u_sg)
-        u_now[ss.u.index("w_r")] = w_r
-        x1, *Y, means, miss = advance(x_sg, series, u_now, theta_sg, dt)
-        x1[at] -= 2 * math.pi * ca.floor(x1[at] / (2 * math.pi) + 0.5)
-        return means[0], [x1, means, miss, *Y]
+    def machine(_N: ca.MX, _slope: ca.MX) -> tuple[ca.MX, list[Any]]:
+        PW, made = 0.0, []
+        for fast, its, g, x in zip(machines, own, given, x_sg, strict=True):
+            w_r, u_now, at = its.w_r(N), ca.MX(g.u), fast.ss.x.index("theta_e")
+            u_now[fast.ss.u.index("w_r")] = w_r
+            x1, *Y, means, miss = fast.advance(x, g.series, u_now, g.theta, g.dt)
+            x1[at] -= 2 * math.pi * ca.floor(x1[at] / (2 * math.pi) + 0.5)
+            PW = PW + its.PW(means[0])
+            # w_r goes with the checks: the series holds in a range of speeds
+            made.append((x1, [means, ca.vertcat(miss, w_r), *Y]))
+        return PW, made
 
     def engine(Wf: ca.MX, PW: ca.MX) -> tuple[ca.MX, list[ca.MX]]:
+        dt = given[0].dt
         N1, *rest = gas_step(N, ca.vertcat(Wf, PW, u[2:]), theta, dt, z)
         return N1, [N1, *rest]
 
-    made = governed_step(own, PAPER, machine, engine, N=N, x=ca.vertsplit(x_gov), h=dt)
-    (x1, means, miss, *Y), (N1, y, z1, r) = made.machine, made.engine
-    after = ca.vertcat(N1, z1, *made.governor, x1)
-    # w_r goes with the checks: the series holds in a range of speeds
-    outs = [after, y, means, ca.vertcat(miss, r, w_r), *Y]
+    h = given[0].dt
+    made = governed_step(shaft, PAPER, machine, engine, N=N, x=ca.vertsplit(x_gov), h=h)
+    N1, y, z1, r = made.engine
+    after = ca.vertcat(N1, z1, *made.governor, *(x1 for x1, _ in made.machine))
+    outs = [after, y, r, *(out for _, each in made.machine for out in each)]
     step = ca.Function("joint_step", [carry, *held], outs)
 
+    given_to = [*held]
+    if wide:
+        steady = [id(g.dt) for g in given]
+        given_to = [s if id(s) in steady else ca.MX.sym(s.name(), s.numel(), BLOCK) for s in held]
     now, rows = carry, []
-    for _ in range(BLOCK):
-        now, *row = step(now, *held)
+    for k in range(BLOCK):
+        these = [s[:, k] if s.size2() > 1 else s for s in given_to]
+        now, *row = step(now, *these)
         rows.append(row)
-    return ca.Function(
-        name,
-        [carry, *held],
-        [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))],
-        ["carry", "u", "theta", "u_sg", "theta_sg", "numbers", "series", "dt"],
-        ["last", "y", "means", "checks"] + ["waves"] * len(Y),
-    )
+    last = [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))]
+    return ca.Function(name, [carry, *given_to], last)
 
 
 class JointBlock(Rebuilt):
-    """Blocks of exchange steps with one load and fault."""
+    """Blocks of exchange steps, each group of equal generators with its load and fault.
+
+    Args:
+        apu: the unit.
+        machines: what propagates each group; a ``Propagator`` must have constant coefficients.
+        links: of each group.
+        wide: whether what is held over a step changes from step to step (:meth:`followed`).
+    """
 
     apu: Apu
-    machine: Propagator | MeanStep
+    machines: Sequence[Fast]
 
-    def __init__(self, apu: Apu, machine: Propagator | MeanStep) -> None:
-        """Build or fetch the compiled block; a ``Propagator`` must have constant coefficients."""
-        self.apu, self.machine = apu, machine
-        self._numbers, self._n_gov = apu.link.numbers, len(apu.governor.X)
-        self._call = _caller(apu.gas_generator.family, apu.link, machine)
+    def __init__(
+        self, apu: Apu, machines: Sequence[Fast], links: Sequence[Link], *, wide: bool = False
+    ) -> None:
+        """Build or fetch the compiled block."""
+        self.apu, self.machines = apu, tuple(machines)
+        self._fixed = [
+            (m.theta, link.numbers, m.parameters, m.dt)
+            for m, link in zip(machines, links, strict=True)
+        ]
+        n_x = [len(m.ss.x) for m in machines]
+        self._n_gov, self._n_x = len(apu.governor.X), n_x
+        self._sampled = [m.advance.n_out() == 4 for m in machines]
+        self._call = _caller(apu.gas_generator.family, links[0], self.machines, wide)
 
     def __call__(
         self,
         N: np.ndarray,
         z: np.ndarray,
         governor: tuple[float, ...],
-        x_sg: np.ndarray,
         u: np.ndarray,
         theta: np.ndarray,
-        u_sg: np.ndarray,
+        x_sg: Sequence[np.ndarray],
+        u_sg: Sequence[np.ndarray],
     ) -> BlockResult:
-        """Advance ``BLOCK`` steps.
+        """Advance ``BLOCK`` steps; state and inputs of each group at the end of the arguments.
 
         Raises:
             NotApplicable: a check fails; step by step it is decided which, and what to do.
         """
-        m = self.machine
-        carry = np.concatenate([N, z, governor, x_sg])
         full = self.apu.gas_generator.full(theta)
-        last, y, means, checks, *waves = self._call(
-            carry, u, full, u_sg, m.theta, self._numbers, m.parameters, m.dt
-        )
-        *miss, residual, w_r = checks
-        good = (
-            np.all(m.limits >= np.array(miss).T)
-            and np.all(residual <= RESIDUAL_TOL)
-            and np.isfinite(last).all()
-            and np.isfinite(means).all()
-            and m.valid(float(w_r.min()))
-            and m.valid(float(w_r.max()))
-        )
-        if not good:
-            raise NotApplicable(f"{m.ss.name}: a step of the block is not right")
-        ends = np.cumsum([0, N.size, z.size, self._n_gov, x_sg.size]).tolist()
+        held = [a for own, fixed in zip(u_sg, self._fixed, strict=True) for a in (own, *fixed)]
+        return self.followed(N, z, governor, x_sg, [u, full, *held])
+
+    def followed(
+        self,
+        N: np.ndarray,
+        z: np.ndarray,
+        governor: tuple[float, ...],
+        x_sg: Sequence[np.ndarray],
+        held: Sequence[Any],
+    ) -> BlockResult:
+        """Advance ``BLOCK`` steps with all that :func:`block_function` takes beside the state.
+
+        Raises:
+            NotApplicable: a check fails; step by step it is decided which, and what to do.
+        """
+        carry = np.concatenate([N, z, governor, *x_sg])
+        last, y, residual, *rest = self._call(carry, *held)
+        if not (np.all(residual <= RESIDUAL_TOL) and np.isfinite(last).all()):
+            raise NotApplicable("a step of the block is not right: the cycle's residual")
+        ends = np.cumsum([0, N.size, z.size, self._n_gov, *self._n_x]).tolist()
         # copied: the state stays when a later block is refused
-        N, z, x_gov, x_sg = (last[i:j].copy() for i, j in pairwise(ends))
-        wave = waves[0] if waves else np.empty((0, 0))
-        return BlockResult(N, z, tuple(x_gov.tolist()), x_sg, y, means, wave)
+        N, z, x_gov, *x1 = (last[i:j].copy() for i, j in pairwise(ends))
+        made = []
+        for m, x, sampled in zip(self.machines, x1, self._sampled, strict=True):
+            means, (*miss, w_r), *rest = rest
+            good = (
+                np.all(m.limits >= np.array(miss).T)
+                and np.isfinite(means).all()
+                and m.valid(float(w_r.min()))
+                and m.valid(float(w_r.max()))
+            )
+            if not good:
+                raise NotApplicable(f"{m.ss.name}: a step of the block is not right")
+            waves = np.empty((0, 0))
+            if sampled:
+                waves, *rest = rest
+            made.append(MachineBlock(x, means, waves))
+        return BlockResult(N, z, tuple(x_gov.tolist()), y, made)
 
 
-def _caller(family: CycleFunctions, link: Link, machine: Propagator | MeanStep) -> Caller:
-    """One compiled block for each structure of gas generator, link and machine, and layout."""
+def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: bool) -> Caller:
+    """One compiled block for each structure of gas generator, link and machines, and layout."""
 
     def make() -> Caller:
-        name = f"joint_block_{machine.ss.name}_{machine.n_out}"
-        function = block_function(machine.advance, machine.ss, family.step, link, name)
+        kind = "joint_course_" if wide else "joint_block_"
+        name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
+        function = block_function(machines, family.step, link, name, wide=wide)
         return Caller(compiled(function, level=3), copy=False)
 
-    key = (link.structure, machine.layout, backend_in_use())
+    key = (link.structure, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

@@ -1,4 +1,4 @@
-"""The generators between two exchange instants: state, load, fault, and what integrates them.
+"""Equal generators between two exchange instants: state, load, fault, and what integrates them.
 
 A :class:`Phase <apu_casadi.unit.integrators.Phase>` holds from one switch to the next, with the
 integrators that can be asked in it (:mod:`apu_casadi.unit.integrators`).
@@ -6,28 +6,36 @@ integrators that can be asked in it (:mod:`apu_casadi.unit.integrators`).
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
+from apu_casadi.machine.course import Numbers
 from apu_casadi.machine.generator import Generator, GeneratorPoint
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import who
+from apu_casadi.unit.exchange import Link
 from apu_casadi.unit.integrators import (
     SETTLED,
     Phase,
     Settings,
     Step,
+    Way,
     integrators,
 )
-from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
+from apu_casadi.unit.jointstep import MachineBlock
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
 if TYPE_CHECKING:
     from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
+    from apu_casadi.machine.meanstep import MeanStep
+    from apu_casadi.machine.propagation import Propagator
 
 NOISE = tuple(["w1_q", "w1_d", "w1_0", "w2_fd", "w2_kd", "w2_kq"])
 
@@ -39,26 +47,29 @@ class MachineMade(NamedTuple):
         x: state at the end.
         means: over the step, or over each.
         t, w: instants of the samples, s, and waveforms, shape (``WAVEFORMS``, samples).
+        severity: of a fault that changes over a block, by name.
     """
 
     x: np.ndarray
     means: RawMeans
     t: np.ndarray
     w: np.ndarray
+    severity: dict[str, np.ndarray] | None = None
 
 
 class MachineStep:
-    """One of the two equal generators.
+    """Generators that are equal in model, gear, load, fault and state, computed once.
 
     Args:
-        apu, point: the unit and the steady state to start from.
-        load: that of the steady state.
+        apu, numbers: the unit, and which of its generators they are, from 1.
+        point, load: the steady state to start from, and its load.
         settings: how it is integrated.
-        phasors: whether phasors are wanted too.
+        means: what is averaged.
     """
 
-    apu: Apu
+    numbers: tuple[int, ...]
     gen: Generator
+    link: Link
     settings: Settings
     V_ref: float
     w_r: Any
@@ -71,53 +82,78 @@ class MachineStep:
     def __init__(
         self,
         apu: Apu,
+        numbers: tuple[int, ...],
         point: GeneratorPoint,
         load: Load,
         settings: Settings,
-        phasors: bool = False,
+        means: StepMeans,
     ) -> None:
         """Take over the steady state; see the class."""
-        self.apu, self.gen, self.settings = apu, apu.generator, settings
-        self.V_ref, self.w_r = point.V_ref, apu.w_r(apu.N_ref)
+        self.numbers, self.settings, self.means = numbers, settings, means
+        self.gen, self.link = apu.machines[numbers[0] - 1].generator, apu.link_of(numbers)
+        self._of_all = len(numbers) == len(apu.machines)
+        self.V_ref, self.w_r = point.V_ref, self.link.w_r(apu.N_ref)
         self.x, self.u = np.asarray(point.x, float), np.array(point.u, float)
-        self.means = StepMeans(self.gen, phasors)
         self.nsteps = self.propagated = 0
         self.spikes: list[str] = []
         self._since = math.inf  # s since the last switch
+        self._way: Way | None = None
+        self._asked: tuple[Any, Any] = (load, None)
         symmetric = load.balanced and not settings.noisy
         self._enter(Phase(self.gen, load, None, point.ss, self.u, np.zeros(0), symmetric))
 
+    def part(self, numbers: tuple[int, ...]) -> MachineStep:
+        """Let some of the generators go their own way from now on; returns them."""
+        other = copy.copy(self)
+        other.x, other.u = self.x.copy(), self.u.copy()
+        other.nsteps = other.propagated = 0
+        other.spikes = []
+        rest = tuple(k for k in self.numbers if k not in numbers)
+        for part, its in ((self, rest), (other, numbers)):
+            part.numbers, part._of_all = its, False
+            part.link = dataclasses.replace(self.link, pairs=len(its) / 2)
+        return other
+
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
-        self._integrators = integrators(phase, self.settings, self.means)
-        self._block: JointBlock | None = None
-        self._no_block = ""
+        self._integrators = integrators(phase, self.settings, self.means, self._way)
         self._at = phase.ss.u.index("w_r")
 
-    def samples(self, grid: np.ndarray) -> int:
-        """Waveform samples of a whole run, the start included; 0 where none are stored."""
-        if self.settings.waveform_dt is None:
-            return 0
-        return 1 + sum(self.settings.n_out(float(h)) for h in np.diff(grid))
+    def follow(self, load: Any, fault: Any, end: float) -> None:
+        """Take what load and fault are made of, until the end of the run, s."""
+        if (load, fault) == self._asked:
+            return
+        self._asked = (load, fault)
+        changing = any(isinstance(x, Varying) for x in (load, fault))
+        self._way = Way(load, fault, end) if changing else None
+        self._enter(self.phase)
 
-    @property
-    def warnings(self) -> list[str]:
-        """What must be known of the steps so far."""
-        return [*self.spikes, *self.means.warnings]
+    def switch(self, load: Load, fault: Fault | None, t: float, *, smooth: bool = False) -> bool:
+        """Change load and fault at the instant t, s, where they differ; the flux linkages stay.
 
-    def switch(self, load: Load, fault: Fault | None, t: float) -> bool:
-        """Change load and fault at the instant t, s, where they differ; the flux linkages stay."""
+        Args:
+            smooth: they go on along their profiles, which is no switch unless the model changes.
+
+        Returns:
+            Whether there was a switch.
+        """
         old = self.phase
         if load == old.load and fault == old.fault:
             return False
         ss, theta = self.gen.variant(load, fault), self.gen.fault_vector(load, fault)
         u = self.gen.inputs(load, w_r=self.w_r, V_ref=self.V_ref)
+        if smooth and ss == old.ss:
+            self.u = u
+            self.phase = dataclasses.replace(old, load=load, fault=fault, u=u, theta=theta)
+            for each in self._integrators:
+                each.phase = self.phase
+            return False
         self.x = self.gen.transfer(
             self.x, old.ss, ss, u=self.u, theta=old.theta, u_target=u, theta_target=theta
         )
         text = self.gen.spike(ss, self.x, u, theta, t=t, load=load)
         if text is not None:
-            self.spikes.append(text)
+            self.spikes.append(text if self._of_all else f"{who(self.numbers)}: {text}")
         symmetric = fault is None and load.balanced and not self.settings.noisy
         self.u, self._since = u, 0.0
         self._enter(Phase(self.gen, load, fault, ss, u, theta, symmetric))
@@ -132,8 +168,8 @@ class MachineStep:
 
         The own state is left as it was: the caller may repeat the step, and then :meth:`accept` it.
         """
-        self.w_r = self.u[self._at] = self.apu.w_r(N)
-        step = Step(self.x, self.u, self.w_r, self.apu.w_r(slope), h, t0, self._since)
+        self.w_r = self.u[self._at] = self.link.w_r(N)
+        step = Step(self.x, self.u, self.w_r, self.link.w_r(slope), h, t0, self._since)
         made = first_able(self._integrators, step)
         self.nsteps += made.nsteps
         self.propagated += made.exact
@@ -145,37 +181,45 @@ class MachineStep:
         self.x = made.x
         self._since += h
 
-    def block(
-        self,
-        x: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
-        u: np.ndarray,
-        theta: np.ndarray,
-        grid: np.ndarray,
-    ) -> tuple[BlockResult, MachineMade]:
-        """Advance the whole unit over ``BLOCK`` exchange steps at once.
+    @property
+    def settled(self) -> bool:
+        """Whether the windings have settled after the last switch."""
+        return self._since >= SETTLED - SAME_INSTANT
+
+    def for_blocks(self) -> MeanStep | Propagator:
+        """Return what propagates over many steps at once; else NotApplicable."""
+        return self._integrators[0].for_blocks()
+
+    def columns(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
+        """Return what propagates over the steps of a block, and what it takes in each.
+
+        Args:
+            t, before: middles of the steps and of the one before, s.
 
         Raises:
-            NotApplicable: that is not possible here.
+            NotApplicable: exact propagation does not hold, or numbers change too fast.
         """
-        if self._since < SETTLED - SAME_INSTANT:
-            raise NotApplicable("the windings have not settled")
-        if self._no_block:
-            raise NotApplicable(self._no_block)
-        fast, h = self._integrators[0], self.settings.dt
-        if self._block is None:
-            try:
-                self._block = JointBlock(self.apu, fast.for_blocks())
-            except NotApplicable as error:
-                self._no_block = str(error)
-                raise
-        if np.abs(np.diff(grid) - h).max() > SAME_INSTANT:
-            raise NotApplicable("the steps of a block are whole exchange steps")
-        done = self._block(x, z, governor, self.x, u, theta, self.u)
+        fast, now = self._integrators[0].columns(t, before)
+        inputs = now.u.copy()
+        inputs[self.phase.ss.u.index("V_ref")] = self.V_ref
+        return fast, now._replace(u=inputs)
+
+    def went_on(
+        self, done: MachineBlock, N: float, grid: np.ndarray, severity: Any = ()
+    ) -> MachineMade:
+        """Go on from the end of a block over a grid, s, which began at the rotor speed N, rad/s.
+
+        Args:
+            severity: of the fault in each step, in the order of its names, where it changes.
+        """
+        fast = self._integrators[0]
         t, w = fast.waves(done.waves, grid)
-        self.propagated += BLOCK
-        self.w_r = self.apu.w_r(float(x[0]))
-        means = RawMeans.of(fast.quad, self.phase.symmetric, done.means, h, self.w_r, grid[1:])
-        self.x = done.x_sg
-        return done, MachineMade(done.x_sg, means, t, w)
+        self.propagated += grid.size - 1
+        self.w_r = self.link.w_r(N)
+        h, symmetric = self.settings.dt, self.phase.symmetric
+        means = RawMeans.of(fast.quad, symmetric, done.means, h, self.w_r, grid[1:])
+        self.x = done.x
+        fault = self.phase.fault
+        changing = self._way is not None and fault is not None and len(severity)
+        names = [s.name for s in fault.severities] if changing and fault is not None else []
+        return MachineMade(done.x, means, t, w, dict(zip(names, severity, strict=True)) or None)

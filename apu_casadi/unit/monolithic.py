@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.errors import SimulationError, ValidityWarning
+from apu_casadi.core.errors import ScenarioError, SimulationError, ValidityWarning
 from apu_casadi.core.means import RMS, Term, as_dict, settled, wanted
 from apu_casadi.core.results import dataset
 from apu_casadi.core.runloop import run
@@ -31,7 +31,7 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import Ambient, Event, Holding, all_factors, in_order
+from apu_casadi.unit.events import Ambient, Event, Holding, SpeedChange, all_factors, in_order
 from apu_casadi.unit.exchange import coupled
 from apu_casadi.unit.multirate import exchange_grid
 from apu_casadi.unit.stepmeans import MEANS, rms_at_rest
@@ -148,14 +148,25 @@ def simulate_monolithic(
     Warns:
         ValidityWarning: as ``simulate_joint``.
     """
-    events = in_order(events, duration)
+    apu.refuse_different("the one model of the unit")
+    n = len(apu.machines)
+    events = in_order(events, duration, generators=n)
+    for e in events:
+        if getattr(e, "generator", None) is not None:
+            raise ScenarioError(f"{e!r}: the generators of the one model have the same load")
+    day, factors = Ambient() if ambient is None else ambient, all_factors(health)
+    start = Holding((load,) * n, (None,) * n, factors, day)
+    if any(start.after(events[:k]).changing for k in range(len(events) + 1)):
+        raise ScenarioError("the one model of the unit follows no profiles: give events instead")
+    if any(isinstance(e, SpeedChange) for e in events):
+        raise ScenarioError("the one model of the unit has one governed speed, of its parameters")
     grid = exchange_grid(duration, dt, events)
     system = _OneModel(
         apu,
         grid,
         load=load,
-        ambient=Ambient() if ambient is None else ambient,
-        health=all_factors(health),
+        ambient=day,
+        health=factors,
         how={"solver": solver, "rtol": rtol, "atol": atol},
     )
     rows = np.empty((system.at_start().size, grid.size))
@@ -167,7 +178,7 @@ def simulate_monolithic(
     run(system, grid, events, record=record, progress=progress)
     gg = apu.gas_generator
     values = dict(zip((*gg.Y.names, *MEANS, *RMS), rows, strict=True))
-    told = runrecord.asked(load=load, fault=None, ambient=system.ambient, events=events)
+    told = runrecord.asked(start=start, events=events)
     attrs = {**system.how, "nsteps": system.nsteps, **told}
     ds = dataset({"time": grid}, {"time": values}, signals=gg.Y, attrs=attrs)
     starved = validity.fuel_limited(apu, grid, values["N"], values["Wf"])
@@ -195,7 +206,7 @@ class _OneModel:
         how: dict[str, Any],
     ) -> None:
         self.apu, self.grid, self.ambient, self.how = apu, grid, ambient, how
-        self.now = Holding(load, None, health)
+        self.now = Holding((load,), (None,), health)
         self.point = apu.steady_state(load, ambient=ambient, health=health)
         self.y, self.nsteps, self.worst = self.point.gas.y, 0, 0.0
         own = (*apu.governor.start(self.point.gas["Wf"]), *self.point.generator.x)
@@ -206,23 +217,23 @@ class _OneModel:
     @property
     def symmetric(self) -> bool:
         """Whether the phases differ by rotation only."""
-        return self.now.fault is None and self.now.load.balanced
+        return self.now.faults[0] is None and self.now.loads[0].balanced
 
     def _prepare(self) -> None:
         """Choose the models of load and fault, with their inputs and parameters."""
         gen, gg = self.apu.generator, self.apu.gas_generator
         self.quad = (*MEANS, *wanted(phasors=False, short=True, symmetric=self.symmetric))
-        kind = gen.fault_kind(self.now.load, self.now.fault)
-        self.ss = joint_state_space(self.apu, self.now.load.kind, kind, self.quad)
-        self.sg = gen.variant(self.now.load, self.now.fault)
+        kind = gen.fault_kind(self.now.loads[0], self.now.faults[0])
+        self.ss = joint_state_space(self.apu, self.now.loads[0].kind, kind, self.quad)
+        self.sg = gen.variant(self.now.loads[0], self.now.faults[0])
         rest = np.delete(self._u_sg(), self.sg.u.index("w_r"))
         self.u = np.concatenate([dataclasses.astuple(self.ambient), rest, [0.0]])
-        fault = gen.fault_vector(self.now.load, self.now.fault)
+        fault = gen.fault_vector(self.now.loads[0], self.now.faults[0])
         self.theta = np.concatenate([gg.THETA.pack(self.now.factors), fault])
 
     def _u_sg(self) -> np.ndarray:
         w_r, V_ref = self.apu.w_r(float(self.x[0])), self.point.generator.V_ref
-        return self.apu.generator.inputs(self.now.load, w_r=w_r, V_ref=V_ref)
+        return self.apu.generator.inputs(self.now.loads[0], w_r=w_r, V_ref=V_ref)
 
     def at_start(self) -> np.ndarray:
         """Outputs and means at the first instant."""
@@ -235,10 +246,10 @@ class _OneModel:
         if not events:
             return
         gen, old, u_old = self.apu.generator, self.sg, self._u_sg()
-        theta_old = gen.fault_vector(self.now.load, self.now.fault)
+        theta_old = gen.fault_vector(self.now.loads[0], self.now.faults[0])
         self.now = self.now.after(events)
         self._prepare()
-        theta = gen.fault_vector(self.now.load, self.now.fault)
+        theta = gen.fault_vector(self.now.loads[0], self.now.faults[0])
         x_sg = gen.transfer(
             self.x[self._first :],
             old,
@@ -253,7 +264,11 @@ class _OneModel:
     def advance(self, k: int, _until: float) -> tuple[int, np.ndarray]:
         """Integrate over one output interval."""
         t, h = float(self.grid[k]), float(self.grid[k + 1] - self.grid[k])
-        gg, at, fine = self.apu.gas_generator, self.ss.x.index("theta_e"), self.now.load.fineness
+        gg, at, fine = (
+            self.apu.gas_generator,
+            self.ss.x.index("theta_e"),
+            self.now.loads[0].fineness,
+        )
         self.u[-1] = h
         how = self.how | {n: fine * self.how[n] for n in ("rtol", "atol")}
         x0 = np.concatenate([self.x, np.zeros(1 + len(self.quad))])

@@ -61,19 +61,23 @@ class RawMeans(NamedTuple):
 
 
 class StepMeans:
-    """What is averaged over the steps of one generator, and kept.
+    """What is averaged over the steps of equal generators, and kept.
 
     Args:
         gen: the generator.
         phasors: whether phasors are kept too.
+        of: which generators, in words.
+        pairs: number of them over two.
     """
 
     gen: Generator
     phasors: bool
     kept: tuple[str, ...]
 
-    def __init__(self, gen: Generator, phasors: bool) -> None:
-        self.gen, self.phasors = gen, phasors
+    def __init__(
+        self, gen: Generator, phasors: bool, of: str = "the two generators", pairs: float = 1.0
+    ) -> None:
+        self.gen, self.phasors, self._of, self._pairs = gen, phasors, of, pairs
         self.kept = (*MEANS, *RMS, *SEQUENCES, *(PARTS if phasors else ()))
         # largest power of the torques over eq. (8), both, and the instant
         self.excess: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
@@ -116,12 +120,13 @@ class StepMeans:
     @property
     def warnings(self) -> list[str]:
         """What must be known of the steps settled so far."""
-        more, torque, power, t = self.excess
-        if more <= EXCESS * 2.0 * self.gen.machine.P_rated:
+        *powers, t = self.excess
+        more, torque, power = (self._pairs * P for P in powers)
+        if more <= EXCESS * self._pairs * 2.0 * self.gen.machine.P_rated:
             return []
         return [
             f"eq. (8) gives too little: in the step that ends at t = {t:.6g} s the torque of "
-            f"the two generators takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
+            f"{self._of} takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
             f"the gas generator is loaded, {power / 1e3:.4g} kW; {more / 1e3:.3g} kW are more "
             f"than {100 * EXCESS:g} % of the rated power. Eq. (8) holds output and extra loss "
             "of the fault only: near a short circuit the machine's own loss is missing"

@@ -32,13 +32,14 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ApuWarning, ExchangeWarning, OperatingPointError, ValidityWarning
+from apu_casadi.core.profiles.profile import Varying, at, later
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import Governor
-from apu_casadi.unit.events import Event, LoadChange
+from apu_casadi.unit.events import Event, LoadChange, who
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -155,23 +156,40 @@ def fuel_limited(apu: Apu, t: np.ndarray, N: np.ndarray, Wf: np.ndarray) -> str 
     )
 
 
-def unserved(load: Load, events: Sequence[Event], t: np.ndarray, P_e: np.ndarray) -> str | None:
+def unserved(
+    load: Load | Varying[Load],
+    events: Sequence[Event],
+    t: np.ndarray,
+    P_e: np.ndarray,
+    numbers: Sequence[int] = (1,),
+    *,
+    of_all: bool = True,
+) -> str | None:
     """Return the words for a constant-power load that does not get its power; None if all do.
 
     Args:
         load, events: of the run.
         t, P_e: exchange instants, s, and output of one generator over the step before, W, (K,).
+        numbers: of the generators that it is of.
+        of_all: whether they are all.
     """
-    changes = [(e.t, e.load) for e in events if isinstance(e, LoadChange)]
+    of_these = (None, numbers[0])
+    changes = [
+        (e.t, later(e.load, e.t))
+        for e in events
+        if isinstance(e, LoadChange) and e.generator in of_these
+    ]
     starts = [(0.0, load), *changes]
     for (start, x), end in zip(starts, [*(s for s, _ in changes), float(t[-1])], strict=True):
         k = int(np.searchsorted(t, end + 1e-9)) - 1
         if end - start < SETTLED:
             continue
+        x = at(x, float(t[max(k, 1) - 1 : k + 1].mean()))
         if P_e[k] < 0.9 * x.demand:
+            each = "each generator" if of_all else who(numbers)
             return (
                 f"the load asks for more than the generator can give: at t = {t[k]:.6g} s it gets "
-                f"{P_e[k] / 1e3:.1f} kW of the {x.demand / 1e3:.1f} kW asked of each generator; "
+                f"{P_e[k] / 1e3:.1f} kW of the {x.demand / 1e3:.1f} kW asked of {each}; "
                 f"the voltage has collapsed"
             )
     return None
@@ -274,7 +292,7 @@ class _Rotor:
     """
 
     def __init__(self, apu: Apu, point: OperatingPoint, N_0: float, Wf_0: float) -> None:
-        self.link, self.N_0, self.Wf_0 = apu.link, N_0, Wf_0
+        self.link, self.N_0, self.Wf_0 = apu.shaft, N_0, Wf_0
         self.a, self.b = _slopes(apu.gas_generator, point)
         self.state = np.array([0.0, *apu.governor.start(Wf_0)])  # speed from its start, governor's
         self.error = self.excursion = 0.0

@@ -36,7 +36,8 @@ from scenarios.shell import jsontext, progress
 if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.fitting import EngineData, EngineFit
-    from estimators.apu.recordings.recorded import Reading, Table
+    from estimators.apu.recordings.layout import Reading
+    from estimators.apu.recordings.recorded import Table
     from estimators.apu.sensors import SensorSet
     from estimators.batch.fitresult import Profile
 
@@ -49,10 +50,17 @@ files FILE +           | recorded data (see above)
 {given.UNIT}
 --own A,B =            | gains or biases that each file has for itself
 --column NAME=COLUMN[:UNIT] ... | column of another name, or its unit
+--columns FILE         | how the files are laid out (TOML): columns, names, units, rate, ...
+--names A,B            | names of the columns in order, where the file has none; an empty one
+                       | leaves a column out
+--units A,B            | their units, an empty one for SI
 --time COLUMN          | time column (default: time, t, Timestamp and the like)
+--rate float HZ        | of the rows, where no column is the time
+--sort                 | put the rows in the order of time, and join those of one stamp
+--barometer PRESSURE   | of the air around, for gauge pressures: 101.3kPa
 --encoding NAME        | of text files, such as utf-16
 --decimal {{point,comma}} | decimal point or comma
---missing A,B =        | numbers that stand for a gap, as in the file: --missing=-999,9999
+--missing A,B =        | numbers and words that stand for a gap: --missing=-999,off
 --exclude-implausible  | leave out readings that cannot be, instead of refusing the file
 --range NAME=LOW:HIGH ... | another plausible range, in SI: T5=250:1300
 --time-format FORMAT   | of dates, such as %%d.%%m.%%Y %%H:%%M:%%S
@@ -70,19 +78,21 @@ files FILE +           | recorded data (see above)
 --json                 | print JSON
 --quiet                | no word on progress
 """
+MANY = 20  # rows without time from which it is said that they are taken as steady points
 RIDGE = 0.95  # correlation from which a pair is said to be confounded
 
 
 def run(args: argparse.Namespace) -> int:
     """Read, fit, print; return 0."""
     from estimators.apu import fitting
-    from estimators.apu.recordings.recorded import parse_mapping, read_table
+    from estimators.apu.recordings.layout import parse_mapping
+    from estimators.apu.recordings.recorded import read_table
     from estimators.apu.recordings.runfiles import recorded_ambient
 
     gg = given.engine(args)
-    mapping = parse_mapping(args.column)
+    reading, mapping = _reading(args, gg)
+    mapping |= parse_mapping(args.column)
     _known_targets(mapping, gg)
-    reading = _reading(args, gg)
     notes: list[str] = []
     tables = [read_table(f, mapping, reading=reading, notes=notes) for f in args.files]
     sensors = _sensors(args.sigma, gg)
@@ -110,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         figures = _draw(fit, args.figure, steady, ambients, given.program(args))
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
-    found["read_as"] = [*notes, *_unheeded(tables, times, args)]
+    found["read_as"] = [*notes, *_unheeded(tables, times, args), *_other_unit(args)]
     days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
     found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
     found |= {"apu_casadi_version": installed(), **given.own(args)}
@@ -142,15 +152,35 @@ def _profiles(fit: EngineFit, args: argparse.Namespace) -> list[Profile]:
 # ------------------------------------------------------------------------------ options
 
 
-def _reading(args: argparse.Namespace, gg: GasGenerator) -> Reading:
-    """Return how files are read that leave a question."""
+def _reading(
+    args: argparse.Namespace, gg: GasGenerator
+) -> tuple[Reading, dict[str, tuple[str, str | None]]]:
+    """Return how files are read that leave a question, and their columns by --columns."""
+    from estimators.apu.recordings.layout import Reading, merged, pressure, read_layout
     from estimators.apu.recordings.plausible import parse_limits
-    from estimators.apu.recordings.recorded import Reading
 
-    missing = [given.number(n, "--missing", args.missing) for n in given.names(args.missing)]
-    limits = parse_limits(args.range)
-    how = args.exclude_implausible, limits, args.time_format, args.time_zone
-    return Reading(args.encoding, args.decimal, tuple(missing), *how, engine=gg)
+    base, mapping = read_layout(args.columns) if args.columns else (Reading(), {})
+    own: dict[str, Any] = {n: tuple(_blanks(getattr(args, n))) for n in ("names", "units")}
+    own |= {"encoding": args.encoding, "decimal": args.decimal, "time": args.time}
+    own |= {"time_format": args.time_format, "time_zone": args.time_zone, "rate": args.rate}
+    own |= {"sort": args.sort, "exclude": args.exclude_implausible}
+    own |= {"missing": tuple(map(_number_or_word, given.names(args.missing)))}
+    own |= {"barometer": pressure(args.barometer) if args.barometer else None}
+    limits = {**base.ranges, **parse_limits(args.range)}
+    how = merged(base, Reading(**own))
+    return dataclasses.replace(how, ranges=limits, engine=gg), mapping
+
+
+def _blanks(text: str | None) -> list[str]:
+    """Return the names of ``A,,B``, empty ones among them."""
+    return [n.strip() for n in text.split(",")] if text else []
+
+
+def _number_or_word(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _priors(items: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -234,6 +264,7 @@ def _data(
     import numpy as np
 
     from estimators.apu.fitting import INPUTS, EngineData
+    from estimators.apu.recordings.thermal import check_temperatures
 
     readings = {s.name: table.get(s.name, s.unit) for s in sensors.sensors if s.name in table}
     measured = [n for n in readings if n not in INPUTS]
@@ -252,6 +283,7 @@ def _data(
             ambient[name] = said[name]
         if name in ambient:
             _in_range(table.source, name, ambient[name])
+    check_temperatures(table.source, readings, ambient, gg, table.reading.ranges)
     rows = np.arange(table.size, dtype=float) if t is None else t - t[0]
     # rows in which nothing was read are no points
     there = np.any([np.isfinite(readings[n]) for n in measured], axis=0)
@@ -293,15 +325,24 @@ def _recorded(
 def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Namespace) -> list[str]:
     """Say it where a column rises like a time, or flags rows as bad, and is not used."""
     flags = [f for t in tables for f in t.flags()]
-    if args.steady:
-        return flags
-    hints = [(t.source, t.steady_hint()) for t, at in zip(tables, times, strict=True) if at is None]
-    return flags + [
-        f"{source}: no time column, so each row is taken as a steady point; if {hint} is the time, "
-        f"give --time {hint}"
-        for source, hint in hints
-        if hint is not None
-    ]
+    for table, at in zip(tables, times, strict=True):
+        hint = table.steady_hint()
+        if args.steady or at is not None or (hint is None and table.size < MANY):
+            continue
+        remedy = f"--time {hint}" if hint else "--rate HZ"
+        flags.append(
+            f"{table.source}: no time column, so each row is taken as a steady point; if "
+            f"{f'{hint} is the time' if hint else 'they are samples of a transient'}, give {remedy}"
+        )
+    return flags
+
+
+def _other_unit(args: argparse.Namespace) -> list[str]:
+    """Say it where a run is of another unit than the one that is fitted."""
+    from estimators.apu.recordings.runfiles import recorded_engine
+
+    runs = [] if args.engine else [(f, recorded_engine(f)) for f in args.files]
+    return [f"{f} is a run of {unit}: give --engine {unit}" for f, unit in runs if unit]
 
 
 def _ignored(
@@ -310,9 +351,9 @@ def _ignored(
     """Columns that the fit does not use, with a guess of what they may be."""
     from estimators.apu.recordings.timestamps import is_time_name
 
-    used = {*sensors.names, *AMBIENT, time}
     out: dict[str, None] = {}
     for table in tables:
+        used = {*sensors.names, *AMBIENT, *str(time or table.reading.time).split(" + ")}
         for name in table.columns:
             if name in used or name in table.mapped or is_time_name(name):
                 continue

@@ -144,10 +144,14 @@ def unit(args: Namespace, parts_of_it: Sequence[str] | None = None) -> Apu:
 
 def load(args: Namespace) -> Load:
     """Return the load of each generator that ``--load`` describes by the keys of a scenario."""
-    from scenarios.reading import read_load
+    from apu_casadi.core.profiles.profile import Varying
+    from scenarios.reading import PlacedError, read_load
 
     parts(args)
-    return read_load(args.load, "--load")
+    load = read_load(args.load, "--load")
+    if isinstance(load, Varying):
+        raise PlacedError("--load", f"must not change in time here, got {load.label}")
+    return load
 
 
 def power_load(unit: Apu, P: float, power_factor: float = 1.0) -> Load:

@@ -118,7 +118,8 @@ def _parameters(p: Parameters) -> str:
 
 
 def _choices(apu: Apu) -> str:
-    rows = [(f"`{k}`", f'"{v}"') for k, v in apu.parameters().items() if isinstance(v, str)]
+    counted = {k: f'"{v}"' if isinstance(v, str) else f"{v}" for k, v in apu.parameters().items()}
+    rows = [(f"`{k}`", v) for k, v in counted.items() if v[0] == '"' or k.startswith("generator.")]
     return table(("name", "value"), rows)
 
 

@@ -74,6 +74,8 @@ class Fault(ABC):
     #: Word for it in a scenario file, and the keys that it takes.
     word: ClassVar[str] = ""
     keys: ClassVar[tuple[Key, ...]] = ()
+    #: Keys that may stand in place of others, by these; ``resolved`` puts the others.
+    instead: ClassVar[Mapping[str, Key]] = {}
     #: Own states that change their sign when the rotor has turned by half a turn.
     reversing: ClassVar[tuple[str, ...]] = ()
     #: What a run stores of its severity; the defaults are those of a healthy machine.
@@ -154,7 +156,31 @@ class Fault(ABC):
         """The fault in a few words."""
         return repr(self)
 
+    # -- profiles -------------------------------------------------------------------------------
+
+    @classmethod
+    def or_none(cls, *args: Any, **values: Any) -> Fault | None:
+        """Return the fault; None where a severity among its values is that of a healthy machine.
+
+        So a severity may follow a profile that begins at zero, or goes off and on.
+        """
+        return None if cls.absent(values) else cls(*args, **values)
+
+    @classmethod
+    def absent(cls, values: Mapping[str, Any]) -> bool:
+        """Whether a severity among values by name is that of a healthy machine."""
+        return any(values.get(s.name) == s.default for s in cls.severities if s.default == 0.0)
+
     # -- scenario files -------------------------------------------------------------------------
+
+    @classmethod
+    def resolved(cls, table: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the table with ``keys`` alone, those of ``instead`` turned into them.
+
+        Raises:
+            ScenarioError: both are given, or a wrong value; the text starts with the key.
+        """
+        return table
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Fault:
@@ -163,7 +189,7 @@ class Fault(ABC):
         Raises:
             ScenarioError: a key or value that is wrong; the text starts with the key.
         """
-        return cls(**read_table(f"a {cls.word!r} fault", cls.keys, table))
+        return cls(**read_table(f"a {cls.word!r} fault", cls.keys, cls.resolved(table)))
 
     def to_table(self) -> dict[str, Any]:
         """Return the table that :func:`fault_from_table` reads."""
@@ -182,6 +208,16 @@ def fault_from_table(table: Mapping[str, Any], default: str = "ttsc") -> Fault:
     """
     rest = {k: v for k, v in table.items() if k != "kind"}
     return FAULTS.of_kind(table.get("kind", default)).from_table(rest)
+
+
+def fault_of(**table: Any) -> Fault | None:
+    """Return the fault of a table's keys; None where a severity is that of a healthy machine.
+
+    Raises:
+        ScenarioError: as :func:`fault_from_table`.
+    """
+    kind = FAULTS.of_kind(table.get("kind", "ttsc"))
+    return None if kind.absent(table) else fault_from_table(table)
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 from apu_casadi.core.checked import bounded, number
-from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.register import Key, read_table
 from apu_casadi.core.results import CHANNELS
 from apu_casadi.core.signals import Signal
@@ -75,6 +76,9 @@ class Ttsc(Fault):
         Key("kappa", "1", "leakage partition, mu (full coupling) to 1", 0.0, 1.0, default=None),
         Key("phase", "1", "faulty phase", default="a", choices=tuple(PHASE_ANGLE)),
     )
+    instead: ClassVar[Mapping[str, Key]] = MappingProxyType(
+        {"k_rf": Key("h", "1", "mu/(k_rf + 1 - mu), in place of k_rf", 0.0, 99.0, open_lo=True)}
+    )
     reversing: ClassVar[tuple[str, ...]] = ("i_fault",)
     severities: ClassVar[tuple[Signal, ...]] = tuple(
         Signal(name, *CHANNELS[name], default=healthy)
@@ -112,6 +116,26 @@ class Ttsc(Fault):
     def h(self) -> float:
         """mu / (k_rf + 1 - mu): the one severity that shows at the terminals if kappa = mu."""
         return self.mu / (self.k_rf + 1.0 - self.mu)
+
+    @classmethod
+    def of_h(cls, mu: float, h: float, kappa: float | None = None, phase: str = "a") -> Self:
+        """Make the fault of a severity h = mu / (k_rf + 1 - mu) at the terminals.
+
+        Args:
+            mu, kappa, phase: as of the class.
+            h: 0 < h <= mu / (1 - mu), which is a metallic short.
+
+        Raises:
+            ParameterError: a value outside its range.
+        """
+        mu, h = (number(f"Ttsc.{n}", v, error=ParameterError) for n, v in (("mu", mu), ("h", h)))
+        if not (0 < mu < 1 and 0 < h * (1 - mu) <= mu * (1 + 1e-12)):
+            most = f"{mu / (1 - mu):g}" if 0 < mu < 1 else "mu/(1 - mu)"
+            raise ParameterError(
+                f"Ttsc.h = {h:g} is outside (0, {most}]: with mu = {mu:g} a metallic short has "
+                "mu/(1 - mu)"
+            )
+        return cls(mu, max(0.0, mu / h - 1.0 + mu), kappa, phase)
 
     @property
     def phase_angle(self) -> float:
@@ -195,9 +219,29 @@ class Ttsc(Fault):
         return {n: 0.0 if moved else before.get(n, 0.0) for n in states}
 
     @classmethod
+    def absent(cls, values: Mapping[str, Any]) -> bool:
+        """Whether mu or h is zero."""
+        return super().absent(values) or values.get("h") == 0
+
+    @classmethod
+    def resolved(cls, table: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the table with k_rf in place of h."""
+        if "h" not in table:
+            return table
+        if "k_rf" in table:
+            raise ScenarioError("h: stands in place of k_rf; give one of them")
+        rest = {k: v for k, v in table.items() if k != "h"}
+        h = cls.instead["k_rf"].read(table["h"])
+        mu = read_table("a 'ttsc' fault", cls.keys[:1], {"mu": rest.get("mu")})["mu"]
+        try:
+            return {**rest, "k_rf": cls.of_h(mu, h).k_rf}
+        except ParameterError as error:
+            raise ScenarioError(f"h: {str(error).partition('h = ')[2]}") from None
+
+    @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Fault:
-        """Make the fault from mu, k_rf, kappa and phase."""
-        values = read_table("a 'ttsc' fault", cls.keys, table)
+        """Make the fault from mu, k_rf or h, kappa and phase."""
+        values = read_table("a 'ttsc' fault", cls.keys, cls.resolved(table))
         if values["kappa"] is not None:
             bounded(values["kappa"], "kappa", lo=values["mu"], hi=1.0)
         return cls(**values)

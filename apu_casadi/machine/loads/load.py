@@ -242,6 +242,11 @@ def load_from_table(table: Mapping[str, Any]) -> Load:
     return LOADS.of_kind(table["kind"]).from_table(table)
 
 
+def load_of(**table: Any) -> Load:
+    """Return the load of a table's keys; as :func:`load_from_table`."""
+    return load_from_table(table)
+
+
 @dataclass(frozen=True)
 class LoadStructure:
     """What a model is built of: equal for all loads of one kind of one class.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,14 +10,21 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from estimators.apu.recordings.columns import Column, cut, header, parsed
+from apu_casadi.core.results import GENERATOR, load
+from apu_casadi.core.units import header, unit_of
+from estimators.apu.recordings.columns import Column, Tell, cut, parsed
 
-__all__ = ["netcdf_columns", "parquet_columns"]
+__all__ = [
+    "dataset_columns",
+    "frame_columns",
+    "netcdf_columns",
+    "parquet_columns",
+    "time_dims",
+    "typed",
+]
 
-Tell = Callable[[str], None]
 
-
-def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
+def typed(path: Path | str, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
     """Make a column of an array, or of a pandas series, of any type.
 
     Raises:
@@ -34,7 +40,8 @@ def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
             raw.cat.categories.dtype if raw.cat.categories.dtype.kind in "ifuM" else object
         )
         dtype = raw.dtype
-    if type(dtype).__name__ == "DatetimeTZDtype":
+    utc = type(dtype).__name__ == "DatetimeTZDtype"
+    if utc:
         raw = raw.dt.tz_convert("UTC").dt.tz_localize(None)
     if hasattr(raw, "to_numpy"):
         kind = getattr(dtype, "kind", "O")
@@ -55,7 +62,8 @@ def typed(path: Path, name: str, unit: Any, raw: Any, tell: Tell) -> Column:
         return Column(name, unit, values, a)
     nothing = np.full(a.shape[0], np.nan)
     if a.dtype.kind in "mM":
-        return Column(name, unit, nothing, a, f"{place(0)}: {a[0] if a.size else ''} is no number")
+        problem = f"{place(0)}: {a[0] if a.size else ''} is no number"
+        return Column(name, unit, nothing, a, problem, utc)
     if a.dtype.kind == "S":
         a = np.char.decode(a, "utf-8", "replace")
     cells = [c.decode("utf-8", "replace") if isinstance(c, bytes) else c for c in a.tolist()]
@@ -87,6 +95,11 @@ def parquet_columns(path: Path, tell: Tell) -> list[Column]:
         frame = pd.read_parquet(path, engine=engine)
     except Exception as e:  # damaged files fail with any type
         raise DataError(f"{path}: damaged Parquet file ({type(e).__name__}: {e})") from None
+    return frame_columns(path, frame, tell)
+
+
+def frame_columns(path: Path | str, frame: Any, tell: Tell) -> list[Column]:
+    """Return the columns of a pandas.DataFrame, those of its index first."""
     columns = []
     for level in range(frame.index.nlevels):
         values = frame.index.get_level_values(level)
@@ -108,14 +121,12 @@ def parquet_columns(path: Path, tell: Tell) -> list[Column]:
     return columns
 
 
-def _label(path: Path, label: Any) -> tuple[str, Any]:
+def _label(path: Path | str, label: Any) -> tuple[str, Any]:
     """Name and unit of a column; of several levels the first is the name, the second the unit."""
     if not isinstance(label, tuple):
         return header(str(label))
     parts = [str(p).strip() for p in label if str(p).strip()]
     if len(parts) == 2:
-        from apu_casadi.core.units import unit_of
-
         unit = parts[1].strip("[]()")
         if unit_of(unit) is not None:
             return parts[0], unit
@@ -130,19 +141,49 @@ def _label(path: Path, label: Any) -> tuple[str, Any]:
 # ------------------------------------------------------------------------------ netCDF
 
 
-def netcdf_columns(path: Path, tell: Tell) -> tuple[list[Column], dict[str, str]]:
+def netcdf_columns(
+    path: Path, tell: Tell, dim: str | None = None
+) -> tuple[list[Column], dict[str, str]]:
     """Read a netCDF file; return its columns, and why other variables are none."""
+    return dataset_columns(path, load(path), tell, dim)
+
+
+def time_dims(data: Any) -> list[str]:
+    """Dimensions along which a dataset has columns, the longest last."""
+    data = _each_generator(data)
+    found = [d for d in data.sizes if any(v.dims == (d,) for v in data.data_vars.values())]
+    return sorted(map(str, found), key=lambda d: int(data.sizes[d]))
+
+
+def _each_generator(data: Any) -> Any:
+    """A dataset without the dimension of generators, whose numbers end the names instead."""
+    if GENERATOR not in data.dims or data.sizes[GENERATOR] == 1:
+        return data
+    many = [n for n, v in data.data_vars.items() if GENERATOR in v.dims]
+    numbers = 1 + np.arange(data.sizes[GENERATOR])
+    numbers = data[GENERATOR].values if GENERATOR in data.coords else numbers
+    out = data.drop_vars([*many, *(n for n, v in data.coords.items() if GENERATOR in v.dims)])
+    for n in many:
+        for k, number in enumerate(numbers):
+            out[f"{n}_{number}"] = data[n].isel({GENERATOR: k}, drop=True)
+    return out
+
+
+def dataset_columns(
+    path: Path | str, data: Any, tell: Tell, dim: str | None = None
+) -> tuple[list[Column], dict[str, str]]:
+    """Return the columns of an xarray.Dataset along one dimension, and why other ones are none.
+
+    What each generator has of its own is a column for each, ``v_a_2``.
+    """
     import xarray as xr
 
-    from apu_casadi.core.results import load
-
-    with path.open("rb") as f:
-        start = f.read(4)
-    data = _netcdf4(path) if start == b"\x89HDF" else load(path)
-    sizes = {d: int(n) for d, n in data.sizes.items()}
+    data = _each_generator(data)
+    sizes = {str(d): int(n) for d, n in data.sizes.items()}
     if not sizes:
         raise DataError(f"{path}: no data rows")
-    dim = "time" if "time" in sizes else max(sizes, key=lambda d: sizes[d])
+    if dim is None:
+        dim = "time" if "time" in sizes else max(sizes, key=lambda d: sizes[d])
     out, others = [], {}
     for name in [*data.coords, *data.data_vars]:
         v = data[name].squeeze([d for d in data[name].dims if d != dim and sizes[d] == 1])
@@ -162,34 +203,3 @@ def netcdf_columns(path: Path, tell: Tell) -> tuple[list[Column], dict[str, str]
         unit = v.attrs.get("units")
         out.append(typed(path, str(name), unit, values, tell))
     return out, others
-
-
-def _netcdf4(path: Path) -> Any:
-    import xarray as xr
-
-    try:
-        with xr.open_dataset(path, decode_times=False) as ds:
-            data = ds.load()
-    except ValueError:
-        raise DataError(
-            f"{path}: a netCDF 4 file; reading it needs h5netcdf: pip install h5netcdf"
-        ) from None
-    except Exception as e:  # damaged files fail with any type
-        raise DataError(f"{path}: damaged netCDF file ({type(e).__name__}: {e})") from None
-    if not data.variables:
-        groups = _groups(path)
-        if groups:
-            raise DataError(
-                f"{path}: the variables are in groups ({', '.join(groups)}), which are not read: "
-                "save one of them as a file of its own, xarray.open_dataset(path, group=...)"
-            )
-    return data
-
-
-def _groups(path: Path) -> list[str]:
-    import xarray as xr
-
-    try:
-        return [g for g in xr.open_groups(path, decode_times=False) if g != "/"]
-    except Exception:  # only for the message
-        return []

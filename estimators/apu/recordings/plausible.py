@@ -9,7 +9,7 @@ at all (a sentinel, a missing unit, a zero of a dead channel), not to judge an e
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,12 +19,23 @@ from apu_casadi.core.errors import DataError, nearest
 from apu_casadi.core.units import UNITS
 from apu_casadi.gaspath.conditions import RANGES as CONDITIONS
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from estimators.apu.sensors import RANGES
+from apu_casadi.machine.park import PHASES
+from estimators.apu.sensors import ELECTRICAL, KNOWN, RANGES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["PLAUSIBLE", "Limits", "parse_limits", "plausible_for"]
+__all__ = [
+    "PLAUSIBLE",
+    "WAVES",
+    "Limits",
+    "clipped",
+    "parse_limits",
+    "plain",
+    "plausible_for",
+    "si_of",
+    "stuck",
+]
 
 _COLD, _HOT, _BURNT = (150.0, 420.0), (300.0, 1200.0), (400.0, 1900.0)
 _AMBIENT_P, _HIGH_P = (5e3, 2.5e5), (4e4, 2e6)
@@ -42,7 +53,14 @@ _OF = (
     ("SM", (-0.5, 2.0)),
     ("Mach8", (0.0, 1.0)),
     ("V8", (0.0, 700.0)),
+    ("w_r", (1e3, 6e3)),
+    ("V_fd", (-600.0, 600.0)),
+    ("i_fd", (-500.0, 1000.0)),
+    *((f"v_{p}", (-2500.0, 2500.0)) for p in PHASES),
+    *((f"i_{p}", (-15e3, 15e3)) for p in PHASES),
 )
+#: Quantities that are sampled as waveforms, of both signs.
+WAVES = tuple(f"{q}_{p}" for q in "vi" for p in PHASES)
 #: Quantity -> (lowest, highest), SI: what sensors read, the other outputs, and the ambient
 #: conditions, of which the engine takes what is here.
 PLAUSIBLE: Mapping[str, tuple[float, float]] = ChainMap(
@@ -54,13 +72,36 @@ _SMALL = {"PW": 2e3}
 _USUAL = {
     "K": ("degC", "degF", "degR"),
     "Pa": ("kPa", "bar", "psi", "hPa", "MPa"),
-    "rad/s": ("rpm",),
+    "rad/s": ("rpm", "krpm", "rev/s", "%"),
     "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"),
     "W": ("kW", "hp", "MW"),
+    "V": ("kV", "mV"),
+    "A": ("mA", "kA"),
     "m": ("ft", "km"),
 }
 #: What loggers write for "no reading", where a range would let it pass.
 _SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
+#: Full scales and codes that count only where they stand apart from all other readings.
+_CODES = (*_SENTINELS, -40.0, -1.0, 255.0, 850.0, 888.0, 1023.0, 4095.0, 8888.0, 32767.0, 65535.0)
+_NINES = (99.0, 99.9, 99.99, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0)
+_RUN = 8  # equal readings in a row, while others change, that look stuck
+
+
+def plain(name: str) -> str:
+    """Return a quantity of a generator without the machine's number: ``v_a`` of ``v_a_2``."""
+    head, _, machine = name.rpartition("_")
+    return head if machine in ["1", "2", "3", "4"] and head in ELECTRICAL else name
+
+
+def si_of(name: str) -> str | None:
+    """Return the SI unit in which the model has a quantity; None for an unknown one."""
+    name = plain(name)
+    if name in ELECTRICAL:
+        return ELECTRICAL[name].unit
+    if name in KNOWN:
+        return KNOWN[name].unit
+    signals = next((s for s in (GasGenerator.Y, GasGenerator.U) if name in s.names), None)
+    return None if signals is None else signals[name].unit
 
 
 def plausible_for(gg: GasGenerator) -> dict[str, tuple[float, float]]:
@@ -88,10 +129,12 @@ class Limits:
     Args:
         ranges: quantity -> (lowest, highest), SI; what is not named is not judged.
         exclude: make a gap of an impossible reading instead of refusing the file.
+        given: quantities whose range the user gave: what is in it is believed.
     """
 
     ranges: Mapping[str, tuple[float, float]]
     exclude: bool = False
+    given: Collection[str] = ()
 
     def apply(
         self,
@@ -117,11 +160,16 @@ class Limits:
         Raises:
             DataError: an impossible reading, with file, column, row and value.
         """
-        if name not in self.ranges:
+        kind = name if name in self.ranges else plain(name)
+        if kind not in self.ranges:
             return values
-        low, high = self.ranges[name]
-        out = np.isfinite(values) & ((values < low) | (values > high) | np.isin(raw, _SENTINELS))
+        low, high = self.ranges[kind]
         there = np.isfinite(values)
+        out = there & ((values < low) | (values > high) | np.isin(raw, _SENTINELS))
+        if kind in WAVES:
+            out &= (values < low) | (values > high)
+        apart = np.zeros_like(out) if name in self.given else _apart(raw, there & ~out)
+        odd, out = bool(apart.any() and not out.any()), out | apart
         if not out.any():
             if unit is None and there.any():
                 self._bare(name, si, values[there], where(int(np.argmax(there))), mixed)
@@ -132,38 +180,47 @@ class Limits:
             shown += f" = {values[k]:.6g} {si}"
         count = f"{int(out.sum())} of {int(there.sum())} readings"
         limits = f"{low:g} to {high:g}" + ("" if si == "1" else f" {si}")
+        rest = raw[there & ~out]
+        no = (
+            f"a code or {name}? it stands apart from all other readings, {rest.min():.6g} to "
+            f"{rest.max():.6g} ({count}"
+            if odd
+            else f"no possible {name} ({limits}; {count}"
+        )
         others = _fits(si, raw[there], low, high)
+        others = others if unit is None or not _inside(raw[there], low, high) else [si, *others][:2]
         if others and out.sum() * 2 >= there.sum() and self._many(values[there], low, high):
             meant = " or ".join(others)
             raise DataError(
                 f"{where(k)}: {'unit missing' if unit is None else 'wrong unit'}? {raw[k]:.9g} is "
                 f"plausible as {meant}, not as {unit or si} ({name} lies within {limits}): write "
-                f"the unit into the header, {name} [{others[0]}], or give --column "
+                f"the unit into the header, such as {name} [{others[0]}], or give --column "
                 f"{name}={name}:{others[0]}"
             )
         if not self.exclude:
             raise DataError(
-                f"{where(k)}: {shown} is no possible {name} ({limits}; {count}): give --missing "
-                f"{raw[k]:.9g} if that stands for a gap, --exclude-implausible to leave such "
-                f"readings out, or --range {name}=LOW:HIGH in {si} if they are right"
+                f"{where(k)}: {shown} is {no}): give --missing {raw[k]:.9g} if that stands for a "
+                "gap, --exclude-implausible to leave such readings out, or --range "
+                f"{name}=LOW:HIGH in {si} if they are right"
             )
         if out.sum() == there.sum():
             raise DataError(
                 f"{where(k)}: {shown} is no possible {name} ({limits}), nor is any other reading "
                 "of this column: nothing is left of it"
             )
-        tell(f"{where(k)}: {shown} is no possible {name} ({limits}); {count} left out")
+        no = no if odd else f"no possible {name} ({limits}); {count}"
+        tell(f"{where(k)}: {shown} is {no}{')' * odd} left out")
         return np.where(out, np.nan, values)
 
     @staticmethod
     def _many(values: np.ndarray, low: float, high: float) -> bool:
         """Whether the column as a whole is off, and not one reading of several."""
-        middle = float(np.median(values))
-        return not low <= middle <= high
+        off = (values < low) | (values > high)
+        return not low <= float(np.median(values)) <= high or bool(off.mean() > 0.9)
 
     def _bare(self, name: str, si: str, values: np.ndarray, where: str, mixed: bool) -> None:
         """Refuse a column without unit whose readings may be in another one as well."""
-        low, high = self.ranges[name]
+        low, high = self.ranges[plain(name)]
         top = float(np.abs(values).max())
         if 0 < top < _SMALL.get(name, 0.0):
             raise DataError(
@@ -181,15 +238,60 @@ class Limits:
                 )
 
 
+def _apart(raw: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Readings that are a code or a zero, and farther from all others than those are apart."""
+    out = np.zeros(raw.shape, bool)
+    values = np.unique(raw[there])
+    if values.size < 3 or values.size * 20 < there.sum():  # few levels: coarse, or steps
+        return out
+    for end, rest in ((values[0], values[1:]), (values[-1], values[:-1])):
+        code = end == 0.0 or float(end) in _CODES or abs(float(end)) in _NINES
+        far = 1.0 if values.size < 50 else 0.5 if end == 0.0 else 0.2
+        few = (raw == end).sum() * 2 < there.sum()
+        if code and few and np.abs(rest - end).min() > far * np.ptp(rest):
+            out |= there & (raw == end)
+    return out
+
+
+def stuck(values: np.ndarray, others: Sequence[np.ndarray]) -> tuple[int, int] | None:
+    """Return first and last row of a long run of one reading while all others change; else None."""
+    there = np.isfinite(values)
+    same = np.append(False, values[1:] == values[:-1])
+    if not there.any() or same.mean() > 0.5:
+        return None
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+    runs = sorted(((b - a, a) for a, b in edges.reshape(-1, 2)), reverse=True)
+    if not runs or runs[0][0] + 1 < _RUN or (len(runs) > 1 and runs[0][0] < 3 * runs[1][0]):
+        return None
+    n, a = runs[0]
+    part = slice(a - 1, a + n)
+    moving = [np.nanstd(o[part]) > 0 for o in others if np.isfinite(o[part]).sum() > 2]
+    return (a - 1, a + n - 1) if moving and all(moving) else None
+
+
+def clipped(values: np.ndarray) -> int:
+    """Return how many samples stand at the largest or lowest one in runs, as a transducer clips."""
+    count = 0
+    for end in (np.nanmax(values), np.nanmin(values)):
+        at = values == end
+        count += int((at[1:] & at[:-1]).sum())
+    return count if count >= 4 and count > 0.002 * values.size else 0
+
+
+def _inside(values: np.ndarray, low: float, high: float) -> bool:
+    return bool(((values >= low) & (values <= high)).all())
+
+
 def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
     """Return the units in which all the readings would be plausible."""
     found = []
     for unit in _USUAL.get(si, ()):
         _, factor, offset = UNITS[unit]
-        v = raw * factor + offset
-        if ((v >= low) & (v <= high)).all():
+        if unit == "%":  # of the design speed
+            factor = low / 40
+        if _inside(raw * factor + offset, low, high):
             found.append(unit)
-    return found[:2]
+    return found[:4]
 
 
 def parse_limits(items: list[str]) -> dict[str, tuple[float, float]]:

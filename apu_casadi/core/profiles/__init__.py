@@ -1,0 +1,1 @@
+"""Profiles: numbers that change in time, one kind a class."""

@@ -1,0 +1,244 @@
+"""What exact propagation needs of a load and a fault that change in time.
+
+Their numbers enter the transition matrices of :mod:`apu_casadi.machine.transition`, and a table of
+these costs as much as a hundred exchange steps.  But along a smooth course everything is a smooth
+function of one number, the time, or the value of the profile where there is only one, given by
+points: tables are computed at a few of its Chebyshev nodes and interpolated in between.  An
+interval is halved until the polynomial of degree ``DEGREES`` agrees with tables between its nodes
+to ``TOL``; it is never laid across a jump or a bend of a profile.
+
+A run holds all numbers over an exchange step.  The windings see a small jump at its beginning, and
+what follows it within microseconds falls between the samples of propagation; ``smooth`` of what
+propagates bounds the jump; beyond it steps are left to an adaptive integrator, as after a switch.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from apu_casadi.core.errors import ApuError, NotApplicable
+from apu_casadi.core.profiles.profile import Profile, Varying
+from apu_casadi.machine.faults.fault import Fault
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.generatormodel import GeneratorModel
+from apu_casadi.machine.loads.load import Load
+from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.machine.propagation import Propagator
+
+DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
+TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
+DEEPEST = 16  # times that an interval may be halved
+_INSIDE = 1e-6  # share of an interval that nodes keep from its ends, where profiles may jump
+
+F = TypeVar("F", MeanStep, Propagator)
+
+
+class Numbers(NamedTuple):
+    """What steps take, one column each.
+
+    Args:
+        vector: numbers of what propagates (:attr:`MeanStep.vector`), (numbers, steps).
+        u: inputs, (nu, steps); speed, reference and noise among them do not count.
+        theta: parameters as compiled functions take them, (ntheta, steps).
+        severity: of the fault, in the order of its ``severities``, (severities, steps).
+    """
+
+    vector: np.ndarray
+    u: np.ndarray
+    theta: np.ndarray
+    severity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Piece(Generic[F]):
+    """Polynomials over an interval of the coordinate.
+
+    Args:
+        fast: propagates; its numbers are to be replaced.
+        middle, half: of the interval.
+        powers: coefficients of Chebyshev polynomials, (degree + 1, numbers).
+        nodes, rates: values of the coordinate, and the largest rate of change of a transition
+            matrix there, nominal units.
+    """
+
+    fast: F
+    middle: float
+    half: float
+    powers: np.ndarray
+    nodes: np.ndarray
+    rates: np.ndarray
+
+    def at(self, s: np.ndarray) -> np.ndarray:
+        """Return all numbers at values of the coordinate, (numbers, steps)."""
+        x = (s - self.middle) / self.half
+        basis = np.polynomial.chebyshev.chebvander(x, self.powers.shape[0] - 1)
+        return np.asarray((basis @ self.powers).T)
+
+
+class Course(Generic[F]):
+    """A load and a fault on their way through a run, beside one model variant.
+
+    Args:
+        gen, ss: generator and its variant for this load and this fault.
+        load, fault: at least one of them changes in time.
+        prepare: (u, theta, harmonics at least) -> what propagates with these numbers.
+        end: end of the run, s.
+    """
+
+    gen: Generator
+    ss: GeneratorModel
+    load: Load | Varying[Load]
+    fault: Fault | Varying[Fault | None] | None
+
+    def __init__(
+        self,
+        gen: Generator,
+        ss: GeneratorModel,
+        load: Load | Varying[Load],
+        fault: Fault | Varying[Fault | None] | None,
+        prepare: Callable[[np.ndarray, np.ndarray, int], F],
+        end: float,
+    ) -> None:
+        self.gen, self.ss, self.load, self.fault = gen, ss, load, fault
+        self._prepare: Callable[[np.ndarray, np.ndarray, int], F] = prepare
+        parts: list[Varying[Any]] = [x for x in (load, fault) if isinstance(x, Varying)]
+        profiles = [p for x in parts for p in x.profiles.values()]
+        # the value of the only profile, where its course in time has many bends
+        self._only: Profile | None = (
+            profiles[0] if len(profiles) == 1 and profiles[0].by_value else None
+        )
+        if self._only is not None:
+            low, high = self._only.bounds
+            self._ends: list[float] = [low, high if high > low else low + max(abs(low), 1e-9)]
+        else:
+            bends: set[float] = {t for x in parts for t in x.corners(end)}
+            self._ends = [0.0, *sorted(bends), end]
+        self._pieces: dict[tuple[float, float], Piece[F] | str | None] = {}
+
+    # -- the coordinate -------------------------------------------------------------------------
+
+    def _coordinate(self, t: np.ndarray) -> np.ndarray:
+        return t if self._only is None else self._only(t)
+
+    def _made(self, part: Any, s: float) -> Any:
+        if not isinstance(part, Varying):
+            return part
+        if self._only is None:
+            return part.at(s)
+        return part.with_values(dict.fromkeys(part.profiles, s))
+
+    # -- numbers --------------------------------------------------------------------------------
+
+    def numbers(self, t: np.ndarray, before: float | None = None) -> tuple[F, Numbers]:
+        """Return what propagates over steps whose middles are ``t``, s, and its numbers.
+
+        Args:
+            before: the middle of the step before them, if the first goes on from it.
+
+        Raises:
+            NotApplicable: the numbers change too fast from step to step, have no polynomial, or
+                those of the steps differ in structure.
+        """
+        s = self._coordinate(np.asarray(t, dtype=float))
+        pieces = [self._piece(float(v)) for v in s]
+        if any(p.fast.layout != pieces[0].fast.layout for p in pieces):
+            raise NotApplicable(f"{self.ss.name}: the structure changes on the way")
+        first = s[:1] if before is None else self._coordinate(np.array([before]))
+        moved = np.abs(np.diff(s, prepend=first)).tolist()
+        rates = (float(np.interp(v, p.nodes, p.rates)) for p, v in zip(pieces, s, strict=True))
+        jump = max(r * d for r, d in zip(rates, moved, strict=True))
+        fast = pieces[0].fast
+        if jump > fast.smooth:
+            raise NotApplicable(
+                f"{self.ss.name}: load or fault change by {jump:.1e} of the transition matrices "
+                f"in a step, {fast.smooth:g} at most"
+            )
+        if all(p is pieces[0] for p in pieces):
+            values = pieces[0].at(s)
+        else:
+            columns = [p.at(s[k : k + 1]) for k, p in enumerate(pieces)]
+            values = np.concatenate(columns, axis=1)
+        sizes = (fast.vector.size, len(self.ss.u), fast.theta.size)
+        return fast, Numbers(*np.split(values, np.cumsum(sizes)))
+
+    def _piece(self, s: float) -> Piece[F]:
+        """Return the polynomials around a value of the coordinate, made when first asked for."""
+        ends = self._ends
+        k = min(max(bisect.bisect_right(ends, s), 1), len(ends) - 1)
+        a, b = ends[k - 1], ends[k]
+        for _ in range(DEEPEST):
+            if (a, b) not in self._pieces:
+                try:
+                    self._pieces[a, b] = self._fitted(a, b)
+                except ApuError as error:  # also of a load or fault that cannot be there
+                    self._pieces[a, b] = str(error)
+            found = self._pieces[a, b]
+            if isinstance(found, Piece):
+                return found
+            if isinstance(found, str):
+                raise NotApplicable(found)
+            middle = (a + b) / 2
+            a, b = (a, middle) if s < middle else (middle, b)
+        raise NotApplicable(f"{self.ss.name}: no polynomial through its numbers converges")
+
+    def _fitted(self, a: float, b: float) -> Piece[F] | None:
+        """Return the polynomials of [a, b]; None where none of ``DEGREES`` is enough."""
+        middle, half = (a + b) / 2, (b - a) / 2
+        reach, made = half * (1 - _INSIDE), dict[float, F]()
+        for degree in DEGREES:
+            nodes: np.ndarray = _lobatto(degree)
+            between: np.ndarray = _lobatto(2 * degree)[1::2]
+            if degree == DEGREES[-1]:  # two of them tell enough
+                between = between[[0, degree // 2]]
+            wanted = [float(x) for x in (*nodes, *between)]
+            tables = [self._table(middle + reach * x, made, x) for x in wanted]
+            harmonics = max(t[0].harmonics for t in tables)
+            if any(t[0].harmonics != harmonics for t in tables):
+                made.clear()
+                tables = [
+                    self._table(middle + reach * x, made, x, harmonics=harmonics) for x in wanted
+                ]
+            fast = tables[0][0]
+            values = np.array([v for _, v in tables])
+            fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
+            powers = fit @ values[: degree + 1]
+            off = np.polynomial.chebyshev.chebvander(between, degree) @ powers
+            error = np.abs(off - values[degree + 1 :])
+            n = fast.vector.size
+            own = (error[:, :n] * fast.units).max()
+            scale = np.abs(values[:, n:]).max(axis=0) + 1e-300
+            rest = float((error[:, n:] / scale).max()) if scale.size else 0.0
+            if max(own, rest) <= TOL:
+                slope = np.polynomial.chebyshev.chebder(powers[:, :n]) * fast.units / reach
+                rates = np.abs(np.polynomial.chebyshev.chebvander(nodes, degree - 1) @ slope)
+                at = middle + reach * nodes
+                return Piece(fast, middle, reach, powers, at, rates.max(axis=1))
+        return None
+
+    def _table(
+        self, s: float, made: dict[float, Any], x: float, *, harmonics: int = 0
+    ) -> tuple[F, np.ndarray]:
+        """Return what propagates at a value of the coordinate, and all of its numbers."""
+        if x in made:
+            return made[x]  # type: ignore[no-any-return]
+        load, fault = self._made(self.load, s), self._made(self.fault, s)
+        ss, theta = self.gen.variant(load, fault), self.gen.fault_vector(load, fault)
+        if ss != self.ss:
+            raise NotApplicable(f"{self.ss.name}: on the way it turns into {ss.name}")
+        u = self.gen.inputs(load)
+        fast = self._prepare(u, theta, harmonics)
+        severity = [] if fault is None else list(fault.severity.values())
+        severity = [0.0 if math.isnan(v) else v for v in severity]
+        made[x] = fast, np.concatenate([fast.vector, u, fast.theta, severity])
+        return made[x]  # type: ignore[no-any-return]
+
+
+def _lobatto(degree: int) -> np.ndarray:
+    """Chebyshev-Lobatto nodes of [-1, 1], increasing; those of twice the degree hold them."""
+    return np.asarray(-np.cos(np.pi * np.arange(degree + 1) / degree))

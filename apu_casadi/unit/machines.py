@@ -1,0 +1,285 @@
+"""The generators of a joint run, each group of equal ones computed once.
+
+Generators of equal model, gear, load, fault and state are one group.  A switch of one of them alone
+parts its group for good: from then on both have their own states.  Groups go on by blocks of
+exchange steps where all can, else by single steps, each with the integrator that can take it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.runloop import SAME_INSTANT
+from apu_casadi.unit.apu import Apu, JointPoint, groups
+from apu_casadi.unit.events import Event, HealthChange, Holding, who
+from apu_casadi.unit.integrators import WAVEFORMS, Settings
+from apu_casadi.unit.jointstep import BlockResult, JointBlock
+from apu_casadi.unit.machinestep import MachineMade, MachineStep
+from apu_casadi.unit.stepmeans import RawMeans, StepMeans
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from apu_casadi.machine.faults.fault import Fault
+
+
+class Of(NamedTuple):
+    """What one or more steps gave of a group of generators.
+
+    Args:
+        numbers: which they are.
+        means: as they were averaged, or as they are kept.
+        fault: of each; or severities by name, one for each step.
+        w: waveforms, shape (``WAVEFORMS``, samples).
+    """
+
+    numbers: tuple[int, ...]
+    means: RawMeans | np.ndarray
+    fault: Fault | Mapping[str, np.ndarray] | None
+    w: np.ndarray
+
+
+class Inputs(NamedTuple):
+    """What the unit takes beside its generators in each of some steps.
+
+    Args:
+        u, theta: inputs and full theta of the gas generator, a column for each step.
+        N_ref: governed speed, rad/s, (steps,).
+    """
+
+    u: np.ndarray
+    theta: np.ndarray
+    N_ref: np.ndarray
+
+
+def kinds(apu: Apu, start: Holding, events: Sequence[Event] = ()) -> list[tuple[int, ...]]:
+    """Return the generators that stay equal through a run, by their numbers."""
+    course, t = [start], -1.0
+    for e in events:
+        if not isinstance(e, HealthChange):
+            now = course[-1].after([e])
+            course[len(course) - (e.t - t <= SAME_INSTANT) :] = [now]  # what is left of an instant
+            t = e.t
+    fates = zip(*((*now.loads, *now.faults) for now in course), strict=True)
+    n, of_each = len(apu.machines), [list(f) for f in fates]
+    return [*groups([(m, of_each[k], of_each[n + k]) for k, m in enumerate(apu.machines)])]
+
+
+class Machines:
+    """The generators from their steady start on.
+
+    Args:
+        apu, point: the unit, and where it starts.
+        start: what holds then.
+        settings: how they are integrated.
+        phasors: whether phasors are wanted too.
+        end: of the run, s.
+    """
+
+    groups: list[MachineStep]
+
+    def __init__(
+        self,
+        apu: Apu,
+        point: JointPoint,
+        start: Holding,
+        settings: Settings,
+        phasors: bool,
+        *,
+        end: float = 0.0,
+    ) -> None:
+        self.apu, self.settings, self._end = apu, settings, end
+        self.means = StepMeans(apu.generator, phasors)
+        self.groups = [
+            MachineStep(
+                apu,
+                numbers,
+                point.of(numbers[0]),
+                start.loads[numbers[0] - 1].balanced_part,
+                settings,
+                self.means,
+            )
+            for numbers in kinds(apu, start)
+        ]
+        self._forget()
+
+    def _forget(self) -> None:
+        self._block: JointBlock | None = None
+        self._no_block = ""
+        self._wide: tuple[tuple[Any, ...], JointBlock] | None = None
+
+    def samples(self, grid: np.ndarray) -> int:
+        """Waveform samples of a whole run, the start included; 0 where none are stored."""
+        if self.settings.waveform_dt is None:
+            return 0
+        return 1 + sum(self.settings.n_out(float(h)) for h in np.diff(grid))
+
+    def at_rest(self, point: JointPoint) -> list[Of]:
+        """What a step would give in the steady state."""
+        found = []
+        for group in self.groups:
+            at = point.of(group.numbers[0])
+            w = np.array([[at.y[n]] for n in WAVEFORMS])
+            found.append(Of(group.numbers, self.means.at_rest(at), None, w))
+        return found
+
+    def switch(self, now: Holding, here: Holding, t: float, *, switched: bool = True) -> bool:
+        """Change loads and faults at the instant t, s, where they differ.
+
+        Args:
+            now, here: what holds, and its numbers.
+            switched: whether this is a switch, or goes on smoothly.
+
+        Returns:
+            Whether any generator was switched, or is no longer one of its group.
+        """
+        changed, after = False, list[MachineStep]()
+        for group in self.groups:
+            members = group.numbers
+            (_, fate), *others = groups(
+                [(now.loads[k - 1], now.faults[k - 1]) for k in members]
+            ).items()
+            parts = [(group.part(tuple(members[i - 1] for i in at)), own) for at, own in others]
+            for step, own in [(group, fate), *parts]:
+                k = step.numbers[0] - 1
+                step.follow(*own, self._end)
+                changed |= step.switch(here.loads[k], here.faults[k], t, smooth=not switched)
+                after.append(step)
+            changed |= bool(parts)
+        self.groups = sorted(after, key=lambda g: g.numbers)
+        if changed:
+            self._forget()
+        return changed
+
+    def disturb(self, draw: Callable[[int], np.ndarray], w1: float, w2: float) -> None:
+        """Draw the process noise of (5) and (6), V, for the next step; each group has its own."""
+        for group in self.groups:
+            group.disturb(w1 * draw(3), w2 * draw(3))
+
+    def step(self, N: float, slope: float, h: float, t0: float) -> tuple[float, list[MachineMade]]:
+        """Advance over [t0, t0 + h]; see :meth:`MachineStep.step`.
+
+        Returns:
+            Mean shaft power (1), W, and what each group made.
+        """
+        PW, made = 0.0, []
+        for group in self.groups:
+            one = group.step(N, slope, h, t0)
+            if len(self.groups) > 1:  # another group may use the same buffers
+                one = one._replace(t=one.t.copy(), w=one.w.copy())
+            PW += group.link.PW(float(one.means.values[0, 0]))
+            made.append(one)
+        return PW, made
+
+    def accept(self, made: Sequence[MachineMade], h: float) -> None:
+        """Go on from the end of a step of length h."""
+        for group, one in zip(self.groups, made, strict=True):
+            group.accept(one, h)
+
+    def block(
+        self,
+        x: np.ndarray,
+        z: np.ndarray,
+        governor: tuple[float, ...],
+        u: np.ndarray,
+        theta: np.ndarray,
+        grid: np.ndarray,
+    ) -> tuple[BlockResult, list[MachineMade]]:
+        """Advance the whole unit over the exchange steps of a block at once.
+
+        Raises:
+            NotApplicable: that is not possible here.
+        """
+        if self._no_block:
+            raise NotApplicable(self._no_block)
+        self._check_block(grid)
+        if self._block is None:
+            try:
+                fast = [g.for_blocks() for g in self.groups]
+                self._block = JointBlock(self.apu, fast, [g.link for g in self.groups])
+            except NotApplicable as error:
+                self._no_block = str(error)
+                raise
+        states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
+        done = self._block(x, z, governor, u, theta, states, inputs)
+        N = float(x[0])
+        pairs = zip(self.groups, done.machines, strict=True)
+        return done, [g.went_on(one, N, grid) for g, one in pairs]
+
+    def _check_block(self, grid: np.ndarray) -> None:
+        if not all(g.settled for g in self.groups):
+            raise NotApplicable("the windings have not settled")
+        if np.abs(np.diff(grid) - self.settings.dt).max() > SAME_INSTANT:
+            raise NotApplicable("the steps of a block are whole exchange steps")
+
+    def follow(
+        self,
+        x: np.ndarray,
+        z: np.ndarray,
+        governor: tuple[float, ...],
+        unit: Inputs,
+        grid: np.ndarray,
+        before: float,
+    ) -> tuple[BlockResult, list[MachineMade]]:
+        """Advance the whole unit over a block whose inputs have a column for each step.
+
+        Args:
+            before: the middle of the step before the block, s.
+
+        Raises:
+            NotApplicable: that is not possible here.
+        """
+        self._check_block(grid)
+        middles = (grid[1:] + grid[:-1]) / 2
+        given = [g.columns(middles, before) for g in self.groups]
+        fast, links = [one for one, _ in given], [g.link for g in self.groups]
+        layouts = tuple(one.layout for one in fast)
+        if self._wide is None or self._wide[0] != layouts:
+            self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
+        held: list[Any] = [unit.u, unit.theta]
+        for link, (one, own) in zip(links, given, strict=True):
+            numbers = np.repeat(link.numbers[:, None], middles.size, axis=1)
+            numbers[0] = unit.N_ref
+            held += [own.u, own.theta, numbers, own.vector, one.dt]
+        done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held)
+        N, pairs = float(x[0]), zip(self.groups, done.machines, given, strict=True)
+        return done, [g.went_on(one, N, grid, own.severity) for g, one, (_, own) in pairs]
+
+    def rows(self, made: Sequence[MachineMade]) -> list[Of]:
+        """What is to be recorded of what the groups made."""
+        pairs = zip(self.groups, made, strict=True)
+        return [Of(g.numbers, m.means, m.severity or g.phase.fault, m.w) for g, m in pairs]
+
+    @property
+    def V_ref(self) -> float | list[float]:
+        """Voltage reference, per unit; of each generator where they differ."""
+        each = {k: g.V_ref for g in self.groups for k in g.numbers}
+        alike = len(set(each.values())) == 1
+        return each[1] if alike else [each[k] for k in sorted(each)]
+
+    @property
+    def nsteps(self) -> int:
+        """Steps of the solvers so far."""
+        return sum(g.nsteps for g in self.groups)
+
+    @property
+    def propagated(self) -> int:
+        """Exchange steps of generators that were propagated exactly, each group counted."""
+        return sum(g.propagated for g in self.groups)
+
+    @property
+    def spikes(self) -> list[str]:
+        """What must be known of the switches so far."""
+        return [words for g in self.groups for words in g.spikes]
+
+
+def means_of(apu: Apu, numbers: tuple[int, ...], phasors: bool) -> StepMeans:
+    """Return what settles the means of equal generators."""
+    n, gen = len(apu.machines), apu.machines[numbers[0] - 1].generator
+    words = {1: "the generator", 2: "the two generators"}.get(n, f"the {n} generators")
+    of = words if len(numbers) == n else who(numbers)
+    return StepMeans(gen, phasors, of, len(numbers) / 2)

@@ -1,0 +1,149 @@
+"""Loads and faults that change in time, propagated with interpolated tables, against CVODES."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from apu_casadi.core import simulation
+from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.means import Term, wanted
+from apu_casadi.core.profiles.points import Points
+from apu_casadi.core.profiles.profile import at, varying
+from apu_casadi.core.profiles.shapes import Growth, Ramp
+from apu_casadi.machine.course import Course
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.generator import Generator
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.machine.propagation import Propagator
+from apu_casadi.unit.integrators import WAVEFORMS
+from apu_casadi.unit.stepmeans import MEANS
+
+GEN = Generator()
+W = GEN.machine.w_rated
+DT = 0.02
+QUAD = (*MEANS, *wanted(phasors=True, short=True, symmetric=False))
+KW100 = SeriesLoad.from_power(100e3)
+RAMP = varying(SeriesLoad.from_power, Ramp(100e3, 200e3, over=60.0), 0.9)
+GROWN = varying(Ttsc.of_h, 0.05, Growth(1e-5, 0.01, over=10.0))
+
+
+def course_of(load, fault, *, end=60.0, waves=False):
+    """The course of a load and a fault, beside the variant of its beginning."""
+    ss = GEN.variant(at(load, 1.0), at(fault, 1.0))
+
+    def prepare(u, theta, harmonics):
+        if waves:
+            more = {"n_out": 400, "outputs": WAVEFORMS, "quad": MEANS}
+            return Propagator(GEN, ss, u, theta, dt=DT, harmonics=harmonics, **more)
+        return MeanStep(GEN, ss, u, theta, dt=DT, quad=QUAD, harmonics=harmonics)
+
+    return Course(GEN, ss, load, fault, prepare, end)
+
+
+def settled_at(ss, load, fault, V_ref):
+    """State some time after the switch to load and fault from a steady start."""
+    point = GEN.steady_state(KW100, theta_e=0.3)
+    u, theta = GEN.inputs(load, V_ref=V_ref), GEN.fault_vector(load, fault)
+    x = GEN.transfer(point.x, point.ss, ss, u=point.u, theta=[], u_target=u, theta_target=theta)
+    return simulation.stepper(ss, 1, rtol=1e-10, atol=1e-12)(x, u, theta, 0.3).x_end.copy()
+
+
+def followed(load, fault, begin, steps=6, waves=False):
+    """Steps by interpolated tables, and by CVODES with the very numbers; largest errors of both."""
+    course = course_of(load, fault, waves=waves)
+    ss, V_ref = course.ss, GEN.V_ref_default
+    t = begin + DT * (np.arange(steps) + 0.5)
+    quad = MEANS if waves else QUAD
+    exact = simulation.stepper(ss, 400 if waves else 1, quad=quad, rtol=1e-11, atol=1e-13)
+    x = ours = settled_at(ss, at(load, t[0]), at(fault, t[0]), V_ref)
+    off, seen = {}, 0.0
+    for k in range(steps):
+        fast, now = course.numbers(t[k : k + 1], t[k - 1] if k else None)
+        fast.put(now.vector[:, 0], now.theta[:, 0])
+        here, there = at(load, t[k]), at(fault, t[k])
+        u, theta = GEN.inputs(here, V_ref=V_ref, w_r=W), GEN.fault_vector(here, there)
+        given = now.u[:, 0].copy()
+        changed = ss.u.indices(["w_r", "V_ref"])
+        given[changed] = u[changed]
+        assert_allclose(given, u, rtol=1e-8)
+        ours, *waves_, means = fast(ours, given)
+        ours = ours.copy()
+        theirs = exact(x, u, theta, DT)
+        x = theirs.x_end.copy()
+        for name, mean in zip(quad, means.ravel(), strict=True):
+            scale = max(abs(theirs.mean[name]), Term.of(name).nominal(ss) / 100, 1.0)
+            off[name] = max(off.get(name, 0.0), abs(mean - theirs.mean[name]) / scale)
+        if waves:
+            y = theirs.y[ss.y.indices(WAVEFORMS)]
+            peak = np.abs(y).max(axis=1) + 1e-12
+            seen = max(seen, float((np.abs(waves_[0] - y).max(axis=1) / peak).max()))
+    windings = [i for i, n in enumerate(ss.x.names) if n.startswith("lam")]
+    states = np.abs((ours - x) / ss.x.nominals)[windings].max()
+    return off, states, seen
+
+
+@pytest.mark.parametrize(
+    ("load", "fault", "begin"),
+    [(RAMP, None, 3.0), (KW100, GROWN, 6.0)],
+    ids=["load ramp", "growing fault"],
+)
+def test_means_follow(load, fault, begin):
+    """Powers and squares to 1e-6 of themselves, what ripples to that of a constant case, 1e-5."""
+    off, states, _ = followed(load, fault, begin)
+    assert max(off[n] for n in ("P_total", "P_e", "~v_a^2", "~i_a^2")) < 1e-6
+    assert max(off.values()) < 1e-5 and states < 2e-5
+
+
+def test_waveforms_follow():
+    """Samples to 1e-6 of their peaks, load and fault on their way at once."""
+    load = varying(SeriesLoad.from_power, Ramp(100e3, 200e3, over=60.0))
+    _, states, seen = followed(load, GROWN, 8.0, steps=3, waves=True)
+    assert seen < 1e-6 and states < 2e-6
+
+
+def test_a_profile_of_many_points_needs_few_tables(monkeypatch):
+    """A rough course of one profile is told by its value: as many tables as for a ramp."""
+    rough = np.random.default_rng(0).uniform(100e3, 200e3, 500)
+    load = varying(SeriesLoad.from_power, Points(tuple(np.arange(500.0)), tuple(rough)))
+    course, made = course_of(load, None, end=500.0), []
+    prepare = course._prepare
+    monkeypatch.setattr(course, "_prepare", lambda *a: made.append(a) or prepare(*a))
+    t = np.linspace(0.5, 498.5, 200)
+    for s in t:
+        _, now = course.numbers(np.array([s]))
+        R = load.at(float(s)).R[0]
+        assert now.u[course.ss.u.index("R_a"), 0] == pytest.approx(R, rel=2e-8)
+    assert len(made) < 60
+
+
+def test_what_changes_too_fast_or_in_structure_is_left_to_others():
+    """A jump, an end that is another model, a profile of no load."""
+    fast = varying(SeriesLoad.from_power, Ramp(100e3, 200e3, over=0.1), 0.9)
+    course = course_of(fast, None, end=2.0)
+    course.numbers(np.array([0.05]))
+    with pytest.raises(NotApplicable, match=r"change by .* of the transition matrices in a step"):
+        course.numbers(np.array([0.05, 0.07]))
+    with pytest.raises(NotApplicable, match="in a step"):
+        course.numbers(np.array([0.05]), 0.03)
+    assert course.numbers(np.array([1.0]), 0.98)[1].u.shape[1] == 1  # constant at the end
+    going = varying(Ttsc, Ramp(0.05, 0.0, over=10.0), 20.0)
+    gone = course_of(KW100, going, end=20.0)
+    with pytest.raises(NotApplicable, match="turns into generator_resistive_healthy"):
+        gone.numbers(np.array([15.0]))
+    assert gone.numbers(np.array([5.0]))[1].severity[0] == pytest.approx(0.025, rel=1e-8)
+
+
+def test_numbers_of_many_steps_are_those_of_each():
+    """Columns, also across the pieces of a bent course."""
+    bent = varying(SeriesLoad.from_power, Ramp(100e3, 101e3, over=5.0, after=1.0))
+    course = course_of(bent, None, end=60.0)
+    t = 0.9 + DT * (np.arange(10) + 0.5)
+    _, many = course.numbers(t)
+    for k in range(10):
+        one = course.numbers(t[k : k + 1])[1]
+        for a, b in zip(one, many, strict=True):
+            assert_allclose(a[:, 0], b[:, k], rtol=1e-13)
+    assert math.isclose(many.u[2, 0], KW100.R[0], rel_tol=1e-9)
