@@ -248,6 +248,7 @@ def test_figures_that_were_not_put_in_are_predicted(tpe):
     assert {a.name.split(".")[0] for a in tpe.assumed} >= {"machine", "exciter", "limits"}
 
 
+@pytest.mark.compiled
 def test_the_second_unit_compiles_nothing(tpe, monkeypatch):
     """Trim, deck and a joint run with load step and both faults, on what the default unit made."""
 
