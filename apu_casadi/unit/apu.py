@@ -28,15 +28,13 @@ from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator, GeneratorPoint
 from apu_casadi.unit.control import GOVERNORS, Governor, GovernorParameters, word_of
-from apu_casadi.unit.events import Ambient
+from apu_casadi.unit.events import MOST, Ambient
 from apu_casadi.unit.exchange import Link
 
 if TYPE_CHECKING:
     from apu_casadi.machine.loads.load import Load
 
 RESIDUAL_JOINT = 1e-9
-MOST = 4
-"""Generators that a unit may have; it has at least one."""
 T = TypeVar("T")
 _NUMBERED = re.compile(r"generator(\d+)\.(.+)")
 

@@ -25,6 +25,9 @@ HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
 )
 """The health factors of the gas path, one when healthy, with their meaning."""
 
+MOST = 4
+"""Generators that a unit may have; it has at least one."""
+
 HEALTH_LO, HEALTH_HI = health.RUN_RANGE
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
 
