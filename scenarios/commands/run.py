@@ -117,6 +117,7 @@ def made_with(report: dict[str, Any]) -> list[str]:
     lines = []
     if report["ambient"]:
         lines.append(f"ambient: {day_words(report['ambient'])}")
+    lines += [f"profile of {words}" for words in report.get("profiles", ())]
     if solver:
         lines.append(
             f"solver {solver['solver']}, rtol {solver['rtol']:g}, atol {solver['atol']:g}; seed "
