@@ -54,8 +54,9 @@ from apu_casadi.gaspath.engines import (
 from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS, Limits
 from apu_casadi.gaspath.unitnumbers import MAPS
 from apu_casadi.machine.generator import NEUTRALS, Generator
-from apu_casadi.unit.apu import MOST, Apu, OnShaft
+from apu_casadi.unit.apu import Apu, OnShaft
 from apu_casadi.unit.control import GOVERNORS, Governor, word_of
+from apu_casadi.unit.events import MOST
 from apu_casadi.unit.shippedunits import unit_path
 
 _INNER = ("machine", "exciter", "coupling")

@@ -283,7 +283,7 @@ def _data(
             ambient[name] = said[name]
         if name in ambient:
             _in_range(table.source, name, ambient[name])
-    check_temperatures(table.source, readings, ambient, gg)
+    check_temperatures(table.source, readings, ambient, gg, table.reading.ranges)
     rows = np.arange(table.size, dtype=float) if t is None else t - t[0]
     # rows in which nothing was read are no points
     there = np.any([np.isfinite(readings[n]) for n in measured], axis=0)
