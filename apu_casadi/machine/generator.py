@@ -99,7 +99,7 @@ class Generator(Parametric):
         return _variant(self, self._structure(beside, found))
 
     def _structure(self, load: Load, fault: FaultStructure | None = None) -> Structure:
-        how = (self.neutral, self.exciter.absent, self.excitation)
+        how = (self.neutral, self.exciter.absent, self.excitation, type(self.machine))
         return Structure(LoadStructure.of(load), fault, *how)
 
     def fault_kind(self, load: Load, fault: Fault | None) -> str | None:

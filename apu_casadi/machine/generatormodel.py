@@ -24,7 +24,11 @@ from apu_casadi.machine import wrsg
 from apu_casadi.machine.faults.fault import AtFault, Branch, FaultStructure
 from apu_casadi.machine.faults.fault import Own as OwnOfFault
 from apu_casadi.machine.loads.load import AtLoad, LoadStructure, by_phase
-from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
+from apu_casadi.machine.machinedata import (
+    ExciterParameters,
+    MachineParameters,
+    SaturatedMachine,
+)
 from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc, speed_voltage
 from apu_casadi.machine.wrsg import Windings
 
@@ -77,7 +81,8 @@ class GeneratorModel(StateSpace):
     Args:
         load, fault: structures that it is built of.
         linear: names of the states that are linear at constant speed with the exciter held; empty
-            where the load is not.
+            where the load or the machine is not.
+        nonlinear: which of them is not, in words; "" where both are.
         reversing: those of them that change their sign when the rotor has turned by half a turn.
         exciter: Function (x, V_t, V_ref, theta) -> rates of the exciter's states, in the order of
             ``x``, from a terminal voltage in V rms.
@@ -88,6 +93,7 @@ class GeneratorModel(StateSpace):
     load: LoadStructure | None = None
     fault: FaultStructure | None = None
     linear: tuple[str, ...] = ()
+    nonlinear: str = ""
     reversing: tuple[str, ...] = ()
     exciter: ca.Function = field(default=None, repr=False)
     reduced: tuple[GeneratorModel, ca.Function] | None = field(default=None, repr=False)
@@ -122,6 +128,7 @@ class Structure(Parametric):
     Args:
         load, fault, neutral, excitation: as of the generator.
         absent: parameters of the exciter that do not count (:attr:`ExciterParameters.absent`).
+        machine: what the machine's parameters are of, linear or saturating.
     """
 
     load: LoadStructure
@@ -129,13 +136,20 @@ class Structure(Parametric):
     neutral: str
     absent: tuple[str, ...] = ()
     excitation: str = "regulated"
+    machine: type[MachineParameters] = MachineParameters
 
     @property
     def name(self) -> str:
         """Name of the model."""
         parts = ["generator", self.load.kind, self.fault.kind if self.fault else "healthy"]
         parts += [] if self.grounded else ["isolated"]
-        return "_".join(parts + ([] if self.excitation == "regulated" else ["constant_field"]))
+        parts += [] if self.excitation == "regulated" else ["constant_field"]
+        return "_".join(parts + (["saturated"] if self.saturated else []))
+
+    @property
+    def saturated(self) -> bool:
+        """Whether the machine is not linear."""
+        return issubclass(self.machine, SaturatedMachine)
 
     @property
     def grounded(self) -> bool:
@@ -169,7 +183,7 @@ class Structure(Parametric):
         """Return the parameters of machine and exciter that count."""
         names = [f.name for f in fields(ExciterParameters) if f.name not in self.absent]
         return (
-            MachineParameters().signals("machine"),
+            self.machine().signals("machine"),
             ExciterParameters().signals("exciter", names),
         )
 
@@ -186,11 +200,17 @@ class Structure(Parametric):
     @property
     def linear(self) -> tuple[str, ...]:
         """States of the windings, the fault and the load, where all of them are linear."""
-        if not self.load.load.linear:
+        if not self.load.load.linear or self.saturated:
             return ()
         fluxes = [s.name for s in FLUXES if self.grounded or s.name != "lam_s0"]
         fault = [s.name for s in self.own_of_fault.states]
         return (*fluxes, *fault, *(s.name for s in self.load.load.own.states))
+
+    @property
+    def nonlinear(self) -> str:
+        """What is not linear, in words."""
+        parts = [] if self.load.load.linear else ["its load is not linear"]
+        return "; ".join(parts + (["its machine saturates"] if self.saturated else []))
 
     @property
     def reversing(self) -> tuple[str, ...]:
@@ -210,7 +230,7 @@ def family(structure: Structure) -> GeneratorModel:
     of_machine, of_exciter = structure.parameters()
     (xv, x), (zv, z), (uv, u), (tv, th) = X.sx(), Z.sx(), U.sx(), TH.sx()
     pv, ev = ca.SX.sym("machine", len(of_machine)), ca.SX.sym("exciter", len(of_exciter))
-    p = MachineParameters().symbolic(**_by_field(of_machine, pv))
+    p = structure.machine().symbolic(**_by_field(of_machine, pv))
     e = structure.exciter.symbolic(**_by_field(of_exciter, ev))
     V_t, V_ref = ca.SX.sym("V_t"), ca.SX.sym("V_ref")
     ode, alg, y = equations(structure, p, e, x, z, u, th)
@@ -265,6 +285,7 @@ def _told(made: GeneratorModel, structure: Structure, exciter: ca.Function) -> G
         load=structure.load,
         fault=structure.fault,
         linear=linear,
+        nonlinear=structure.nonlinear,
         reversing=reversing,
         exciter=exciter,
     )
@@ -330,7 +351,7 @@ def equations(
 
     # load
     rates = dlam if grounded else dlam._replace(s0=p.L_ls * branch.zero_rate)
-    dibar, turn = wrsg.currents(p, rates).stator, speed_voltage(w_r, ibar.stator)
+    dibar, turn = wrsg.current_rates(p, lam, rates).stator, speed_voltage(w_r, ibar.stator)
     dbar = qd0_to_abc(theta_e, Qd0(*map(sum, zip(dibar, turn, strict=True))))
     di = Abc(*map(sum, zip(dbar, branch.rate, strict=True)))
     v_load = Abc(*(vk - v_n for vk in v))

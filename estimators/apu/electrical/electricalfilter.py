@@ -12,7 +12,7 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, last
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.machinedata import MachineParameters, require_linear
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
@@ -372,6 +372,7 @@ def electrical_filter(
         SignalError: unknown parameter in ``free``.
     """
     machine = MachineParameters() if machine is None else machine
+    require_linear(machine, "the electrical filter")
     if gains not in GAINS:
         raise ParameterError(f"gains {gains!r} {nearest(str(gains), GAINS)}")
     wrong = [k for k in (*phases, *([] if phase is None else [phase])) if k not in PHASES]
