@@ -28,15 +28,13 @@ from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator, GeneratorPoint
 from apu_casadi.unit.control import GOVERNORS, Governor, GovernorParameters, word_of
-from apu_casadi.unit.events import Ambient
+from apu_casadi.unit.events import MOST, Ambient
 from apu_casadi.unit.exchange import Link
 
 if TYPE_CHECKING:
     from apu_casadi.machine.loads.load import Load
 
 RESIDUAL_JOINT = 1e-9
-MOST = 4
-"""Generators that a unit may have; it has at least one."""
 T = TypeVar("T")
 _NUMBERED = re.compile(r"generator(\d+)\.(.+)")
 
@@ -342,28 +340,31 @@ class Apu(Parametric):
         health: Mapping[str, float] | None = None,
         V_ref: float | None = None,
         limits: Limits | None = None,
+        N_ref: float | None = None,
     ) -> JointPoint:
         """Solve the steady unit at governed speed: healthy generators under balanced loads.
 
         ``load`` is that of each generator, or a list with one for each.  ``ambient`` is the default
-        day if not given.  ``limits`` are those of the trim; by default without one of temperature,
-        which is no reason not to simulate.
+        day if not given, ``N_ref`` another governed speed than the unit's, rad/s.  ``limits`` are
+        those of the trim; by default without one of temperature, which is no reason not to
+        simulate.
 
         Raises:
             OperatingPointError: no such point, or it needs fuel beyond the governor's limits.
         """
         amb = dataclasses.asdict(Ambient() if ambient is None else ambient)
+        N_ref = self.N_ref if N_ref is None else N_ref
         alike = groups(zip(self.machines, self.each("load", load), strict=True))
         points: dict[int, GeneratorPoint] = {}
         PW = 0.0
         for numbers, ((gen, _), own) in alike.items():
             link = self.link_of(numbers)
-            point = gen.steady_state(own, w_r=link.w_r(self.N_ref), V_ref=V_ref)
+            point = gen.steady_state(own, w_r=link.w_r(N_ref), V_ref=V_ref)
             PW += link.PW(point.y["P_total"])
             points |= dict.fromkeys(numbers, point)
         limits = Limits(T4_max=math.inf) if limits is None else limits
         gas = trim_gas_generator(
-            self.gas_generator, {"N": self.N_ref, "PW": PW}, theta=health, limits=limits, **amb
+            self.gas_generator, {"N": N_ref, "PW": PW}, theta=health, limits=limits, **amb
         )
         Wf, g = gas["Wf"], self.governor
         if not g.Wf_min <= Wf <= g.Wf_max:
