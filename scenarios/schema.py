@@ -56,6 +56,7 @@ from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import (
+    STARTS,
     Ambient,
     Event,
     FaultChange,
@@ -251,6 +252,8 @@ class Scenario(_Plain):
         waveform_dt: sampling step of the waveforms; None for no waveforms (0 in a file).
         exchange: how speed and fuel pass between the two parts: ``paper``, ``predicted`` or
             ``corrected``, see :func:`apu_casadi.unit.multirate.simulate_joint`.
+        start_from: ``balanced``, where a fault or an unbalanced load of the start acts from t = 0
+            on a healthy unit, or ``settled``, where it has been there for long.
         noise: process and measurement noise; None for none.
         seed: seed of the noise.
         parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
@@ -274,6 +277,7 @@ class Scenario(_Plain):
     dt: float = field(default=0.02, metadata=limits(lo=1e-4, hi=0.2, unit="s"))
     waveform_dt: float | None = field(default=50e-6, metadata=limits(lo=1e-6, unit="s"))
     exchange: str = "paper"
+    start_from: str = "balanced"
     noise: Noise | None = field(default=None, hash=False)
     seed: int | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -301,6 +305,8 @@ class Scenario(_Plain):
         text_of(self.exchange, "exchange")
         hint = f"unknown {self.exchange!r} {nearest(self.exchange, EXCHANGES)}"
         require(self.exchange in EXCHANGES, "exchange", hint)
+        hint = f"unknown {self.start_from!r} {nearest(str(self.start_from), STARTS)}"
+        require(self.start_from in STARTS, "start_from", hint)
         if self.seed is not None:
             whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
             require(whole and self.seed >= 0, "seed", f"a whole number >= 0, got {self.seed!r}")
@@ -447,6 +453,8 @@ class Scenario(_Plain):
         table |= {"phase": [p.to_dict() for p in self.phases]}
         if self.exchange != "paper":
             table["exchange"] = self.exchange
+        if self.start_from != "balanced":
+            table["start_from"] = self.start_from
         noise = {} if self.noise is None else dataclasses.asdict(self.noise)
         more = {
             "event": [c.to_dict() for c in self.changes],
@@ -493,6 +501,7 @@ class Scenario(_Plain):
         health = dict(first.health) if isinstance(first.health, Mapping) else None
         N_ref = None if first.N_ref_rpm is None else _rad_s(first.N_ref_rpm)
         start = {"load": first.load, "health": health, "fault": _there(first.fault)}
+        start |= {} if self.start_from == "balanced" else {"start_from": self.start_from}
         return start if N_ref is None else {**start, "N_ref": N_ref}
 
     def events(self) -> tuple[Event, ...]:

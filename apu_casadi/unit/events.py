@@ -25,6 +25,10 @@ HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
 )
 """The health factors of the gas path, one when healthy, with their meaning."""
 
+STARTS = ("balanced", "settled")
+"""What a run may start from: the healthy unit with balanced loads, or what is there from the start.
+"""
+
 HEALTH_LO, HEALTH_HI = health.RUN_RANGE
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
 

@@ -41,6 +41,7 @@ class Asked:
         ambient, health: from the start; all health factors by name.
         grid: exchange instants, s.
         phasors, noise, seed, hook: as there.
+        settled: whether loads and faults have been there for long.
     """
 
     loads: tuple[Load, ...]
@@ -52,6 +53,7 @@ class Asked:
     noise: Noise
     seed: int | None
     hook: Callable[[int, np.ndarray], np.ndarray] | None
+    settled: bool = False
 
 
 class JointRun:
@@ -79,10 +81,13 @@ class JointRun:
         self, apu: Apu, asked: Asked, settings: Settings, rng: np.random.Generator
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
-        start = [load.balanced_part for load in asked.loads]
         self.now = Holding(asked.loads, asked.faults, asked.health)
-        self.point = apu.steady_state(start, ambient=asked.ambient, health=self.now.factors)
-        self.machines = Machines(apu, self.point, self.now, settings, asked.phasors)
+        there: tuple[Any, ...] = ([load.balanced_part for load in asked.loads], None)
+        if asked.settled:
+            there = asked.loads, asked.faults
+        self.point = apu.steady_state(*there, ambient=asked.ambient, health=self.now.factors)
+        how = {"phasors": asked.phasors, "settled": asked.settled}
+        self.machines = Machines(apu, self.point, self.now, settings, **how)
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)

@@ -64,26 +64,30 @@ class Machines:
         start: what holds then.
         settings: how they are integrated.
         phasors: whether phasors are wanted too.
+        settled: whether loads and faults have been there for long, and ``point`` is of them.
     """
 
     groups: list[MachineStep]
 
     def __init__(
-        self, apu: Apu, point: JointPoint, start: Holding, settings: Settings, phasors: bool
+        self,
+        apu: Apu,
+        point: JointPoint,
+        start: Holding,
+        settings: Settings,
+        *,
+        phasors: bool,
+        settled: bool = False,
     ) -> None:
         self.apu, self.settings = apu, settings
         self.means = StepMeans(apu.generator, phasors)
-        self.groups = [
-            MachineStep(
-                apu,
-                numbers,
-                point.of(numbers[0]),
-                start.loads[numbers[0] - 1].balanced_part,
-                settings,
-                self.means,
-            )
-            for numbers in kinds(apu, start)
-        ]
+        self.groups = []
+        for numbers in kinds(apu, start):
+            at = numbers[0] - 1
+            load, fault = start.loads[at], start.faults[at]
+            there = (load, fault) if settled else (load.balanced_part, None)
+            own = point.of(numbers[0])
+            self.groups.append(MachineStep(apu, numbers, own, *there, settings, self.means))
         self._forget()
 
     def _forget(self) -> None:
@@ -102,7 +106,7 @@ class Machines:
         for group in self.groups:
             at = point.of(group.numbers[0])
             w = np.array([[at.y[n]] for n in WAVEFORMS])
-            found.append(Of(group.numbers, self.means.at_rest(at), None, w))
+            found.append(Of(group.numbers, self.means.at_rest(at), group.phase.fault, w))
         return found
 
     def switch(self, now: Holding, t: float) -> bool:

@@ -42,7 +42,7 @@ from apu_casadi.core.means import RMS
 from apu_casadi.core.runloop import SAME_INSTANT, run
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import Ambient, Event, all_factors, in_order
+from apu_casadi.unit.events import STARTS, Ambient, Event, all_factors, in_order
 from apu_casadi.unit.exchange import EXCHANGES
 from apu_casadi.unit.integrators import SOLVERS, WAVEFORMS, Settings, ramped
 from apu_casadi.unit.jointrun import Asked, JointRun
@@ -54,14 +54,15 @@ from apu_casadi.unit.stepmeans import MEANS
 if TYPE_CHECKING:
     import xarray as xr
 
-    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
+    from apu_casadi.unit.apu import Faults
 
 __all__ = [
     "EXCHANGES",
     "MEANS",
     "RMS",
     "SOLVERS",
+    "STARTS",
     "WAVEFORMS",
     "Noise",
     "exchange_grid",
@@ -91,7 +92,7 @@ def simulate_joint(
     load: Load | Sequence[Load],
     ambient: Ambient | None = None,
     health: Mapping[str, float] | None = None,
-    fault: Fault | Sequence[Fault | None] | Mapping[int, Fault | None] | None = None,
+    fault: Faults = None,
     events: Sequence[Event] = (),
     dt: float = 0.02,
     exchange: str = "paper",
@@ -101,6 +102,7 @@ def simulate_joint(
     seed: int | None = None,
     hook: Callable[[int, np.ndarray], np.ndarray] | None = None,
     solver: str = "auto",
+    start_from: str = "balanced",
     rtol: float = 1e-8,
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
@@ -111,7 +113,8 @@ def simulate_joint(
     """Simulate gas generator, generators and governor together, from a steady start.
 
     Nothing moves before the first event.  A fault or an unbalanced load given for the start acts
-    from t = 0 on the steady healthy, balanced unit.
+    from t = 0 on the steady healthy, balanced unit; or, with ``start_from="settled"``, it has been
+    there for long, and the run starts in the periodic state of all generators.
 
     Args:
         apu, load, fault: the unit; load and fault from the start, of all generators, or a list with
@@ -124,6 +127,7 @@ def simulate_joint(
         phasors: store fundamental phasors of voltages and currents of each exchange step, too.
         noise, seed: uncertainty and the seed of its random numbers.
         hook: processes the rotor speed between state update and output (Algorithm 2).
+        start_from: one of ``STARTS``, as above.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
         progress: called with (done, total) seconds.
         attrs: more attributes for the dataset.
@@ -149,7 +153,7 @@ def simulate_joint(
     events = in_order(events, duration, generators=len(apu.machines))
     asked = Asked(
         loads=apu.each("load", load),
-        faults=apu.each("fault", _by_number(apu, fault)),
+        faults=apu.each_fault(fault),
         ambient=Ambient() if ambient is None else ambient,
         health=all_factors(health),
         grid=exchange_grid(duration, settings.dt, events),
@@ -157,6 +161,7 @@ def simulate_joint(
         noise=noise,
         seed=seed,
         hook=hook,
+        settled=_settled(start_from),
     )
     rng = np.random.default_rng(seed)
     system = JointRun(apu, asked, settings, rng)
@@ -169,15 +174,10 @@ def simulate_joint(
     return _concluded(system, record, rng, exchange, events, warn_exchange, attrs or {})
 
 
-def _by_number(apu: Apu, fault: Any) -> Any:
-    """Return a mapping of faults by number as a list."""
-    if not isinstance(fault, Mapping):
-        return fault
-    n = len(apu.machines)
-    for k in fault:
-        if k not in range(1, n + 1):
-            raise ScenarioError(f"fault: generator {k!r}, but the unit has 1 to {n}")
-    return [fault.get(k) for k in range(1, n + 1)]
+def _settled(start_from: str) -> bool:
+    if start_from not in STARTS:
+        raise ScenarioError(f"start_from {start_from!r} {nearest(str(start_from), STARTS)}")
+    return start_from == "settled"
 
 
 def _settings(
