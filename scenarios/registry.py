@@ -174,11 +174,8 @@ def assumed(s: Scenario) -> list[dict[str, Any]]:
 
 
 def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:
-    from apu_casadi.unit.events import Ambient
     from apu_casadi.unit.multirate import simulate_joint
 
-    if not isinstance(s.ambient, Ambient):
-        raise ScenarioError("ambient: profiles are not followed by joint runs")
     return simulate_joint(
         unit_for(s),
         duration=s.duration,

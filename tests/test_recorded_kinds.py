@@ -7,7 +7,9 @@ import xarray as xr
 from numpy.testing import assert_allclose
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.recordings.recorded import Reading, parse_mapping, read_table
+from estimators.apu.recordings.thermal import check_temperatures
 from scenarios.cli import main
 
 K = 12
@@ -97,6 +99,34 @@ LAYOUTS = {
     "percent": (text(names=["N [%]", *NAMES[1:]]).replace("36050.500", "100.0013869625"),
                 "100 % is taken as the design speed, 36050 r/min"),
     "carriage returns": (text().replace("\n", "\r\n"), None),
+    "old line ends": (text().replace("\n", "\r"), None),
+    "mark of UTF-32": (text().encode("utf-32"), "read as UTF-32"),
+    "quoted line of excel": ('"sep=;"\n' + text(sep=";", comma=True), "decimal commas"),
+    "blanks, decimal commas": (
+        text(sep="  ", comma=True, names=[n.replace(" ", "") for n in NAMES]), "decimal commas"),
+    "blank thousands": (text(sep=";").replace("36050.500", "36 050.500"), "separate thousands"),
+    "apostrophes": (text().replace("36050.500", "36'050.500"), "separate thousands"),
+    "Fortran": (text().replace("36050.500", "3.60505D+04"), None),
+    "unit in cells": (text().replace("36050.500", "36050.500 rpm"), "unit stands in the cells"),
+    "keys above": ("Channels,6\nRate,50\n" + text(), "lines 1 to 2, above the column names"),
+    "keys above, filled": ("Channels,6,,,,\nRate,50,,,,\n" + text(), "lines 1 to 2, above"),
+    "percent comments": ("% bench 3\n" + text(), "lines 1 to 1, above the column names"),
+    "units above": ("rpm,kPa,degC,degC,kg/h,kW\n" + text(names=DATA), "line 1: taken as a row of"),
+    "words, then units": (
+        text(names=DATA).replace(
+            "PW\n", "PW\nspeed,pressure,a,b,fuel,power\nrpm,kPa,degC,degC,kg/h,kW\n"),
+        "line 3: taken as a row of units"),
+    "units, then channels": (
+        text(names=DATA).replace("PW\n", "PW\nrpm,kPa,degC,degC,kg/h,kW\nc0,c1,c2,c3,c4,c5\n"),
+        "left out above the data: line 3"),
+    "in": (text(names=[n.replace("[", "in ").replace("]", "") for n in NAMES]), "as N in rpm"),
+    "braces": (text(names=[n.replace("[", "{").replace("]", "}") for n in NAMES]), None),
+    "dashes": (text(names=[n.replace("[", "- ").replace("]", "") for n in NAMES]), "is taken as"),
+    "a word at the end": (text() + "\nEnd of data\n", "line 15 below the data left out"),
+    "empty rows": (text() + ",,,,,\n,,,,,\n", "an empty row is left out, of 2 in all"),
+    "two of a name": (text().replace("\n", ",1,2\n").replace("],1,2", "],a,a"), None),
+    "turns": (text(names=["N [U/min]", *NAMES[1:]]), None),
+    "thousand turns": (text(names=["N [krpm]", *NAMES[1:]]).replace("36050.500", "36.0505"), None),
 }  # fmt: skip
 
 
@@ -123,6 +153,18 @@ OPEN = {
     "two headers": (text() + text(), r"line 14, column N: 'N \[rpm\]' is no number"),
     "sum at the end": (text() + "Mean,800,285,400,150,400\n", "'Mean' is no number"),
     "gauge pressure": (text().replace("kPa", "psig"), "unknown unit 'psig'"),
+    "gauge in brackets": (text().replace("[kPa]", "(bar(g))"), r"bar\(g\).*--barometer PRESSURE"),
+    "frequency": (text().replace("rpm", "Hz"), "'Hz' measures 1/s"),
+    "commas as both": (text(comma=True), "are commas decimal commas as well as separators"),
+    "another unit in cells": (text().replace("36050.500", "36050.5 rad/s"), "correct one of them"),
+    "a word of the day": (cell(3, "T5", "off"), "'off' is no number"),
+    "beyond a bound": (cell(3, "T5", "> 800"), "'> 800' is no number"),
+    "half of the units": (
+        text(names=DATA).replace("PW\n", "PW\nrpm,kPa,Grad\n"),
+        "give them by --units|neither numbers nor units",
+    ),
+    "codes in the range": (cell(3, "P3", "999"), "999 kPa.* stands apart .*--missing 999"),
+    "a zero in the range": (cell(3, "PW", "0"), "0 kW.* stands apart .*--missing 0 .*--range PW"),
     "long cell": (text().rstrip() + "x" * 200_000, r"x.csv, line 13: no CSV file|is no number"),
 }
 
@@ -206,6 +248,19 @@ TIMES = {
     "iso, offsets": ([f"2024-01-01T{i % 2:02d}:00:{i:02d}+0{i % 2}:00" for i in k], 1.0, True),
     "year first": ([f"2024/03/31 01:00:{i:02d}" for i in k], 1.0, True),
     "clock": ([f"00:01:{i:02d}" for i in k], 1.0, True),
+    "clock over midnight": (
+        [f"23:59:{54 + i}" for i in k[:6]] + [f"00:00:0{i}" for i in k[:6]],
+        1.0,
+        True,
+    ),
+    "halves of the day": (
+        [f"11:59:{54 + i} AM" for i in k[:6]] + [f"12:00:0{i} PM" for i in k[:6]],
+        1.0,
+        True,
+    ),
+    "month in letters": ([f"31-Mar-2024 01:00:{i:02d}.250" for i in k], 1.0, True),
+    "day of the year": ([f"2024-091T01:00:{i:02d}" for i in k], 1.0, True),
+    "of mails": ([f'"Sun, 31 Mar 2024 01:00:{i:02d} +0000"' for i in k], 1.0, True),
     "clock, comma": ([f'"00:01:{i:02d},5"' for i in k], 1.0, True),
 }
 
@@ -236,6 +291,15 @@ NO_TIMES = {
     "falling": ([0, 1, 3, 2, *range(4, K)], "data row 4 has 2 s after 3 s"),
     "a gap": ([0, "", *range(2, K)], "gap in data row 2"),
     "words": (["noon"] * K, "'noon' is no time"),
+    "spreadsheet, minutes": ([f"{45382 + i / 1440:.8f}" for i in k], "days of a spreadsheet"),
+    "spreadsheet, hours": ([f"{45382 + i / 24:.8f}" for i in k], "days of a spreadsheet"),
+    "MATLAB": ([f"{739342 + i / 86400:.8f}" for i in k], "may be days of MATLAB or seconds"),
+    "Julian": ([f"{2460400.5 + i / 86400:.8f}" for i in k], "days of the Julian calendar"),
+    "abbreviated zone": ([f"2024-01-01 00:00:{i:02d} CET" for i in k], "--time-zone Europe/Berlin"),
+    "month first": ([f"3/31/2024 1:00:{i:02d} PM" for i in k],
+                    "give --time-format '%m/%d/%Y %I:%M:%S %p'"),
+    "half marked": ([f"11:00:{i:02d}{' AM' * (i % 2)}" for i in k], "some times have AM or PM"),
+    "coarse": ([i // 4 for i in k], "give --rate HZ if the stamps are too coarse"),
 }  # fmt: skip
 
 
@@ -260,13 +324,51 @@ def test_options_for_times(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["Time", "TIMESTAMP", "Time Stamp", "Date/Time", "UTC", "Zeit",
-                                  "Elapsed Time [s]", "time_s", "t_ms"])  # fmt: skip
+                                  "Elapsed Time [s]", "time_s", "t_ms", "LogTime", "rec_time",
+                                  "time since start [s]", "Uhrzeit", "t(s)"])  # fmt: skip
 def test_names_of_the_time(tmp_path, name):
     """A transient is not taken for steady points; a column that only may be the time is told."""
     table, _ = read(tmp_path, text(k * 0.5, tname=name))
     assert_allclose(np.diff(table.time()), 5e-4 if name == "t_ms" else 0.5)
     table, _ = read(tmp_path, text(k * 0.5, tname="clock"))
     assert table.time() is None and table.steady_hint() == "clock"
+
+
+def test_dates_and_times_of_day_in_two_columns(tmp_path):
+    """Joined, also over midnight; a day first is refused with the format that decides."""
+    late = [f"23:59:{54 + i}" for i in k[:6]] + [f"00:00:0{i}" for i in k[:6]]
+    for days, names, form in (
+        (("2024-03-31", "2024-04-01"), "Date,Time", None),
+        (("31-Mar-2024", "01-Apr-2024"), "Date,Time", None),
+        (("31.03.2024", "01.04.2024"), "Datum,Uhrzeit", "%d.%m.%Y %H:%M:%S"),
+    ):
+        both = [f"{days[i > 5]},{c}" for i, c in enumerate(late)]
+        if form is not None:
+            with pytest.raises(DataError, match=f"Datum . Uhrzeit: .*--time-format '{form}'"):
+                read(tmp_path, text(both, tname=names))
+        table, notes = read(tmp_path, text(both, tname=names), time_format=form)
+        assert_allclose(np.diff(table.time()), 1.0)
+        assert any(f"column {names.replace(',', ' + ')}: dates" in n for n in notes)
+
+
+def test_rate_order_and_pressure_are_given(tmp_path):
+    """Stamps too coarse; rows that fell back, two of them of one stamp; gauge pressures."""
+    table, notes = read(tmp_path, text(k // 4), rate=50.0)
+    assert_allclose(table.time(), k * 0.02)
+    assert "--rate goes before column time" in notes[0]
+    rows = text(k * 0.5).splitlines()
+    moved = [rows[0], *rows[3:5], *rows[1:3], *rows[5:]]
+    moved[1:1] = [rows[3].replace("36050.500", "")]
+    path = tmp_path / "y.csv"
+    path.write_text("\n".join(moved))
+    table = read_table(path, reading=Reading(sort=True), notes=(notes := []))
+    assert_allclose(table.time(), k * 0.5)
+    assert_allclose(table.get("T5", "K"), DATA["T5"][1] + 273.15)
+    assert np.isfinite(table.get("N", "rad/s")).all() and "1 joined with another" in notes[0]
+    path.write_text("P3 [psig],P5 [bar(g)],P0 [mbar]\n100,0.02,1013.25\n101,0.03,1013.25\n")
+    table = read_table(path, notes=[])
+    assert_allclose(table.get("P3", "Pa")[0], 101325 + 100 * 6894.757293168)
+    assert_allclose(table.get("P5", "Pa"), [103325, 104325])
 
 
 FRAME = pd.DataFrame({f"{n} [{d[0]}]": d[1] for n, d in DATA.items()})
@@ -378,6 +480,69 @@ def test_the_command_says_how_it_read(tmp_path, capsys):
     path.write_text(flagged, encoding="utf-8")
     assert main(["fit", str(path)]) == 0
     assert "column valid is not heeded: 1 of 12 rows" in capsys.readouterr().out
+
+
+def test_the_command_takes_layouts(tmp_path, capsys):
+    """Names, units and rate by options or by a file; words for gaps; many rows without time."""
+    path, layout = tmp_path / "x.csv", tmp_path / "x.toml"
+    path.write_text(text().split("\n", 1)[1], encoding="utf-8")
+    names, units = ",".join(DATA), ",".join(d[0] for d in DATA.values())
+    assert main(["fit", str(path)]) == 2
+    assert "give --names A,B" in capsys.readouterr().err
+    assert main(["fit", str(path), "--names", names, "--units", units]) == 0
+    assert "12 steady points" in capsys.readouterr().out
+    layout.write_text(f"names = {names.split(',')}\nunits = {units.split(',')}\n", "utf-8")
+    assert main(["fit", str(path), "--columns", str(layout), "--rate", "20"]) == 0
+    assert "12 samples of a transient" in capsys.readouterr().out
+    path.write_text(cell(3, "T5", "off"), encoding="utf-8")
+    assert main(["fit", str(path), "--missing=off", "--json"]) == 0
+    assert '"readings": 11' in capsys.readouterr().out
+    rows = text().splitlines()
+    path.write_text("\n".join([*rows, *rows[1:]]), encoding="utf-8")
+    assert main(["fit", str(path)]) == 0
+    assert "no time column, so each row is taken as a steady" in capsys.readouterr().out
+
+
+def test_temperatures_that_the_other_readings_refute(tmp_path, capsys):
+    """All in SI but T5 in degC, which as K lies in the range; a hot day's T3 so too."""
+    si = {n: d[1] * {"N": np.pi / 30, "P3": 1e3, "Wf": 1 / 3600, "PW": 1e3}.get(n, 1.0)
+          + 273.15 * (n in ("T3", "T5")) for n, d in DATA.items()}  # fmt: skip
+    path = tmp_path / "x.csv"
+    for name, add in (("T5", 0.0), ("T3", 30.0)):
+        wrong = {**si, name: si[name] - 273.15 + add}
+        pd.DataFrame(wrong).to_csv(path, index=False)
+        assert main(["fit", str(path)]) == 2
+        err = capsys.readouterr().err
+        assert (
+            f"x.csv, column {name}: unit missing?" in err and f"--column {name}={name}:degC" in err
+        )
+        assert main(["fit", str(path), "--column", f"{name}={name}:degC"]) == 0
+        capsys.readouterr()
+
+
+@pytest.mark.parametrize(("name", "factor", "words"), [
+    ("P3", 0.1, r"column P3: wrong unit\? 7.892e.04 Pa .* no compressor's .*--altitude"),
+    ("Wf", 0.454, "columns Wf, PW and T5: 688.2 K .* too hot for an engine .*--range T5"),
+])  # fmt: skip
+def test_pressure_and_heat_that_cannot_be(tmp_path, name, factor, words):
+    """kPa that are called hPa, kg/h that are called lb/h; believed where the range is given."""
+    table, _ = read(tmp_path, text())
+    readings = {n: table.get(n, d[2]) for n, d in DATA.items()}
+    check_temperatures("x.csv", readings, {}, GasGenerator())
+    readings[name] = readings[name] * factor
+    with pytest.raises(DataError, match=words):
+        check_temperatures("x.csv", readings, {}, GasGenerator())
+    check_temperatures("x.csv", readings, {}, GasGenerator(), ("P3", "T5"))
+
+
+def test_units_of_time_in_names(tmp_path):
+    """TimeMs, and a column that is asked for by a name that is a unit."""
+    for name, time in (("TimeMs", None), ("msec", "msec"), ("Elapsed Hours", None)):
+        scale = 3600e-3 if "Hours" in name else 1.0
+        cells = [f"{20 * i / 1e3 / 3600:.12f}" if scale != 1 else str(20 * i) for i in k]
+        table, notes = read(tmp_path, text(cells, tname=name), time=time)
+        assert_allclose(np.diff(table.time()), 0.02, atol=1e-6)
+        assert any("as its name says" in n or "as Elapsed in h" in n for n in notes)
 
 
 def test_calibration_points_have_the_same_ranges(tmp_path, capsys):

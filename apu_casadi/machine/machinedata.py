@@ -72,6 +72,8 @@ class MachineParameters(Parameters):
         return self.r_fd * V_peak / (self.w_rated * self.L_md)
 
 
+MACHINE = MachineParameters().signals("machine")
+"""The machine's parameters by dotted name, as ``machine.r_s``."""
 _SAT = "assumed, of the size usual for salient poles; Table 1 tells a linear machine"
 
 

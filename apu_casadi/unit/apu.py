@@ -29,7 +29,7 @@ from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator, GeneratorPoint
 from apu_casadi.machine.machinedata import magnetics
 from apu_casadi.unit.control import GOVERNORS, Governor, GovernorParameters, word_of
-from apu_casadi.unit.events import Ambient
+from apu_casadi.unit.events import MOST, Ambient
 from apu_casadi.unit.exchange import Link
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     Faults = Fault | Sequence[Fault | None] | Mapping[int, Fault | None] | None
 
 RESIDUAL_JOINT = 1e-9
-MOST = 4
-"""Generators that a unit may have; it has at least one."""
 T = TypeVar("T")
 _NUMBERED = re.compile(r"generator(\d+)\.(.+)")
 
@@ -337,7 +335,7 @@ class Apu(Parametric):
             raise ScenarioError(f"{what}: {n} entries expected, one a generator, got {len(given)}")
         return tuple(given)
 
-    def each_fault(self, given: Faults) -> tuple[Fault | None, ...]:
+    def each_fault(self, given: Any) -> tuple[Any, ...]:
         """Return the fault of each generator; as :meth:`each`, or a mapping by number from 1."""
         if not isinstance(given, Mapping):
             return self.each("fault", given)
@@ -358,32 +356,35 @@ class Apu(Parametric):
         health: Mapping[str, float] | None = None,
         V_ref: float | None = None,
         limits: Limits | None = None,
+        N_ref: float | None = None,
     ) -> JointPoint:
         """Solve the steady unit at governed speed.
 
         ``load`` and ``fault`` are those of each generator, or a list with one for each; for the
         fault also a mapping by number of the generator, from 1.  With a fault or an unbalanced load
         the generator's state is periodic, and the shaft carries the mean of its power over a turn.
-        ``ambient`` is the default day if not given.  ``limits`` are those of the trim; by default
-        without one of temperature, which is no reason not to simulate.
+        ``ambient`` is the default day if not given, ``N_ref`` another governed speed than the
+        unit's, rad/s.  ``limits`` are those of the trim; by default without one of temperature,
+        which is no reason not to simulate.
 
         Raises:
             ScenarioError: another number of loads or faults than there are generators.
             OperatingPointError: no such point, or it needs fuel beyond the governor's limits.
         """
         amb = dataclasses.asdict(Ambient() if ambient is None else ambient)
+        N_ref = self.N_ref if N_ref is None else N_ref
         loads, faults = self.each("load", load), self.each_fault(fault)
         alike = groups(zip(self.machines, loads, faults, strict=True))
         points: dict[int, GeneratorPoint] = {}
         PW = 0.0
         for numbers, ((gen, _), own, broken) in alike.items():
             link = self.link_of(numbers)
-            point = gen.steady_state(own, broken, w_r=link.w_r(self.N_ref), V_ref=V_ref)
+            point = gen.steady_state(own, broken, w_r=link.w_r(N_ref), V_ref=V_ref)
             PW += link.PW(point.mean("P_total"))
             points |= dict.fromkeys(numbers, point)
         limits = Limits(T4_max=math.inf) if limits is None else limits
         gas = trim_gas_generator(
-            self.gas_generator, {"N": self.N_ref, "PW": PW}, theta=health, limits=limits, **amb
+            self.gas_generator, {"N": N_ref, "PW": PW}, theta=health, limits=limits, **amb
         )
         Wf, g = gas["Wf"], self.governor
         if not g.Wf_min <= Wf <= g.Wf_max:

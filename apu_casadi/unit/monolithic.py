@@ -31,7 +31,7 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import Ambient, Event, Holding, all_factors, in_order
+from apu_casadi.unit.events import Ambient, Event, Holding, SpeedChange, all_factors, in_order
 from apu_casadi.unit.exchange import coupled
 from apu_casadi.unit.multirate import exchange_grid
 from apu_casadi.unit.stepmeans import MEANS, rms_at_rest
@@ -154,13 +154,19 @@ def simulate_monolithic(
     for e in events:
         if getattr(e, "generator", None) is not None:
             raise ScenarioError(f"{e!r}: the generators of the one model have the same load")
+    day, factors = Ambient() if ambient is None else ambient, all_factors(health)
+    start = Holding((load,) * n, (None,) * n, factors, day)
+    if any(start.after(events[:k]).changing for k in range(len(events) + 1)):
+        raise ScenarioError("the one model of the unit follows no profiles: give events instead")
+    if any(isinstance(e, SpeedChange) for e in events):
+        raise ScenarioError("the one model of the unit has one governed speed, of its parameters")
     grid = exchange_grid(duration, dt, events)
     system = _OneModel(
         apu,
         grid,
         load=load,
-        ambient=Ambient() if ambient is None else ambient,
-        health=all_factors(health),
+        ambient=day,
+        health=factors,
         how={"solver": solver, "rtol": rtol, "atol": atol},
     )
     rows = np.empty((system.at_start().size, grid.size))
@@ -172,9 +178,7 @@ def simulate_monolithic(
     run(system, grid, events, record=record, progress=progress)
     gg = apu.gas_generator
     values = dict(zip((*gg.Y.names, *MEANS, *RMS), rows, strict=True))
-    told = runrecord.asked(
-        loads=[load] * n, faults=[None] * n, ambient=system.ambient, events=events
-    )
+    told = runrecord.asked(start=start, events=events)
     attrs = {**system.how, "nsteps": system.nsteps, **told}
     ds = dataset({"time": grid}, {"time": values}, signals=gg.Y, attrs=attrs)
     starved = validity.fuel_limited(apu, grid, values["N"], values["Wf"])

@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         figures = _draw(fit, args.figure, steady, ambients, given.program(args))
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
-    found["read_as"] = [*notes, *_unheeded(tables, times, args)]
+    found["read_as"] = [*notes, *_unheeded(tables, times, args), *_other_unit(args)]
     days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
     found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
     found |= {"apu_casadi_version": installed(), **given.own(args)}
@@ -283,7 +283,7 @@ def _data(
             ambient[name] = said[name]
         if name in ambient:
             _in_range(table.source, name, ambient[name])
-    check_temperatures(table.source, readings, ambient, gg)
+    check_temperatures(table.source, readings, ambient, gg, table.reading.ranges)
     rows = np.arange(table.size, dtype=float) if t is None else t - t[0]
     # rows in which nothing was read are no points
     there = np.any([np.isfinite(readings[n]) for n in measured], axis=0)
@@ -335,6 +335,14 @@ def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Name
             f"{f'{hint} is the time' if hint else 'they are samples of a transient'}, give {remedy}"
         )
     return flags
+
+
+def _other_unit(args: argparse.Namespace) -> list[str]:
+    """Say it where a run is of another unit than the one that is fitted."""
+    from estimators.apu.recordings.runfiles import recorded_engine
+
+    runs = [] if args.engine else [(f, recorded_engine(f)) for f in args.files]
+    return [f"{f} is a run of {unit}: give --engine {unit}" for f, unit in runs if unit]
 
 
 def _ignored(

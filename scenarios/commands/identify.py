@@ -70,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
     sets, added = _sets(args, sensors)
     f = _found(args)
     if args.figure is not None:
-        files.save_figure(_figure(f.point, args.samples, _engine(args)), args.figure)
+        figure = _figure(f.point, args.samples, _engine(args), given.program(args))
+        files.save_figure(figure, args.figure)
     if args.json:
         jsontext.show(_report(args, sensors, sets, added, f))
         return 0
@@ -420,7 +421,7 @@ def _electrical(rows: list[Severity]) -> list[str]:
     return [*lines, *_say("severity")]
 
 
-def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
+def _figure(point: str, samples: int, engine: Mapping[str, Any], program: str) -> Any:
     from estimators.apu import identify as study
     from estimators.apu.sensors import GAS_PATH
     from scenarios.figures.estimationplot import plot_gain_of_a_sensor
@@ -435,4 +436,5 @@ def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
         curves[label] = {k: [r[k] for r in rows] for k in keys}
     aims = {label: (study.PRIOR, aim) for label, aim in study.AIMS.items()}
     told = {"point": point, "power": noise, "samples": samples, "eta": study.ETA_BIAS}
-    return plot_gain_of_a_sensor(priors, curves, aims=aims, note=_template().text("figure", **told))
+    note = f"{_template().text('figure', **told)} {program[0].upper()}{program[1:]}."
+    return plot_gain_of_a_sensor(priors, curves, aims=aims, note=note)

@@ -104,6 +104,14 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 )
 
 
+_OF_EACH = {
+    *("load of each", "V rms a [V]", "I rms a [A]", "      b", "      c", "output of each [kW]"),
+    *("fault loss of each [kW]", "TTSC mu [%]", "  phase", "  k_rf", "  kappa"),
+    "  h = mu/(k_rf + 1 - mu)",
+}
+"""Rows of what a generator has of its own."""
+
+
 def made_with(report: dict[str, Any]) -> list[str]:
     """Return the lines that tell what a run was made with, and whether the model holds."""
     from apu_casadi.gaspath.conditions import day_words
@@ -134,9 +142,19 @@ def made_with(report: dict[str, Any]) -> list[str]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return the phases side by side; means over the end of each phase, then extremes over it."""
-    columns = [[r["name"], *(show(r) for _, show in _ROWS)] for r in rows]
-    heads = ["", *(name for name, _ in _ROWS)]
+    """Return the phases side by side; means over the end of each phase, then extremes over it.
+
+    Where generators differ, what each has of its own follows for one after the other.
+    """
+    several = "generators" in rows[0]
+    of_unit = [(name, show) for name, show in _ROWS if not (several and name in _OF_EACH)]
+    heads = ["", *(name for name, _ in of_unit)]
+    columns = [[r["name"], *(show(r) for _, show in of_unit)] for r in rows]
+    own = [(name.replace(" of each", ""), show) for name, show in _ROWS if name in _OF_EACH]
+    for k, first in enumerate(rows[0].get("generators", ())):
+        heads += [f"generator {first['generator']}", *(f"  {name}" for name, _ in own)]
+        for column, r in zip(columns, rows, strict=True):
+            column += ["", *(show(r["generators"][k]) for _, show in own)]
     left = max(len(h) for h in heads)
     widths = [max(len(c) for c in column) for column in columns]
     lines = []

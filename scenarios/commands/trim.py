@@ -126,8 +126,11 @@ def _fixed(texts: list[str], gg: GasGenerator) -> dict[str, Any]:
     return out
 
 
-def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, dict[str, float]]:
-    """Solve the whole unit; return the gas generator's point, and values of each generator."""
+def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, list[dict[str, float]]]:
+    """Solve the whole unit; return the gas generator's point, and values of the generators.
+
+    Those of one where all are equal.
+    """
     from apu_casadi.unit.events import Ambient
 
     if args.speed is not None:
@@ -135,7 +138,8 @@ def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, dict[s
     ambient = Ambient(**given.ambient_of(args))
     unit = given.unit(args)
     joint = unit.steady_state(_load(args, unit), given.fault(args), ambient=ambient, **how)
-    return joint.gas, _values(joint.generator)
+    each = (joint.generator, *joint.others)
+    return joint.gas, [_values(g) for g in each]
 
 
 def _alone(
@@ -162,14 +166,16 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
     health = given.numbers(args.health, "--health")
     used = None if mode == "--load" else given.LIMITED
     limits = _limits(args.limit, given.engine_file(args, used))
-    extra: dict[str, float] = {}
+    extra: list[dict[str, float]] = []
     if mode == "--load":
         point, extra = _joint(args, health=health, limits=limits)
     else:
         point = _alone(args, mode, health, limits)
     values = {"N_rpm": point["N"] / RPM, **point.values}
     if args.json:
-        report = {"outputs": values, "generator": extra, "residual": point.residual}
+        report: dict[str, Any] = {"outputs": values, "generator": extra[0] if extra else {}}
+        report |= {"generators": extra} if len(extra) > 1 else {}
+        report["residual"] = point.residual
         report |= {
             "iterations": point.iterations,
             "inputs": {**given.ambient_of(args), "health": health},
@@ -186,8 +192,9 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         jsontext.show(report)
         return 0
     print(_table(values, list(values) if args.all else ["N_rpm", *SHOWN]))
-    if extra:
-        print("\neach generator\n" + _table(extra, list(extra)))
+    for k, own in enumerate(extra, 1):
+        head = "each generator" if len(extra) == 1 else f"generator {k}"
+        print(f"\n{head}\n{_table(own, list(own))}")
     print(f"\nresidual {point.residual:.1e}, {point.iterations} Newton steps")
     if point.second is not None:
         print(_second(point.second))

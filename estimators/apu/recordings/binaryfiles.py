@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.results import GENERATOR, load
 from apu_casadi.core.units import header, unit_of
 from estimators.apu.recordings.columns import Column, Tell, cut, parsed
 
@@ -39,7 +40,8 @@ def typed(path: Path | str, name: str, unit: Any, raw: Any, tell: Tell) -> Colum
             raw.cat.categories.dtype if raw.cat.categories.dtype.kind in "ifuM" else object
         )
         dtype = raw.dtype
-    if type(dtype).__name__ == "DatetimeTZDtype":
+    utc = type(dtype).__name__ == "DatetimeTZDtype"
+    if utc:
         raw = raw.dt.tz_convert("UTC").dt.tz_localize(None)
     if hasattr(raw, "to_numpy"):
         kind = getattr(dtype, "kind", "O")
@@ -60,7 +62,8 @@ def typed(path: Path | str, name: str, unit: Any, raw: Any, tell: Tell) -> Colum
         return Column(name, unit, values, a)
     nothing = np.full(a.shape[0], np.nan)
     if a.dtype.kind in "mM":
-        return Column(name, unit, nothing, a, f"{place(0)}: {a[0] if a.size else ''} is no number")
+        problem = f"{place(0)}: {a[0] if a.size else ''} is no number"
+        return Column(name, unit, nothing, a, problem, utc)
     if a.dtype.kind == "S":
         a = np.char.decode(a, "utf-8", "replace")
     cells = [c.decode("utf-8", "replace") if isinstance(c, bytes) else c for c in a.tolist()]
@@ -142,30 +145,40 @@ def netcdf_columns(
     path: Path, tell: Tell, dim: str | None = None
 ) -> tuple[list[Column], dict[str, str]]:
     """Read a netCDF file; return its columns, and why other variables are none."""
-    return dataset_columns(path, open_netcdf(path), tell, dim)
-
-
-def open_netcdf(path: Path) -> Any:
-    """Return the dataset of a netCDF 3 or 4 file, times as the file has them."""
-    from apu_casadi.core.results import load
-
-    with path.open("rb") as f:
-        start = f.read(4)
-    return _netcdf4(path) if start == b"\x89HDF" else load(path)
+    return dataset_columns(path, load(path), tell, dim)
 
 
 def time_dims(data: Any) -> list[str]:
     """Dimensions along which a dataset has columns, the longest last."""
+    data = _each_generator(data)
     found = [d for d in data.sizes if any(v.dims == (d,) for v in data.data_vars.values())]
     return sorted(map(str, found), key=lambda d: int(data.sizes[d]))
+
+
+def _each_generator(data: Any) -> Any:
+    """A dataset without the dimension of generators, whose numbers end the names instead."""
+    if GENERATOR not in data.dims or data.sizes[GENERATOR] == 1:
+        return data
+    many = [n for n, v in data.data_vars.items() if GENERATOR in v.dims]
+    numbers = 1 + np.arange(data.sizes[GENERATOR])
+    numbers = data[GENERATOR].values if GENERATOR in data.coords else numbers
+    out = data.drop_vars([*many, *(n for n, v in data.coords.items() if GENERATOR in v.dims)])
+    for n in many:
+        for k, number in enumerate(numbers):
+            out[f"{n}_{number}"] = data[n].isel({GENERATOR: k}, drop=True)
+    return out
 
 
 def dataset_columns(
     path: Path | str, data: Any, tell: Tell, dim: str | None = None
 ) -> tuple[list[Column], dict[str, str]]:
-    """Return the columns of an xarray.Dataset along one dimension, and why other ones are none."""
+    """Return the columns of an xarray.Dataset along one dimension, and why other ones are none.
+
+    What each generator has of its own is a column for each, ``v_a_2``.
+    """
     import xarray as xr
 
+    data = _each_generator(data)
     sizes = {str(d): int(n) for d, n in data.sizes.items()}
     if not sizes:
         raise DataError(f"{path}: no data rows")
@@ -190,34 +203,3 @@ def dataset_columns(
         unit = v.attrs.get("units")
         out.append(typed(path, str(name), unit, values, tell))
     return out, others
-
-
-def _netcdf4(path: Path) -> Any:
-    import xarray as xr
-
-    try:
-        with xr.open_dataset(path, decode_times=False) as ds:
-            data = ds.load()
-    except ValueError:
-        raise DataError(
-            f"{path}: a netCDF 4 file; reading it needs h5netcdf: pip install h5netcdf"
-        ) from None
-    except Exception as e:  # damaged files fail with any type
-        raise DataError(f"{path}: damaged netCDF file ({type(e).__name__}: {e})") from None
-    if not data.variables:
-        groups = _groups(path)
-        if groups:
-            raise DataError(
-                f"{path}: the variables are in groups ({', '.join(groups)}), which are not read: "
-                "save one of them as a file of its own, xarray.open_dataset(path, group=...)"
-            )
-    return data
-
-
-def _groups(path: Path) -> list[str]:
-    import xarray as xr
-
-    try:
-        return [g for g in xr.open_groups(path, decode_times=False) if g != "/"]
-    except Exception:  # only for the message
-        return []

@@ -26,11 +26,12 @@ _WORDS = """
 #n/a #na #value! #ref! #div/0! #num! #null! #name? <na> nat bad baddata badinput nodata nogooddata
 notavailable unavailable i/otimeout iotimeout timeout error err invalid missing disconnected
 ptcreated scanoff overrange underrange outofrange overflow underflow overload overld over ol open
-notconnected fault failed stale 1.#ind 1.#qnan 1.#inf nan(ind) nan(snan) nan* n.a. n.d. n/v nd void
+notconnected fault failed stale 1.#ind 1.#qnan 1.#inf nan(ind) nan(snan) nan* <nan>
+n.a. n.a n.d. n/v nd void
 """
 #: What programs and data historians write for a reading that they do not have.
 WORDS = frozenset(_WORDS.split())
-_MARKS = re.compile(r"[-*#?_]+")  # ---, ****, ####
+_MARKS = re.compile(r"[-–—*#?_]+")  # ---, ****, ####
 _CODE = re.compile(r"^\[-?\d+\]")  # [-11059] No Good Data
 POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eEdD][+-]?\d+)?", re.ASCII)
@@ -50,6 +51,7 @@ class Column:
         values: shape (K,), NaN where there is a gap.
         raw: the same as the file holds it: numbers, text, dates; for time columns.
         problem: why these are no numbers, for a column that nobody may need; else None.
+        utc: whether dates are in UTC.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Column:
     values: np.ndarray
     raw: Any = None
     problem: str | None = None
+    utc: bool = False
 
 
 def cut(cell: Any) -> str:
@@ -134,8 +137,10 @@ def parsed(
             return Column(name, unit, values, _whole(cells, values))
         return Column(name, unit, values, values)
     if wrong and (good > len(wrong) or (good and good == len(wrong))):
+        cell = cut(cells[wrong[0]])
         raise DataError(
-            f"{place(wrong[0])}: {cut(cells[wrong[0]])} is no number (an empty cell is a gap)"
+            f"{place(wrong[0])}: {cell} is no number (an empty cell is a gap): correct it, or give "
+            f"--missing={cell} if it stands for a gap"
         )
     if wrong or not good:
         k = (wrong or words)[0]

@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
-from estimators.apu.recordings.binaryfiles import open_netcdf, time_dims
+from apu_casadi.core.results import load
+from estimators.apu.recordings.binaryfiles import time_dims
 from estimators.apu.recordings.layout import Reading, merged, parse_mapping, read_layout
-from estimators.apu.recordings.plausible import PLAUSIBLE, plain, si_of
+from estimators.apu.recordings.plausible import PLAUSIBLE, WAVES, plain, si_of
 from estimators.apu.recordings.recorded import Table, read_data, read_table
 from estimators.apu.recordings.timestamps import Start, is_time_name
 from estimators.apu.sensors import ELECTRICAL
@@ -33,6 +34,7 @@ from estimators.apu.sensors import ELECTRICAL
 if TYPE_CHECKING:
     import xarray as xr
 
+SLOW = 0.01  # s, a step with which no waveform is sampled
 __all__ = ["Channel", "Measurements", "read_recording"]
 
 
@@ -195,7 +197,7 @@ def read_recording(
     tables = [t for s in sources for t in _tables(s, mapping, base, notes)]
     if not tables:
         raise DataError("no recording is given")
-    return _joined(tables, notes)
+    return _joined(tables, notes, len(sources) > 1)
 
 
 def _tables(
@@ -207,7 +209,7 @@ def _tables(
         path = Path(source)
         if path.suffix.lower() not in (".nc", ".cdf") or not path.is_file():
             return [read_table(path, mapping, **how)]
-        data, name = open_netcdf(path), path.name
+        data, name = load(path), path.name
     elif hasattr(source, "data_vars"):
         data, name = source, "Dataset"
     else:
@@ -223,7 +225,7 @@ def _tables(
     ]
 
 
-def _joined(tables: list[Table], notes: list[str]) -> Measurements:
+def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurements:
     """Take the quantities of all tables, on a common time."""
     starts: list[Start | None] = []
     times: list[np.ndarray] = []
@@ -248,7 +250,7 @@ def _joined(tables: list[Table], notes: list[str]) -> Measurements:
     if len({zoned for _, zoned in dated}) > 1:
         raise DataError("some files have dates with a zone and some without: give time_zone=...")
     zero = min((d for d, _ in dated), default=None)
-    if len(tables) > 1 and zero is None:
+    if several and zero is None:
         notes.append("all files are taken to count their seconds from the same instant")
     channels: dict[str, Channel] = {}
     unused: list[str] = []
@@ -260,9 +262,15 @@ def _joined(tables: list[Table], notes: list[str]) -> Measurements:
                     f"{name} is in {channels[name].source} and in {c.source}: give one of them, or "
                     "another name to one"
                 )
+            _check_rate(c, table)
             channels[name] = c
         taken = {c.source.partition(", column ")[2] for c in channels.values()}
         unused += [n for n in table.columns if n not in taken and not is_time_name(n)]
+    unused += [
+        f"{n} ({why})"
+        for n, why in {n: why for table in tables for n, why in table.others.items()}.items()
+        if not any(n in table.columns for table in tables)
+    ]
     if not channels:
         raise DataError(
             f"{tables[0].source}: none of the columns {', '.join(tables[0].columns)} is a quantity "
@@ -270,6 +278,19 @@ def _joined(tables: list[Table], notes: list[str]) -> Measurements:
         )
     notes += [f for table in tables for f in table.flags()]
     return Measurements(channels, tuple(notes), tuple(unused), zero)
+
+
+def _check_rate(c: Channel, table: Table) -> None:
+    """Refuse waveforms of a few samples a period, and tell of steps that may be in another unit."""
+    step = 1.0 / c.rate
+    if plain(c.name) in WAVES and step > SLOW:
+        raise DataError(
+            f"{c.source}: steps of {step:g} s are no sampling of a waveform: unit of the time "
+            "missing? give columns={'time': 'COLUMN:ms'}, or rate=HZ"
+        )
+    if step >= 10 and table.notes is not None:
+        note = f"{table.source}: steps of {step:g} s; if they are ms, give the time's unit"
+        table.notes.extend([note] * (note not in table.notes))
 
 
 def _first(starts: list[Start | None], dated: bool) -> int:

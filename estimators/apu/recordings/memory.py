@@ -22,8 +22,8 @@ def memory_columns(
 
     Args:
         source, tell: for messages, and who is told.
-        data: ``{"T3 [K]": array, ...}`` of one length, a DataFrame or Series, a Dataset or
-            DataArray.
+        data: ``{"T3 [K]": array, ...}`` of one length, an array of columns, shape (K, n), a
+            DataFrame or Series, a Dataset or DataArray.
         dim: dimension of a Dataset along which the columns are.
 
     Raises:
@@ -38,6 +38,8 @@ def memory_columns(
         data = data.to_frame()
     if hasattr(data, "iloc"):
         return frame_columns(source, data, tell), {}
+    if isinstance(data, np.ndarray) and data.ndim == 2:
+        data = {str(k): column for k, column in enumerate(data.T)}
     if not isinstance(data, Mapping):
         raise DataError(
             f"{source}: a file name, a table of arrays by name, a DataFrame or a Dataset is "

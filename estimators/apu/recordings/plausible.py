@@ -72,9 +72,11 @@ _SMALL = {"PW": 2e3}
 _USUAL = {
     "K": ("degC", "degF", "degR"),
     "Pa": ("kPa", "bar", "psi", "hPa", "MPa"),
-    "rad/s": ("rpm",),
+    "rad/s": ("rpm", "krpm", "rev/s", "%"),
     "kg/s": ("kg/h", "lb/h", "g/s", "kg/min"),
     "W": ("kW", "hp", "MW"),
+    "V": ("kV", "mV"),
+    "A": ("mA", "kA"),
     "m": ("ft", "km"),
 }
 #: What loggers write for "no reading", where a range would let it pass.
@@ -88,7 +90,7 @@ _RUN = 8  # equal readings in a row, while others change, that look stuck
 def plain(name: str) -> str:
     """Return a quantity of a generator without the machine's number: ``v_a`` of ``v_a_2``."""
     head, _, machine = name.rpartition("_")
-    return head if machine in ("1", "2") and head in ELECTRICAL else name
+    return head if machine in ["1", "2", "3", "4"] and head in ELECTRICAL else name
 
 
 def si_of(name: str) -> str | None:
@@ -186,12 +188,13 @@ class Limits:
             else f"no possible {name} ({limits}; {count}"
         )
         others = _fits(si, raw[there], low, high)
+        others = others if unit is None or not _inside(raw[there], low, high) else [si, *others][:2]
         if others and out.sum() * 2 >= there.sum() and self._many(values[there], low, high):
             meant = " or ".join(others)
             raise DataError(
                 f"{where(k)}: {'unit missing' if unit is None else 'wrong unit'}? {raw[k]:.9g} is "
                 f"plausible as {meant}, not as {unit or si} ({name} lies within {limits}): write "
-                f"the unit into the header, {name} [{others[0]}], or give --column "
+                f"the unit into the header, such as {name} [{others[0]}], or give --column "
                 f"{name}={name}:{others[0]}"
             )
         if not self.exclude:
@@ -212,8 +215,8 @@ class Limits:
     @staticmethod
     def _many(values: np.ndarray, low: float, high: float) -> bool:
         """Whether the column as a whole is off, and not one reading of several."""
-        middle = float(np.median(values))
-        return not low <= middle <= high
+        off = (values < low) | (values > high)
+        return not low <= float(np.median(values)) <= high or bool(off.mean() > 0.9)
 
     def _bare(self, name: str, si: str, values: np.ndarray, where: str, mixed: bool) -> None:
         """Refuse a column without unit whose readings may be in another one as well."""
@@ -275,15 +278,20 @@ def clipped(values: np.ndarray) -> int:
     return count if count >= 4 and count > 0.002 * values.size else 0
 
 
+def _inside(values: np.ndarray, low: float, high: float) -> bool:
+    return bool(((values >= low) & (values <= high)).all())
+
+
 def _fits(si: str, raw: np.ndarray, low: float, high: float) -> list[str]:
     """Return the units in which all the readings would be plausible."""
     found = []
     for unit in _USUAL.get(si, ()):
         _, factor, offset = UNITS[unit]
-        v = raw * factor + offset
-        if ((v >= low) & (v <= high)).all():
+        if unit == "%":  # of the design speed
+            factor = low / 40
+        if _inside(raw * factor + offset, low, high):
             found.append(unit)
-    return found[:2]
+    return found[:4]
 
 
 def parse_limits(items: list[str]) -> dict[str, tuple[float, float]]:

@@ -13,6 +13,7 @@ refused, or left out on request.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,7 @@ from estimators.apu.recordings.timestamps import (
     looks_like_time,
     may_be_time,
     to_seconds,
+    unit_in_name,
 )
 from estimators.apu.sensors import KNOWN
 
@@ -268,6 +270,9 @@ class Table:
         """Return columns of truth values that are false in some rows, which nobody heeds."""
         out = []
         for n, c in self.columns.items():
+            marks = re.search(r"(?i)valid|quality|status|flag", n) and c.problem is None
+            if marks and np.unique(c.values[np.isfinite(c.values)]).size > 1:
+                out.append(f"{self.source}, column {n} is not heeded, although it changes")
             cells = [str(x).strip().lower() for x in (c.raw if c.problem else ())]
             if cells and set(cells) <= {"true", "false", "good", "bad", "ok", "valid", "invalid"}:
                 bad = sum(x in ("false", "bad", "invalid") for x in cells)
@@ -328,9 +333,15 @@ class Table:
         else:
             c, unit = self._find(found)
             raw = c.values if c.raw is None else c.raw
+            own = unit_in_name(c.name) if unit is None and c.problem is None else None
+            if own not in (None, "s"):
+                self._tell(f"{self.source}: column {c.name} is taken in {own}, as its name says")
+                unit = own
+        utc = not plus and self._find(found)[0].utc
         form, zone = self.reading.time_format, self.reading.time_zone
         what = f"{self.source}, column {found}"
-        return to_seconds(raw, unit, what, self._tell, form=form, zone=zone, start=start)
+        how: dict[str, Any] = {"form": form, "zone": zone, "start": start, "utc": utc}
+        return to_seconds(raw, unit, what, self._tell, **how)
 
     def ordered(self) -> Table:
         """Return the table with its rows in the order of time; rows of one stamp are joined.
@@ -422,7 +433,7 @@ def read_table(
         if _KINDS[kind] == "text":
             columns, lines = text_columns(path, tell, reading, _known)
         elif _KINDS[kind] == "parquet":
-            columns = parquet_columns(path, tell)
+            columns = _named(path, parquet_columns(path, tell), reading)
         else:
             columns, others = netcdf_columns(path, tell, dim)
     except OSError as e:
@@ -454,7 +465,21 @@ def read_data(
 
     columns, others = memory_columns(source, data, tell, dim)
     reading = Reading() if reading is None else reading
+    columns = _named(source, columns, reading)
     return _table(source, source, columns, mapping, reading, notes, None, others)
+
+
+def _named(path: Any, columns: list[Column], reading: Reading) -> list[Column]:
+    """Return columns with the names and units that were given, if any."""
+    if not reading.names:
+        return columns
+    if len(columns) != len(reading.names):
+        raise DataError(
+            f"{path}: {len(columns)} columns, but {len(reading.names)} names are given: give one "
+            "for each column in order, '' for one to leave out"
+        )
+    each = zip(columns, reading.names, reading.units or [""] * len(columns), strict=True)
+    return [dataclasses.replace(c, name=n, unit=u or None) for c, n, u in each if n]
 
 
 def _table(

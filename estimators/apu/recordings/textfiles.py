@@ -165,7 +165,7 @@ _NAME = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 
 def _rows(path: Path, kept: list[tuple[int, str]], delimiter: str) -> list[Row]:
     if delimiter == " ":
-        width = len(kept[-1][1].split())
+        width = Counter(len(x.split()) for _, x in kept).most_common(1)[0][0]
 
         def cut_at_blanks(x: str) -> list[str]:
             cells = x.split()
@@ -366,8 +366,14 @@ def _tell_left_out(h: _Head, above: list[Row], taken: list[Row | None]) -> None:
     names = taken[0]
     if left and names is not None and left[-1] < names[0]:
         h.tell(f"{h.path}: lines {left[0]} to {left[-1]}, above the column names, are left out")
+    elif left and taken[1] is None:
+        raise DataError(
+            f"{h.path}, line {left[-1]}: what stands between the column names of line "
+            f"{names[0] if names else 0} and the data is not understood; if it holds units, give "
+            "them by --units or units_line (--columns FILE), else delete it"
+        )
     elif left:
-        h.tell(f"{h.path}: lines {', '.join(map(str, left[:6]))} above the data left out")
+        h.tell(f"{h.path}: left out above the data: line {', '.join(map(str, left[:6]))}")
 
 
 def _span(first: int, last: int) -> str:

@@ -25,11 +25,12 @@ __all__ = [
     "looks_like_time",
     "may_be_time",
     "to_seconds",
+    "unit_in_name",
 ]
 
 #: Names of time columns, in lower case and without blanks, underscores and hyphens.
 _NAMED = """
-time t timestamp datetime dateandtime timestamps datestamp timeutc utc utctime utcdatetime
+time timew t timestamp datetime dateandtime timestamps datestamp timeutc utc utctime utcdatetime
 datetimeutc timestamputc localtime systemtime unixtime epoch epochtime posixtime ts elapsed
 elapsedtime timeelapsed reltime relativetime testtime runtime recordtime seconds secs sec zeit
 zeitstempel datum date temps tiempo datumzeit timeofday
@@ -91,6 +92,13 @@ def is_time_name(name: str) -> bool:
     return re.sub(r"[ _/.\-]", "", name).lower() in _NAMES
 
 
+def unit_in_name(name: str) -> str | None:
+    """Return the unit of time that a name ends with or is: ``TimeMs``, ``msec``, ``Hours``."""
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name) or [""]
+    unit = unit_of(words[-1].lower()) if len(words[-1]) > 1 else None
+    return unit if unit is not None and UNITS[unit][0] == "s" else None
+
+
 def may_be_time(name: str) -> bool:
     """Tell whether a name has a word in it that names a time: ``LogTime``, ``time since start``."""
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
@@ -117,6 +125,7 @@ def to_seconds(
     form: str | None = None,
     zone: str | None = None,
     start: list[Start] | None = None,
+    utc: bool = False,
 ) -> np.ndarray:
     """Return times in seconds, NaN where there is none; dates count from the first.
 
@@ -128,6 +137,7 @@ def to_seconds(
         form: how dates are written, such as ``"%d.%m.%Y %H:%M:%S"``; decides what is ambiguous.
         zone: of dates without one: ``"UTC"``, ``"Europe/Berlin"``.
         start: takes the first instant where there are dates, and whether it is in UTC.
+        utc: whether dates, no text, are in UTC.
 
     Raises:
         DataError: what can be read in more than one way, or not at all.
@@ -135,13 +145,16 @@ def to_seconds(
     a = np.asarray(raw)
     start = [] if start is None else start
     if a.dtype == object:
+        utc = utc or any(getattr(c, "tzinfo", None) is not None for c in a)
         a = _narrowed(a)
     if a.dtype.kind == "m":
         tell(f"{what}: spans of time are taken in seconds")
         return _from_spans(a)
     if a.dtype.kind == "M":
+        if zone is not None and not utc:
+            return _told(import_module("pandas").DatetimeIndex(a), what, tell, zone, start)
         tell(f"{what}: dates are taken in seconds since the first, {_text(a)}")
-        return _from_dates(a, start, False)
+        return _from_dates(a, start, utc)
     if a.dtype == object:
         return _from_text(list(a), what, tell, form, zone, start)
     if form is not None and a.dtype.kind in "iuf":
@@ -150,7 +163,7 @@ def to_seconds(
     if a.dtype.kind == "b":
         raise DataError(f"{what}: truth values are no times")
     if unit is not None and re.search(r"\bsince\b", str(unit)):
-        return _since(a, str(unit), what, tell, start)
+        return _since(a, str(unit), what, tell, zone, start)
     if unit is None:
         return _plain(a, what, tell, start)
     return convert(_shifted(a), unit, "s", what) + _first(a, unit, what)
@@ -258,7 +271,9 @@ def _no_calendar(there: np.ndarray, what: str) -> None:
             )
 
 
-def _since(a: np.ndarray, unit: str, what: str, tell: Tell, start: list[Start]) -> np.ndarray:
+def _since(
+    a: np.ndarray, unit: str, what: str, tell: Tell, zone: str | None, start: list[Start]
+) -> np.ndarray:
     """CF convention, ``milliseconds since 2024-01-01``: the origin does not matter here."""
     name, origin = (part.strip() for part in re.split(r"\bsince\b", unit, maxsplit=1))
     known = unit_of(name)
@@ -268,23 +283,33 @@ def _since(a: np.ndarray, unit: str, what: str, tell: Tell, start: list[Start]) 
     tell(f"{what}: {unit!r}: taken in seconds since the first")
     there = np.flatnonzero(np.isfinite(a.astype(float)))
     if there.size:
-        start.extend(_origin(origin, float(a[there[0]]) * scale))
+        start.extend(_origin(origin, float(a[there[0]]) * scale, zone, what))
     return (a - a[there[0]]).astype(float) * scale if there.size else a.astype(float)
 
 
-def _origin(text: str, seconds: float) -> list[Start]:
+def _origin(text: str, seconds: float, zone: str | None, what: str) -> list[Start]:
     """The date that many seconds after the one of a CF unit, if that is an ISO date."""
     pd: Any = import_module("pandas")
 
     try:
         date = pd.to_datetime(text.replace("UTC", "Z").replace(" Z", "Z"), format="ISO8601")
-        zoned = date.tz is not None
-        date = date.tz_convert("UTC").tz_localize(None) if zoned else date
-        return [
-            ((date + pd.to_timedelta(seconds, "s")).to_datetime64().astype("datetime64[ns]"), zoned)
-        ]
     except (ValueError, OverflowError):
         return []
+    first = pd.DatetimeIndex([date + pd.to_timedelta(seconds, "s")])
+    first = _localised(first, what, zone) if first.tz is None and zone is not None else first
+    return [(_in_utc(first).astype("datetime64[ns]")[0], first.tz is not None)]
+
+
+def _localised(dates: Any, what: str, zone: str) -> Any:
+    try:
+        return dates.tz_localize(zone)
+    except Exception as e:  # unknown zones and times that do not exist, of many types
+        raise DataError(f"{what}: zone {zone!r}: {type(e).__name__}: {e}") from None
+
+
+def _in_utc(dates: Any) -> np.ndarray:
+    dates = dates if dates.tz is None else dates.tz_convert("UTC").tz_localize(None)
+    return np.asarray(dates.to_numpy())
 
 
 def _from_text(
@@ -373,13 +398,12 @@ def _day_first(there: list[str]) -> str | None:
     """The format of dates whose first or second number is above 12 somewhere; None if it is not."""
     found = re.match(r"\d{1,2}([./-])\d{1,2}[./-](\d{4}|\d{2})(?!\d)", there[0])
     pairs = [re.match(r"(\d{1,2})[./-](\d{1,2})[./-]", c) for c in there]
-    if found is None or not all(pairs):
+    if found is None or not all(pairs) or len(found[2]) == 2:
         return None
     first, second = (max(int(p[k]) for p in pairs if p) for k in (1, 2))
     if (first > 12) == (second > 12):
         return None
-    year, sep = "%Y" if len(found[2]) == 4 else "%y", found[1]
-    date = sep.join(("%d", "%m") if first > 12 else ("%m", "%d")) + sep + year
+    date = found[1].join(("%d", "%m", "%Y") if first > 12 else ("%m", "%d", "%Y"))
     rest = there[0][found.end() :]
     if re.fullmatch(r"[ T]\d{1,2}:\d{2}:\d{2}(\.\d+)?( [aApP][mM])?", rest):
         half = rest[-1] in "mM"
@@ -452,7 +476,8 @@ def _iso(
     try:
         dates = pd.to_datetime(clean, format="ISO8601", utc=all(zoned) or None)
     except (ValueError, OverflowError) as e:
-        raise DataError(f"{what}: {str(e).splitlines()[0]}") from None
+        why = str(e).splitlines()[0].partition(". You")[0]
+        raise DataError(f"{what}: {why}: correct it, or give --time-format") from None
     return _told(dates, what, tell, zone, start)
 
 
@@ -472,10 +497,7 @@ def _told(dates: Any, what: str, tell: Tell, zone: str | None, start: list[Start
     """Seconds since the first date; local times over a change of the clocks need a zone."""
     there = dates[~dates.isna()]
     if dates.tz is None and zone is not None:
-        try:
-            dates = dates.tz_localize(zone)
-        except Exception as e:  # unknown zones and times that do not exist, of many types
-            raise DataError(f"{what}: zone {zone!r}: {type(e).__name__}: {e}") from None
+        dates = _localised(dates, what, zone)
         there = dates[~dates.isna()]
     elif dates.tz is None and len(there) > 2:
         step = np.diff(there.to_numpy()) / np.timedelta64(1, "s")
@@ -489,7 +511,4 @@ def _told(dates: Any, what: str, tell: Tell, zone: str | None, start: list[Start
                 "--steady"
             )
     tell(f"{what}: dates are taken in seconds since the first, {there[0]}")
-    zoned = dates.tz is not None
-    if zoned:
-        dates = dates.tz_convert("UTC").tz_localize(None)
-    return _from_dates(dates.to_numpy(), start, zoned)
+    return _from_dates(_in_utc(dates), start, dates.tz is not None)
