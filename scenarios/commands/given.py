@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.gaspath.steady.steadypoint import Limits
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.enginefile import Engine
@@ -165,6 +166,20 @@ def load(args: Namespace) -> Load:
     if isinstance(load, Varying):
         raise PlacedError("--load", f"must not change in time here, got {load.label}")
     return load
+
+
+def fault(args: Namespace) -> Fault | None:
+    """Return the fault of each generator that ``--fault`` describes by the keys of a scenario."""
+    from apu_casadi.core.profiles.profile import Varying
+    from scenarios.reading import PlacedError, read_fault
+
+    parts(args)
+    if args.fault is None:
+        return None
+    found = read_fault(args.fault, "--fault")
+    if isinstance(found, Varying):
+        raise PlacedError("--fault", f"must not change in time here, got {found.label}")
+    return found
 
 
 def power_load(unit: Apu, P: float, power_factor: float = 1.0) -> Load:
