@@ -20,19 +20,25 @@ from apu_casadi.gaspath.health import HEALTH_FACTORS
 from apu_casadi.machine.faults.fault import FAULTS, Fault
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
-from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO
+from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST, STARTS
 from scenarios.reading import DEFAULT_FAULT, names_of
 from scenarios.schema import CHANGES, EXCHANGES, FILE_KEYS, Change, Phase, Scenario
 
 Table = dict[str, Any]
+_GENERATOR = {"$ref": "#/definitions/generator"}
+_HEALED = ("kind", "generator")
 _NONE = {"const": "none", "description": "healthy again"}
 
 
 def file_schema() -> Table:
     """Return the schema (JSON Schema, draft 7) of a scenario file."""
+    number = {"type": "integer", "minimum": 1, "maximum": MOST, "description": "of a generator"}
+    one_load = _load()
+    several = {"type": "array", "items": one_load, "minItems": 1, "maxItems": MOST}
     definitions = {
-        "load": _load(),
+        "load": {"anyOf": [one_load, several | {"description": "one for each generator"}]},
         "fault": _fault(),
+        "generator": number,
         "health": _health(),
         "profile": _profile(),
         "N_ref_rpm": _varies(_number(0.0, open_lo=True, unit="r/min")),
@@ -124,12 +130,17 @@ def _load() -> Table:
 
 
 def _fault() -> Table:
-    each = ((kind, FAULTS[kind]) for kind in FAULTS)
-    kinds = []
-    for kind, cls in each:
+    kinds, of_one = [], [_object({"kind": {"const": "none"}, "generator": _GENERATOR}, _HEALED)]
+    for kind, cls in ((kind, FAULTS[kind]) for kind in FAULTS):
         other = [tuple(new if k.name == n else k for k in cls.keys) for n, new in _instead(cls)]
-        kinds += [_part(kind, k, cls, optional=kind == DEFAULT_FAULT) for k in (cls.keys, *other)]
-    return {"anyOf": [*kinds, _NONE]}
+        for keys in (cls.keys, *other):
+            made = _part(kind, keys, cls, optional=kind == DEFAULT_FAULT)
+            kinds.append(made)
+            own = {**made["properties"], "generator": _GENERATOR}
+            required = [*made.get("required", ()), "generator"]
+            of_one.append(made | {"properties": own, "required": required})
+    several = {"type": "array", "items": {"anyOf": of_one}, "minItems": 1, "maxItems": MOST}
+    return {"anyOf": [*kinds, *of_one, several, _NONE]}
 
 
 def _instead(cls: type[Fault]) -> Sequence[tuple[str, Key]]:
@@ -157,7 +168,8 @@ def _row(cls: type) -> Table:
     """Return phases or events."""
     own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]
     text = {n: {"type": "string", "minLength": 1} for n in own if n == "name"}
-    changes = {n: {"$ref": f"#/definitions/{n}"} for n in CHANGES}
+    names = [n for n in names_of(cls) if n in (*CHANGES, "generator")]
+    changes = {n: {"$ref": f"#/definitions/{n}"} for n in names}
     item = _object(text | _numbers(cls) | changes, own)
     return {"type": "array", "items": item, "description": (cls.__doc__ or "").split("\n")[0]}
 
@@ -187,7 +199,14 @@ def _parameters() -> Table:
         part, _, last = name.partition(".")
         table[name] = one
         table.setdefault(part, _object({}))["properties"][last] = one
-    return _object(table)
+    own = {n: table[n] for n in ("machine", "exciter", "coupling")}
+    own["neutral"] = table["generator.neutral"]
+    dotted = "|".join(f"{s}\\.{n}" for s in own if s != "neutral" for n in own[s]["properties"])
+    patterns = {
+        f"^generator[1-{MOST}]$": _object(own),
+        rf"^generator[1-{MOST}]\.({dotted}|neutral)$": {"type": ["number", "string"]},
+    }
+    return _object(table, patternProperties=patterns)
 
 
 def _scenario() -> Table:
@@ -204,6 +223,7 @@ def _scenario() -> Table:
         "phase": _row(Phase) | {"minItems": 1},
         "event": _row(Change),
         "exchange": {"enum": list(EXCHANGES)},
+        "start_from": {"enum": list(STARTS)},
         "noise": _noise(),
         "seed": {"type": "integer", "minimum": 0},
         "parameters": _parameters(),

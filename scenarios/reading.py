@@ -10,13 +10,14 @@ import dataclasses
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import Profile, Varying, profile_from_table
 from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table, fault_of
 from apu_casadi.machine.loads.load import LOADS, Load, load_from_table, load_of
+from apu_casadi.unit.events import MOST
 from scenarios import extensions
 
 if TYPE_CHECKING:
@@ -195,6 +196,80 @@ def _kind(data: Mapping[str, Any], known: Mapping[str, Any], default: str | None
     kind = text_of(data.get("kind", default), "kind")
     require(kind in known, "kind", f"unknown {kind!r} {nearest(kind, known)}")
     return kind
+
+
+class FaultOf(NamedTuple):
+    """The fault of one generator, or None: it is healthy."""
+
+    generator: int
+    fault: Fault | Varying[Fault | None] | None
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the table that :func:`read_faults` reads."""
+        own = {"kind": "none"} if self.fault is None else self.fault.to_table()
+        return {"generator": self.generator, **own}
+
+
+def number_of(value: Any, place: str) -> int:
+    """Return the number of a generator."""
+    whole = isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST
+    require(whole, place, f"the number of a generator, 1 to {MOST}, is expected, got {value!r}")
+    return int(value)
+
+
+def read_loads(data: Any) -> Any:
+    """Return the load of all generators, or a tuple with one for each where a list is given.
+
+    Raises:
+        ScenarioError: as :func:`read_load`, or an empty list or one that is too long.
+    """
+    if not isinstance(data, list | tuple):
+        return read_load(data)
+    n = len(data)
+    require(1 <= n <= MOST, "load", f"1 to {MOST} loads, one for each generator, got {n}")
+    return tuple(read_load(each, f"load[{i}]") for i, each in enumerate(data, 1))
+
+
+def read_faults(data: Any) -> Any:
+    """Return the fault of all generators, or those of single ones, each a :class:`FaultOf`.
+
+    Args:
+        data: a fault or its table; one with ``generator``, or a list of such; in Python also a
+            mapping by number of the generator.
+
+    Raises:
+        ScenarioError: as :func:`read_fault`, or two faults of one generator.
+    """
+    if isinstance(data, Mapping) and data and all(isinstance(k, int) for k in data):
+        rows: list[Any] = [FaultOf(k, v) for k, v in data.items()]
+    elif isinstance(data, list | tuple):
+        rows = list(data)
+    elif isinstance(data, Mapping) and "generator" in data:
+        rows = [data]
+    else:
+        return read_fault(data)
+    require(bool(rows), "fault", "an empty list")
+    one = len(rows) == 1 and isinstance(data, Mapping)
+    found: dict[int, FaultOf] = {}
+    for i, row in enumerate(rows, 1):
+        place = "fault" if one else f"fault[{i}]"
+        made = _fault_of(row, place)
+        twice = f"generator {made.generator} has a fault already; a machine has one at a time"
+        require(made.generator not in found, f"{place}.generator", twice)
+        found[made.generator] = made
+    return tuple(found[k] for k in sorted(found))
+
+
+def _fault_of(row: Any, place: str) -> FaultOf:
+    if isinstance(row, FaultOf):
+        k, fault = number_of(row.generator, f"{place}.generator"), row.fault
+        healthy = fault is None or isinstance(fault, str)
+        return FaultOf(k, None if healthy else read_fault(fault, place))
+    missing = "missing: which generator has it? Without a list, a fault is of all"
+    require(isinstance(row, Mapping) and "generator" in row, f"{place}.generator", missing)
+    own = {k: v for k, v in row.items() if k != "generator"}
+    number = number_of(row["generator"], f"{place}.generator")
+    return FaultOf(number, None if own == {"kind": "none"} else read_fault(own, place))
 
 
 def read_noise(data: Any) -> Noise:

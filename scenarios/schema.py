@@ -8,7 +8,7 @@ A TOML file reads like this::
     [[phase]]
     name = "full load"
     start = 0.0                         # s
-    load = { kind = "R", power_kW = 225.0 }   # of each of the two generators
+    load = { kind = "R", power_kW = 225.0 }   # of each generator
     [[phase]]
     name = "TTSC"
     start = 3.0
@@ -16,6 +16,11 @@ A TOML file reads like this::
     [[event]]                           # a change inside a phase
     time = 4.0
     load = { kind = "RL", power_kW = 100.0, power_factor = 0.85 }
+
+Generators may differ: ``load = [ {...}, {...} ]`` has one load for each, ``fault = { generator = 2,
+... }`` or a list of such has faults of single ones, and an event with ``generator = 2`` is of that
+one.  How many there are, and what they have different, ``[parameters]`` says: ``generator.count``,
+``generator2.machine.r_s``.
 
 A number of a load, a fault, the health, the day, and ``N_ref_rpm`` (r/min, of the governor) may be
 a table: a profile of time (:mod:`apu_casadi.core.profiles.profile`), which begins with its phase or
@@ -56,6 +61,7 @@ from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import (
+    STARTS,
     Ambient,
     Event,
     FaultChange,
@@ -69,6 +75,7 @@ from apu_casadi.unit.exchange import OFFERED
 from apu_casadi.unit.shippedunits import is_name
 from scenarios import extensions
 from scenarios.reading import (
+    FaultOf,
     PlacedError,
     check_numbers,
     files_seen_from,
@@ -76,9 +83,10 @@ from scenarios.reading import (
     limits,
     load_parts,
     names_of,
+    number_of,
     of_profiles,
-    read_fault,
-    read_load,
+    read_faults,
+    read_loads,
     read_noise,
     read_profile,
     require,
@@ -97,6 +105,7 @@ EXCHANGES = OFFERED
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 Health = Mapping[str, Any] | Literal["none"]
+OneLoad = Load | Varying[Load]
 
 
 # ------------------------------------------------------------------------------ phases, events
@@ -120,15 +129,15 @@ class _Change(_Plain):
     """What a phase or an event changes; None leaves as it is, ``"none"`` restores health.
 
     Args:
-        load: electrical load of each of the two generators.
+        load: electrical load of each generator, or a list with one for each.
         health: health factors of the gas path, 1 when healthy.
-        fault: fault of the machine.
+        fault: fault of all generators, or those of single ones (:func:`read_faults`).
         N_ref_rpm: speed of the rotor that the governor holds.
     """
 
-    load: Load | Varying[Load] | None = field(default=None, kw_only=True)
+    load: OneLoad | tuple[OneLoad, ...] | None = field(default=None, kw_only=True)
     health: Health | None = field(default=None, kw_only=True, hash=False)
-    fault: Fault | Varying[Fault | None] | Literal["none"] | None = field(
+    fault: Fault | Varying[Fault | None] | tuple[FaultOf, ...] | Literal["none"] | None = field(
         default=None, kw_only=True
     )
     N_ref_rpm: float | Profile | None = field(default=None, kw_only=True)
@@ -137,9 +146,9 @@ class _Change(_Plain):
         """Check the numbers; make load and fault of their tables."""
         check_numbers(self)
         if self.load is not None:
-            ok = isinstance(self.load, Load | Varying | Mapping)
+            ok = isinstance(self.load, Load | Varying | Mapping | list | tuple)
             require(ok, "load", f"a Load, or a table with kind, is expected, got {self.load!r}")
-            object.__setattr__(self, "load", read_load(self.load))
+            object.__setattr__(self, "load", read_loads(self.load))
         if isinstance(self.health, Mapping):
             with inside("health"):
                 given = {k: read_profile(v, str(k)) for k, v in self.health.items()}
@@ -148,7 +157,7 @@ class _Change(_Plain):
             text = f'a table of factors, or "none", expected: {self.health!r}'
             raise PlacedError("health", text)
         if self.fault is not None and self.fault != "none":
-            object.__setattr__(self, "fault", read_fault(self.fault))
+            object.__setattr__(self, "fault", read_faults(self.fault))
         if self.N_ref_rpm is not None:
             speed = read_profile(self.N_ref_rpm, "N_ref_rpm")
             speed = number_or_profile(speed, "N_ref_rpm", lo=0.0, open_lo=True, unit="r/min")
@@ -158,7 +167,7 @@ class _Change(_Plain):
     def from_dict(cls, data: Any, place: str) -> Self:
         """Make it from a table; :class:`ScenarioError` for a wrong key or value."""
         own = [f.name for f in dataclasses.fields(cls) if not f.kw_only]
-        table = table_of(data, place, (*own, *CHANGES))
+        table = table_of(data, place, names_of(cls))
         label = table.get("name")
         with inside(place, f" (phase {label!r})" if isinstance(label, str) and label else ""):
             for k in own:
@@ -179,6 +188,13 @@ class _Change(_Plain):
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if not f.kw_only}
         return {**own, **self.changes()}
 
+    def touched(self) -> Iterator[tuple[str, int | None]]:
+        """Yield what changes, each with the number of a generator; None: of all, or the unit's."""
+        for name in self.changes():
+            value, k = getattr(self, name), getattr(self, "generator", None)
+            single = name == "fault" and isinstance(value, tuple)
+            yield from ((name, v.generator) for v in value) if single else [(name, k)]
+
 
 CHANGES = tuple(f.name for f in dataclasses.fields(_Change))
 """What a phase or an event may change."""
@@ -188,6 +204,8 @@ def _plain(value: Any) -> Any:
     """Return a value as files have it."""
     if isinstance(value, Mapping):
         return {k: _plain(v) for k, v in value.items()}
+    if type(value) is tuple:
+        return [_plain(v) for v in value]
     return value.to_table() if hasattr(value, "to_table") else value
 
 
@@ -219,17 +237,32 @@ class Change(_Change):
     Args:
         time: instant at which it takes effect.
         load, health, fault, N_ref_rpm: what changes then.
+        generator: number of the generator whose load and fault change; None: of all.
 
     Raises:
         ScenarioError: a time that is not positive, no change at all, or a wrong change.
     """
 
     time: float = field(metadata=limits(lo=0.0, open_lo=True, unit="s"))
+    generator: int | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.generator is not None:
+            number_of(self.generator, "generator")
+            for name in ("load", "fault"):
+                ok = not isinstance(getattr(self, name), tuple)
+                require(ok, name, f"of several generators, in an event of {self.generator}")
+            rest = set(self.changes()) - {"load", "fault"}
+            text = f"no generator has {' and '.join(sorted(rest))}: give an event of its own"
+            require(not rest, "generator", text)
         text = "nothing changes then: give load, health, fault or N_ref_rpm"
         require(bool(self.changes()), "time", text)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the table that :meth:`from_dict` reads."""
+        own = {} if self.generator is None else {"generator": self.generator}
+        return super().to_dict() | own
 
 
 # ------------------------------------------------------------------------------ scenario
@@ -251,6 +284,8 @@ class Scenario(_Plain):
         waveform_dt: sampling step of the waveforms; None for no waveforms (0 in a file).
         exchange: how speed and fuel pass between the two parts: ``paper``, ``predicted`` or
             ``corrected``, see :func:`apu_casadi.unit.multirate.simulate_joint`.
+        start_from: ``balanced``, where a fault or an unbalanced load of the start acts from t = 0
+            on a healthy unit, or ``settled``, where it has been there for long.
         noise: process and measurement noise; None for none.
         seed: seed of the noise.
         parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
@@ -274,6 +309,7 @@ class Scenario(_Plain):
     dt: float = field(default=0.02, metadata=limits(lo=1e-4, hi=0.2, unit="s"))
     waveform_dt: float | None = field(default=50e-6, metadata=limits(lo=1e-6, unit="s"))
     exchange: str = "paper"
+    start_from: str = "balanced"
     noise: Noise | None = field(default=None, hash=False)
     seed: int | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -301,6 +337,8 @@ class Scenario(_Plain):
         text_of(self.exchange, "exchange")
         hint = f"unknown {self.exchange!r} {nearest(self.exchange, EXCHANGES)}"
         require(self.exchange in EXCHANGES, "exchange", hint)
+        hint = f"unknown {self.start_from!r} {nearest(str(self.start_from), STARTS)}"
+        require(self.start_from in STARTS, "start_from", hint)
         if self.seed is not None:
             whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
             require(whole and self.seed >= 0, "seed", f"a whole number >= 0, got {self.seed!r}")
@@ -349,13 +387,33 @@ class Scenario(_Plain):
             names.append(p.name)
 
     def _check_changes(self) -> None:
-        taken = {(p.start, k) for p in self.phases for k in p.changes()}
+        taken = [(p.start, *of) for p in self.phases for of in p.touched()]
         for i, c in enumerate(self.changes, 1):
             require(c.time < self.duration, f"event[{i}].time", self._beyond(c.time))
-            for k in c.changes():
-                text = f"a second change of {k} at {c.time:g} s; keep one"
-                require((c.time, k) not in taken, f"event[{i}].{k}", text)
-                taken.add((c.time, k))
+            for name, k in c.touched():
+                of = "" if k is None else f" of generator {k}"
+                text = f"a second change of {name}{of} at {c.time:g} s; keep one"
+                same = [j for t, n, j in taken if (t, n) == (c.time, name)]
+                ok = all(None not in (j, k) and j != k for j in same)
+                require(ok, f"event[{i}].{name}", text)
+            taken += [(c.time, *of) for of in c.touched()]
+        n = self.parameters.get("generator.count", 2)
+        if self.engine is None and isinstance(n, int):
+            self._check_generators(n)
+
+    def _check_generators(self, n: int) -> None:
+        """Refuse loads and faults of generators that a unit of ``n`` has not."""
+        parts: list[tuple[str, _Change]] = [
+            *((f"phase[{i}]", p) for i, p in enumerate(self.phases, 1)),
+            *((f"event[{i}]", c) for i, c in enumerate(self.changes, 1)),
+        ]
+        for place, c in parts:
+            if isinstance(c.load, tuple):
+                text = f"{len(c.load)} loads, but the unit has {n} generators"
+                require(len(c.load) == n, f"{place}.load", text)
+            for name, k in c.touched():
+                text = f"generator {k}, but the unit has 1 to {n}"
+                require(k is None or k <= n, f"{place}.{name}", text)
 
     def _beyond(self, t: float) -> str:
         return f"{t:g} s is not before the end of the run at {self.duration:g} s"
@@ -447,6 +505,8 @@ class Scenario(_Plain):
         table |= {"phase": [p.to_dict() for p in self.phases]}
         if self.exchange != "paper":
             table["exchange"] = self.exchange
+        if self.start_from != "balanced":
+            table["start_from"] = self.start_from
         noise = {} if self.noise is None else dataclasses.asdict(self.noise)
         more = {
             "event": [c.to_dict() for c in self.changes],
@@ -492,7 +552,11 @@ class Scenario(_Plain):
         first = self.phases[0]
         health = dict(first.health) if isinstance(first.health, Mapping) else None
         N_ref = None if first.N_ref_rpm is None else _rad_s(first.N_ref_rpm)
-        start = {"load": first.load, "health": health, "fault": _there(first.fault)}
+        fault = _there(first.fault)
+        if isinstance(fault, tuple):
+            fault = {f.generator: f.fault for f in fault}
+        start = {"load": first.load, "health": health, "fault": fault}
+        start |= {} if self.start_from == "balanced" else {"start_from": self.start_from}
         return start if N_ref is None else {**start, "N_ref": N_ref}
 
     def events(self) -> tuple[Event, ...]:
@@ -509,12 +573,16 @@ class Scenario(_Plain):
                 health = {**health, **(healthy if c.health == "none" else c.health)}
             if t == 0.0:
                 continue
-            if c.load is not None:
-                events.append(LoadChange(t, c.load))
+            if isinstance(c.load, tuple):
+                events += [LoadChange(t, x, k) for k, x in enumerate(c.load, 1)]
+            elif c.load is not None:
+                events.append(LoadChange(t, c.load, getattr(c, "generator", None)))
             if c.health is not None:
                 events.append(HealthChange(t, dict(health)))
-            if c.fault is not None:
-                events.append(FaultChange(t, _there(c.fault)))
+            if isinstance(c.fault, tuple):
+                events += [FaultChange(t, _there(f.fault), f.generator) for f in c.fault]
+            elif c.fault is not None:
+                events.append(FaultChange(t, _there(c.fault), getattr(c, "generator", None)))
             if c.N_ref_rpm is not None:
                 events.append(SpeedChange(t, _rad_s(c.N_ref_rpm)))
         return tuple(events)

@@ -9,15 +9,20 @@ from numpy.testing import assert_allclose
 from odd_engine import changed, odd_engine
 
 from apu_casadi import Apu, SeriesLoad, simulate_joint
-from apu_casadi.core import backend
 from apu_casadi.core.errors import ParameterError, SignalError
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.unitnumbers import GIVEN
+from apu_casadi.machine.machinedata import MACHINE, MachineParameters
+from apu_casadi.machine.terminals import terminal_model
 from apu_casadi.unit.control import GovernorParameters
+from estimators.apu.electrical.electricalfilter import electrical_filter
+from estimators.apu.electrical.machinemodel import electrical_model
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.gaspathmodel import gas_path_model
-from estimators.filters.ekf import ekf_step
+from estimators.apu.joint import electrical_samples
+from estimators.apu.sensors import ELECTRICAL
+from estimators.filters.ekf import ekf_step, extended_kalman_filter
 from estimators.filters.filtering import FilterStep
 from estimators.filters.ukf import ukf_step
 from estimators.models.filtermodel import (
@@ -35,6 +40,9 @@ from estimators.models.recording import record
 # what none of the filter's outputs depends on: surge margins, and a pressure beside the gas path
 IDLE = ["gas_generator.Ps3_P3", "compressor_map.k_SM", "compressor_map.a_SM"]
 IDLE += ["turbine_map.k_SM", "turbine_map.a_SM"]
+# what the electrical filter does not depend on; the efficiency without power, the rated frequency
+# without a leaky fault
+NO_MATTER = [f"machine.{n}" for n in ("n_pp", "V_rated_rms", "P_rated", "eta_sg", "f_rated")]
 KW100 = SeriesLoad.from_power(100e3)
 
 
@@ -103,17 +111,18 @@ def truth():
 
 
 @pytest.mark.parametrize("step", [None, ukf_step])
-def test_another_engine_builds_and_compiles_nothing(truth, step, monkeypatch):
+def test_another_engine_builds_and_compiles_nothing(truth, step, asked, monkeypatch):
     """The block of the second engine's filter is the first one's; its beliefs are its own."""
     how = {"gains": False, "inertia": None}
     first = gas_path_filter(**how)
     data = first.recording(truth, 1)
     r = first.run(data, step=step)
-    monkeypatch.setattr(backend, "_compile", None)
+    before = set(asked)
     monkeypatch.setattr(FilterModel, "expanded", None)  # what every new step begins with
     other = gas_path_filter(Apu().change({"gas_generator.eta_c": 0.84}).gas_generator, **how)
     assert other.model.shared is first.model.shared
     assert np.abs(other.run(data, step=step)["f_eta_c"][0] - r["f_eta_c"][0]).max() > 1e-3
+    assert before and asked == before
 
 
 def test_a_parameter_of_the_engine_is_a_state_of_the_filter():
@@ -144,6 +153,107 @@ def test_what_cannot_be_free_is_told():
     for name in IDLE:
         with pytest.raises(ParameterError, match=f"no derivatives by {name}"):
             gas_path_filter(free={name: Unknown()})
+
+
+# ------------------------------------------------------------------------------ electrical
+
+
+def moved(p: MachineParameters, name: str, value: float) -> MachineParameters:
+    """Return the machine with one number replaced, pole pairs and limits among them."""
+    return p.symbolic(**{name.partition(".")[2]: value})
+
+
+@pytest.mark.parametrize(
+    "how", [{}, {"power": True, "gains": "estimate"}, {"kappa": 0.5, "phase": "b"}]
+)
+def test_derivatives_of_the_electrical_filter_by_every_parameter_are_exact(how):
+    """Transition and output by all parameters of the machine, against machines made with them."""
+    kappa, gained = how.get("kappa"), "gains" in how
+    args = ELECTRICAL, "power" in how, kappa, how.get("phase"), gained
+    machine = MachineParameters()
+    model = electrical_model(machine, *args)
+    idle = NO_MATTER[: 4 if kappa else 5]
+    if "power" in how:
+        idle.remove("machine.eta_sg")
+    free = augment(model, {n: Unknown() for n in MACHINE.names if n not in idle})
+    for name in idle:
+        with pytest.raises(ParameterError, match=f"no derivatives by {name}: nothing"):
+            augment(model, {name: Unknown()})
+    rng = np.random.default_rng(5)
+    x = model.x.nominals * rng.uniform(0.3, 0.9, len(model.x))
+    u = model.u.nominals * rng.uniform(0.3, 0.9, len(model.u))
+    u[[i for i, n in enumerate(model.u.names) if n.startswith("dt")]] = 1e-4
+    p = np.full(len(model.p), 3e-3)
+    w = rng.standard_normal(len(model.w))
+    names = free.x.names[len(x) :]
+    given = np.array([machine.held("machine")[n] for n in names])
+    s = ca.SX.sym("x", len(free.x))
+    both = [free.transition(s, u, p, w, 1e-4)[0][: len(x)], free.output(s, u, p, w)[0]]
+    J = ca.Function("J", [s], [ca.jacobian(ca.vertcat(*both), s)])(np.append(x, given)).full()
+    for k, name in enumerate(names):
+        h = 1e-5 * given[k]
+        ends = []
+        for value in (given[k] + h, given[k] - h):
+            unit = electrical_model(moved(machine, name, value), *args)
+            ends.append(step_of(unit, x, u, w, 1e-4, p))
+        off = (ends[0] - ends[1]) / (2 * h) - J[:, len(x) + k]
+        rounding = 1e-10 * np.abs(ends[0]) / h
+        assert (np.abs(off) <= 1e-6 * np.abs(J[:, len(x) + k]).max() + rounding).all(), name
+
+
+@pytest.mark.parametrize("fault", ["shunts", "leaky"])
+def test_derivatives_of_the_terminal_model_by_every_parameter_are_exact(fault):
+    """Rates and outputs of the family by all parameters, against models of machines made so."""
+    machine = MachineParameters()
+    ss = terminal_model(machine, fault)
+    rng = np.random.default_rng(6)
+    x, u = (s.nominals * rng.uniform(0.3, 0.9, len(s)) for s in (ss.x, ss.u))
+    theta = np.array([0.05, 1.0, 0.5, 0.3])[: len(ss.theta)]
+    full, t = ss.full(theta), ca.SX.sym("t", len(ss.shared.theta))
+    both = ca.vertcat(ss.shared.f(x, u, t), ss.shared.g(x, u, t))
+    J = ca.Function("J", [t], [ca.jacobian(both, t)])(full).full()[:, len(theta) :]
+    for k, (name, value) in enumerate(machine.held("machine").items()):
+        h, ends = 1e-5 * value, []
+        for v in (value + h, value - h):
+            unit = terminal_model(moved(machine, name, v), fault)
+            ends.append(np.concatenate([flat(unit.f(x, u, theta)), flat(unit.g(x, u, theta))]))
+        off = (ends[0] - ends[1]) / (2 * h) - J[:, k]
+        rounding = 1e-10 * np.abs(ends[0]) / h
+        assert (np.abs(off) <= 1e-6 * np.abs(J[:, k]).max() + rounding).all(), name
+
+
+@pytest.fixture(scope="module")
+def terminals():
+    """Terminals of a machine of stator resistance 0.005 ohm over 0.2 s, measured."""
+    unit = Apu().change({"machine.r_s": 0.005})
+    ds = simulate_joint(unit, duration=0.2, load=KW100, waveform_dt=1e-4)
+    return electrical_samples(ds, unit, np.random.default_rng(3))
+
+
+def test_another_machine_builds_and_compiles_nothing(terminals, asked):
+    """The block of the second machine's filter is the first one's; its beliefs are its own."""
+    first = electrical_filter(power=True)
+    data, prior = first.recording(terminals), first.prior(terminals)
+    r = extended_kalman_filter(first.model, prior, data)
+    before = set(asked)
+    other = electrical_filter(MachineParameters(r_s=0.005), power=True)
+    again = extended_kalman_filter(other.model, other.prior(terminals), data)
+    assert other.model.shared is first.model.shared
+    assert np.abs(again["h_a"][0] - r["h_a"][0]).max() > 1e-5
+    assert again.loglik > r.loglik
+    assert before and asked == before
+
+
+def test_a_parameter_of_the_machine_is_a_state_of_the_filter(terminals):
+    """The stator resistance, as a random walk, is found in a machine that has another one."""
+    filt = electrical_filter(
+        phases=(), free={"machine.r_s": Unknown(walk=1e-5, lower=1e-4, upper=0.1)}
+    )
+    prior = filt.prior(terminals)
+    assert prior["machine.r_s"] == pytest.approx((0.0044, 0.00044))
+    found = extended_kalman_filter(filt.model, prior, filt.recording(terminals), backend="vm")
+    mean, sigma = (float(v[-1]) for v in found["machine.r_s"])
+    assert sigma < 4e-4 and abs(mean - 0.005) < 4 * sigma
 
 
 # ------------------------------------------------------------------------------ in general

@@ -61,7 +61,8 @@ BELOW: dict[str, tuple[str, ...]] = {
     "scenarios.studies": STUDIES,
     "scenarios.bench": STUDIES,
     "scenarios.pages": STUDIES,
-    "scenarios.commands": (*PAGES, "apu_casadi"),
+    "scenarios.export": (*ESTIMATORS, *SHELL),
+    "scenarios.commands": (*PAGES, "apu_casadi", "scenarios.export"),
     "scenarios.cli": (*SHELL, "scenarios.commands"),
 }
 # who may import a package of others' code; all others may not

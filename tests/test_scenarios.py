@@ -274,14 +274,13 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
         given["progress"](0.1, 0.1)
         return results.dataset({"time": np.array([0.0, 0.02])}, {"time": {"N": 3775.0}})
 
-    apu = types.ModuleType("apu_casadi.unit.apu")
-    apu.Apu = Unit
     multirate = types.ModuleType("apu_casadi.unit.multirate")
     multirate.simulate_joint = simulate_joint
-    monkeypatch.setitem(sys.modules, "apu_casadi.unit.apu", apu)
     monkeypatch.setitem(sys.modules, "apu_casadi.unit.multirate", multirate)
     # units are kept between runs: this stand-in must not stay
     monkeypatch.setattr(registry, "unit_of", registry.unit_of.__wrapped__)
+    engine = types.SimpleNamespace(unit=Unit(), assumed=())
+    monkeypatch.setattr(registry, "engine_file", lambda name: engine)
     ds = registry.run(
         "joint",
         waveform_dt=None,

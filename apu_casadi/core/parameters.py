@@ -10,7 +10,9 @@ import dataclasses
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, TypeVar
+
+import casadi as ca
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError, nearest
@@ -104,6 +106,10 @@ class Parameters:
         new.__dict__.update({n: values.get(n, getattr(self, n)) for n in names})
         return new
 
+    def held(self, prefix: str) -> dict[str, float]:
+        """Return its numbers by dotted name, as ``machine.r_s``."""
+        return {f"{prefix}.{row[0]}": row[1] for row in self.table()}
+
     def table(self) -> list[tuple[str, float, str, str, str]]:
         """Return rows (name, value, unit, meaning, source), for printing and for file headers."""
         return [
@@ -112,3 +118,12 @@ class Parameters:
             for f in dataclasses.fields(self)
             if "unit" in f.metadata
         ]  # fmt: skip
+
+
+P = TypeVar("P", bound=Parameters)
+
+
+def of_symbols(cls: type[P], values: Any, **others: Any) -> P:
+    """Return a parameter set whose numbers are symbols, in the order of its fields."""
+    names = [f.name for f in dataclasses.fields(cls) if "unit" in f.metadata]
+    return cls().symbolic(**dict(zip(names, ca.vertsplit(values), strict=True)), **others)

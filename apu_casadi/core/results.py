@@ -304,12 +304,10 @@ _MEANS = (
     ("T4", "T4", 1.0),
     ("T5", "T5", 1.0),
     ("SM_percent", "SM", 100.0),
-    *((f"V_{p}_rms", f"V_{p}_rms", 1.0) for p in "abc"),
-    *((f"I_{p}_rms", f"I_{p}_rms", 1.0) for p in "abc"),
-    ("P_e", "P_e", 1.0),
-    ("P_loss_fault", "P_loss_fault", 1.0),
 )
+_MEANS_OF_EACH = (*(f"{q}_{p}_rms" for q in "VI" for p in "abc"), "P_e", "P_loss_fault")
 _HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
+_SEVERITY = ("mu", "k_rf", "kappa")
 _HEALTHY_NAN = ("k_rf", "kappa")
 
 
@@ -337,10 +335,10 @@ class _Columns:
         return values
 
 
-def _holding(ds: xr.Dataset, attribute: str, key: str, end: float) -> str | None:
-    """Return what the run's attribute says of the time just before ``end`` [s]."""
+def _holding(ds: xr.Dataset, attribute: str, key: str, end: float, number: int) -> str | None:
+    """Return what the run's attribute says of a generator just before ``end`` [s]."""
     try:
-        rows = json.loads(ds.attrs[attribute])
+        rows = [r for r in json.loads(ds.attrs[attribute]) if r.get(GENERATOR, number) == number]
         held = [r for r in rows if float(r["t"]) < end - 1e-9]
         return None if held[-1][key] is None else str(held[-1][key])
     except (KeyError, TypeError, ValueError, IndexError):
@@ -357,18 +355,21 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
     (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
     and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
+    Where generators differ, all that is of a generator is in ``generators`` instead: a list with
+    one table for each, which has its number as ``generator``.
 
     Raises:
         DataError: a variable is missing, is not finite or no number, or a phase holds no sample.
     """
-    needed = [v for _, v, _ in _MEANS] + ["mu", "k_rf", "kappa", *_HEALTH]
+    needed = [v for _, v, _ in _MEANS] + [*_MEANS_OF_EACH, *_SEVERITY, *_HEALTH]
     missing = [v for v in needed if v not in ds]
     if missing:
         raise DataError(f"{_source(ds)}the dataset lacks {', '.join(missing)}")
     spans = phases(ds)
     t = ds["time"].values
     tol = 1e-9
-    col = _Columns(ds)
+    col, numbers = _Columns(ds), generators_of(ds)
+    each = {k: _Columns(of_generator(ds, k)) for k in numbers}
     rows = []
     for k, p in enumerate(spans):
         # a sample is the end of a step: the one at a boundary belongs to the earlier phase
@@ -391,8 +392,29 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         row["SM_percent_min"] = float(inside["SM"].min() * 100.0)
         end = int(np.flatnonzero(tail)[-1])
         row.update({v: float(col[v][end]) for v in _HEALTH})
-        row.update(severity(*(float(col[v][end]) for v in ("mu", "k_rf", "kappa"))))
-        row["fault_phase"] = _holding(ds, "faults", "phase", p["end"]) if row["mu"] else None
-        row["load"] = _holding(ds, "loads", "load", p["end"])
+        of_each = [
+            _of_one(each[k], tail, end) | _held(ds, each[k], end, p["end"], k) for k in numbers
+        ]
+        if GENERATOR in ds.coords:
+            row["generators"] = [
+                {GENERATOR: k, **own} for k, own in zip(numbers, of_each, strict=True)
+            ]
+        else:
+            row |= of_each[0]
         rows.append(row)
     return rows
+
+
+def _of_one(col: _Columns, tail: np.ndarray, end: int) -> dict[str, Any]:
+    """Return means over the end of a phase of one generator, and the severity of its fault."""
+    means = {v: float(np.mean(col[v][tail])) for v in _MEANS_OF_EACH}
+    return means | severity(*(float(col[v][end]) for v in _SEVERITY))
+
+
+def _held(ds: xr.Dataset, col: _Columns, end: int, t: float, number: int) -> dict[str, Any]:
+    """Return phase of the fault and load of a generator at the end of a phase."""
+    faulty = col["mu"][end]
+    return {
+        "fault_phase": _holding(ds, "faults", "phase", t, number) if faulty else None,
+        "load": _holding(ds, "loads", "load", t, number),
+    }

@@ -19,8 +19,14 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import SignalError
-from apu_casadi.core.sharing import Parametric
+from apu_casadi.core.sharing import Parametric, keep
 from apu_casadi.core.signals import Signals
+
+
+def moves(function: ca.Function, argument: int, entry: int) -> bool:
+    """Whether an entry of an argument has derivatives of the first output."""
+    ends = function.jac_sparsity(0, argument).colind()
+    return bool(ends[entry + 1] > ends[entry])
 
 
 @dataclass(frozen=True)
@@ -106,8 +112,8 @@ class StateSpace(Parametric):
             numbers: values of the others.
         """
         sizes = [len(s) for s in (family.x, family.z, family.u, theta)]
-        kind = ca.SX if family.f.is_a("SXFunction") else ca.MX
-        x, z, u, th = (kind.sym(n, k) for n, k in zip(("x", "z", "u", "t"), sizes, strict=True))
+        # calls of the family's functions: written out again they would take longer to make
+        x, z, u, th = (ca.MX.sym(n, k) for n, k in zip(("x", "z", "u", "t"), sizes, strict=True))
         full = ca.vertcat(th, ca.DM(list(numbers)))
         made = cls.of(
             name,
@@ -119,6 +125,43 @@ class StateSpace(Parametric):
             z=family.z_of(x, u, full),
         )
         return replace(made, family=family, numbers=tuple(float(n) for n in numbers))
+
+    def with_free(self, *names: str) -> StateSpace:
+        """Return the model with some of its numbers as parameters, behind theta.
+
+        Raises:
+            SignalError: unknown names, with the nearest; names given twice; a number on which
+                nothing depends, or whose derivatives are left out.
+        """
+        held, family = self.held, self.shared
+        rest = Signals([s for s in family.theta if s.name in held])
+        rest.indices(names)  # refuses what is unknown
+        for n in names:
+            if not any(moves(f, 2, family.theta.index(n)) for f in (family.f, family.g)):
+                raise SignalError(f"{self.name}: no derivatives by {n}: nothing depends on it")
+        made = keep(family, StateSpace.with_free, (len(self.theta), names), lambda: self._by(names))
+        theta = self.theta + Signals([replace(family.theta[n], default=held[n]) for n in names])
+        numbers = [held[n] for n in rest.names if n not in names]
+        return StateSpace.member(self.name, made, theta, numbers)
+
+    def _by(self, names: tuple[str, ...]) -> StateSpace:
+        """Return the family with these of its parameters right behind this model's."""
+        family = self.shared
+        last = [n for n in family.theta.names if n in self.held and n not in names]
+        theta = Signals([family.theta[n] for n in (*self.theta.names, *names, *last)])
+        sizes = [len(s) for s in (family.x, family.z, family.u, theta)]
+        kind = ca.SX if family.f.is_a("SXFunction") else ca.MX
+        x, z, u, th = (kind.sym(n, k) for n, k in zip("xzut", sizes, strict=True))
+        full = th[theta.indices(family.theta.names)]
+        return StateSpace.of(
+            family.name,
+            (family.x, family.z, family.u, theta, family.y),
+            (x, z, u, th),
+            dae=family.residual(x, z, u, full),
+            f=family.f(x, u, full),
+            g=family.g(x, u, full),
+            z=family.z_of(x, u, full),
+        )
 
     @classmethod
     def of(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import OperatingPointError
-from apu_casadi.core.parameters import Parameters
+from apu_casadi.core.parameters import of_symbols
 from apu_casadi.core.rootfinding import Newton
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.atmosphere import ambient
@@ -18,8 +18,6 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas
 from apu_casadi.gaspath.stations import TEMPERATURES, UNKNOWNS, stations
-
-P = TypeVar("P", bound=Parameters)
 
 
 @dataclass(frozen=True)
@@ -41,12 +39,6 @@ class DesignPoint:
     z: dict[str, Any]
     values: dict[str, Any]
     residual: float
-
-
-def of_symbols(cls: type[P], values: Any, **others: Any) -> P:
-    """Return a parameter set whose numbers are symbols, in the order of its fields."""
-    names = [f.name for f in fields(cls) if "unit" in f.metadata]
-    return cls().symbolic(**dict(zip(names, ca.vertsplit(values), strict=True)), **others)
 
 
 class DesignEquations:

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from apu_casadi.core.parameters import of_symbols
 from apu_casadi.core.signals import Signal, Signals
-from apu_casadi.gaspath.design import DesignPoint, design_equations, of_symbols
+from apu_casadi.gaspath.design import DesignPoint, design_equations
 from apu_casadi.gaspath.designdata import GasGeneratorParameters
 from apu_casadi.gaspath.gas import Gas, fuel_burning, used
 from apu_casadi.gaspath.maps.maptable import MapTable

@@ -32,7 +32,8 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
-from apu_casadi.core.sharing import kept
+from apu_casadi.core.parameters import of_symbols
+from apu_casadi.core.sharing import kept, once
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine import wrsg
@@ -40,7 +41,7 @@ from apu_casadi.machine.faults import ttsc
 from apu_casadi.machine.generatormodel import ANGLE, DRIVES
 from apu_casadi.machine.generatormodel import FLUXES as _ALL_FLUXES
 from apu_casadi.machine.generatormodel import OUTPUTS as GENERATOR
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.machinedata import MACHINE, MachineParameters, require_linear
 from apu_casadi.machine.park import (
     PHASE_ANGLE,
     Abc,
@@ -345,20 +346,33 @@ def voltage_weight(w_r: Any, dt: Any) -> Any:
 def terminal_model(p: MachineParameters, fault: str = "shunts") -> StateSpace:
     """Return the continuous model of the machine with its terminals given.
 
+    It is one of a family, which takes the machine's parameters too.
+
     Args:
         p: machine parameters; both neutrals are served, since v is measured to the machine's own.
         fault: ``"shunts"`` (kappa = mu, theta = h_a, h_b, h_c) or ``"leaky"`` (i_fault is a state,
             theta = mu, k_rf, kappa, phase_angle).
 
     Raises:
-        ParameterError: unknown fault.
+        ParameterError: unknown fault, or a machine that saturates.
     """
     if fault not in FAULTS:
         raise ParameterError(f"fault {fault!r} {nearest(str(fault), FAULTS)}")
+    require_linear(p, "the terminal model")
+    family = _family(fault)
+    theta = LEAKY if fault == "leaky" else SHUNTS
+    return StateSpace.member(family.name, family, theta, list(p.held("machine").values()))
+
+
+@once
+def _family(fault: str) -> StateSpace:
+    """The model of all machines, theta with their parameters."""
     leaky = fault == "leaky"
     X = FLUXES + Signals([I_FAULT] if leaky else []) + Signals([ANGLE])
     TH = LEAKY if leaky else SHUNTS
     (xv, x), (uv, u), (tv, th) = X.sx(), INPUTS.sx(), TH.sx()
+    pv = ca.SX.sym("p", len(MACHINE))
+    p = of_symbols(MachineParameters, pv)
     at = Terminals(u["w_r"], Abc(u["v_a"], u["v_b"], u["v_c"]), u["V_fd"])
     lam = Windings(*(x[n] for n in FLUXES.names))
     machine = {"lam": lam, "theta_e": x["theta_e"], "at": at}
@@ -367,8 +381,8 @@ def terminal_model(p: MachineParameters, fault: str = "shunts") -> StateSpace:
     ode_v, y_v = X.stack(ode), OUTPUTS.stack(y)
     return StateSpace.of(
         f"terminal_{fault}",
-        (X, z, INPUTS, TH, OUTPUTS),
-        (xv, none, uv, tv),
+        (X, z, INPUTS, TH + MACHINE, OUTPUTS),
+        (xv, none, uv, ca.vertcat(tv, pv)),
         dae=(ode_v, none),
         f=ode_v,
         g=y_v,

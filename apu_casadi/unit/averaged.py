@@ -41,6 +41,7 @@ from apu_casadi.machine.generatormodel import DRIVES
 from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.exchange import coupled
+from apu_casadi.unit.jointfamily import JointFamily
 
 # The angle enters f and g, and their derivatives by h at h = 0, through its first and second
 # harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.
@@ -94,6 +95,8 @@ def _balanced_inputs(load_kind: str) -> Signals:
 def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpace:
     """Return one generator, averaged over an electrical period, under a balanced load.
 
+    It is one of a family, whose theta has the parameters of machine and exciter behind it.
+
     States are the generator's without the rotor angle; inputs w_r, V_ref and the load's, one value
     for all phases; theta is the severity h where :func:`has_severity`, else empty; outputs
     are field, magnitudes, power, torque and the voltages and currents on the rotor's axes.
@@ -102,12 +105,28 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
         gen: the generator.
         load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
     """
-    faulty = has_severity(gen, load_kind)
-    full = gen.state_space(load_kind, "coupled" if faulty else None)
+    full = gen.state_space(load_kind, "coupled" if has_severity(gen, load_kind) else None)
+    assert full.family is not None
+    family = _all_generators(full.family, load_kind, gen.neutral, len(full.theta))
+    own = Signals(family.theta[: len(family.theta) - len(full.numbers)])
+    return StateSpace.member(family.name, family, own, full.numbers)
+
+
+@kept
+def _all_generators(full: StateSpace, load_kind: str, neutral: str, n_fault: int) -> StateSpace:
+    """The averaged model of all generators, theta with their numbers.
+
+    Args:
+        full: the generator's family.
+        load_kind, neutral: its load and neutral.
+        n_fault: number of its parameters that are those of a fault.
+    """
+    faulty, numbers = n_fault > 0, Signals(full.theta[n_fault:])
     X = Signals([s for s in full.x if s.name != "theta_e"])
     U, TH = _balanced_inputs(load_kind), _SEVERITY if faulty else Signals()
     Y = Signals([*(full.y[n] for n in _KEPT), *_AXES])
     (xv, x), (uv, u), (tv, th) = X.sx(), U.sx(), TH.sx()
+    pv = ca.SX.sym("numbers", len(numbers))
 
     inputs = dict.fromkeys(full.u.names, ca.SX(0))
     inputs |= {n: u[n] for n in U.names if n in full.u}
@@ -116,14 +135,15 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
     fault = ca.SX(0, 1)
     if faulty:  # with k_rf = 0, h = mu/(1 - mu); only h matters if kappa = mu
         values = {"mu": th["h"] / (1 + th["h"]), "k_rf": ca.SX(0), "phase_angle": ca.SX(0)}
-        fault = full.theta.stack(values)
+        fault = Signals(full.theta[:n_fault]).stack(values)
+    theta = ca.vertcat(fault, pv)
     angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES if faulty else np.zeros(1)
     rate: Any = 0
     mean: dict[str, Any] = dict.fromkeys([*_KEPT, "v_q", "v_d", "i_q", "i_d"], ca.SX(0))
     for angle in angles:
         x_full = full.x.stack({**x, "theta_e": ca.SX(float(angle))})
-        rate += full.f(x_full, u_full, fault) / angles.size
-        y = full.y.unpack(full.g(x_full, u_full, fault))
+        rate += full.f(x_full, u_full, theta) / angles.size
+        y = full.y.unpack(full.g(x_full, u_full, theta))
         for a in "vi":
             on_axes = abc_to_qd0(float(angle), Abc(*(y[f"{a}_{k}"] for k in "abc")))
             y |= {f"{a}_q": on_axes.q, f"{a}_d": on_axes.d}
@@ -134,8 +154,9 @@ def averaged_generator(gen: Generator, load_kind: str = "resistive") -> StateSpa
     rates = full.x.unpack(rate)
     f, g = X.stack({n: rates[n] for n in X.names}), Y.stack(mean)
 
-    name = f"averaged_generator_{load_kind}" + ("" if gen.neutral == "grounded" else "_isolated")
-    signals, symbols = (X, Signals(), U, TH, Y), (xv, ca.SX.sym("z", 0), uv, tv)
+    name = f"averaged_generator_{load_kind}" + ("" if neutral == "grounded" else "_isolated")
+    signals = X, Signals(), U, TH + numbers, Y
+    symbols = xv, ca.SX.sym("z", 0), uv, ca.vertcat(tv, pv)
     none = ca.SX(0, 1)
     return StateSpace.of(name, signals, symbols, dae=(f, none), f=f, g=g, z=none, cse=True)
 
@@ -170,44 +191,67 @@ def generator_vectors(
     return ss, x, ss.u.pack(values), np.zeros(len(ss.theta))
 
 
-def _joint_signals(apu: Apu, load_kind: str) -> tuple[Signals, Signals, Signals, Signals]:
+def _joint_signals(parts: JointFamily) -> tuple[Signals, Signals, Signals, Signals]:
     """Return x, u, theta and y of the averaged unit."""
-    gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
-    X = Signals([*gg.X, *apu.governor.X, *gen.x])
+    gg, gen = GasGenerator, parts.gen
+    X = Signals([*gg.X, *parts.governor.X, *gen.x])
     N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
     own = [s for s in gen.u if s.name != "w_r"]
     U = Signals([*(gg.U[n] for n in AMBIENT), N_ref, *own])
-    return X, U, Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
+    return X, U, parts.theta, Signals([*gg.Y, *gen.y])
 
 
-@kept
-def _joint(apu: Apu, load_kind: str) -> tuple[ca.Function, ca.Function]:
-    """Return the equations (x, z, u, theta) -> (ode, alg, y), and the search (x, u, theta) -> z."""
-    gg, gen = apu.gas_generator, averaged_generator(apu.generator, load_kind)
-    X, U, TH, _ = _joint_signals(apu, load_kind)
-    x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
-    u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
-    N, x_gov, x_gen = ca.vertsplit(x, [0, 1, 1 + len(apu.governor.X), len(X)])
+def _joint(parts: JointFamily, load_kind: str) -> tuple[ca.Function, StateSpace]:
+    """Return the equations (x, z, u, theta) -> (ode, alg, y) of all units, and their model."""
+    engines, gen = parts.engines, parts.machine
+    X, U, TH, Y = _joint_signals(parts)
+    names = ["x", "z", "u", "theta"]
+    x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in zip(names, (X, parts.z, U, TH), strict=True))
+    N, x_gov, x_gen = ca.vertsplit(x, [0, 1, 1 + len(parts.governor.X), len(X)])
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
-    health, h = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
-    link = dataclasses.replace(apu.link, N_ref=inputs["N_ref"])
-    u_gg, rates, y_gen = coupled(link, gen, N=N, x=x_gov, x_gen=x_gen, inputs=inputs, fault=h)
-    N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
-    ode = ca.vertcat(N_dot, rates)
-    z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
-    name, y = f"joint_averaged_{load_kind}", ca.vertcat(y_gg, y_gen)
-    names = ["x", "z", "u", "theta"], ["ode", "alg", "y"]
-    equations = ca.Function(f"{name}_equations", [x, z, u, theta], [ode, alg, y], *names)
-    return equations, ca.Function(f"{name}_z", [x, u, theta], [z_sol], ["x", "u", "theta"], ["z"])
+    of_engine, of_gen, link = parts.parts(theta, inputs["N_ref"])
+    state = {"N": N, "x": x_gov, "x_gen": x_gen}
+    u_gg, rates, y_gen = coupled(link, gen, **state, inputs=inputs, fault=of_gen)
+    N_dot, alg, y_gg = engines.equations(N, z, u_gg, of_engine)
+    name, out = f"joint_averaged_{load_kind}", [ca.vertcat(N_dot, rates), alg]
+    args, out = [x, z, u, theta], [*out, ca.vertcat(y_gg, y_gen)]
+    equations = ca.Function(f"{name}_equations", args, out, names, ["ode", "alg", "y"])
+    start = engines.start(N, u_gg, of_engine)
+    found = engines.solve(start, N, u_gg, of_engine)
+    z_sol = ca.Function(f"{name}_z", [x, u, theta], [found])(x, u, theta)
+    ode, alg, _ = equations(x, z, u, theta)
+    f, _, y = equations(x, z_sol, u, theta)
+    signals, symbols = (X, parts.z, U, TH, Y), (x, z, u, theta)
+    return equations, StateSpace.of(name, signals, symbols, dae=(ode, alg), f=f, g=y, z=z_sol)
 
 
-def joint_equations(apu: Apu, load_kind: str = "resistive") -> ca.Function:
-    """Return the averaged unit as Function (x, z, u, theta) -> (ode, alg, y)."""
-    return _joint(apu, load_kind)[0]
+def _all_units(parts: JointFamily, load_kind: str) -> tuple[ca.Function, StateSpace]:
+    return parts.keep((_joint, load_kind), lambda: _joint(parts, load_kind))
 
 
 @kept
-def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
+def joint_equations(
+    apu: Apu, load_kind: str = "resistive", free: tuple[str, ...] = ()
+) -> ca.Function:
+    """Return the family of :func:`joint_averaged` as Function (x, z, u, theta) -> (ode, alg, y)."""
+    parts = JointFamily.of(apu, averaged_generator(apu.generator, load_kind), free)
+    equations = _all_units(parts, load_kind)[0]
+    if not free:
+        return equations
+    names = joint_averaged(apu, load_kind, free).shared.theta
+
+    def reordered() -> ca.Function:
+        x, z, u, theta = (ca.MX.sym(n, equations.size1_in(i)) for i, n in enumerate("xzut"))
+        out = equations(x, z, u, theta[names.indices(parts.theta.names)])
+        return ca.Function(equations.name(), [x, z, u, theta], out)
+
+    return parts.keep((joint_equations, load_kind, free), reordered)
+
+
+@kept
+def joint_averaged(
+    apu: Apu, load_kind: str = "resistive", free: tuple[str, ...] = ()
+) -> StateSpace:
     """Return the whole unit with averaged generators, continuous in time.
 
     States are the rotor speed N, those of the governor (Wf_I) and those of the averaged
@@ -219,29 +263,29 @@ def joint_averaged(apu: Apu, load_kind: str = "resistive") -> StateSpace:
     Args:
         apu: the unit.
         load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
+        free: parameters of the unit by name (``machine.r_s``, ``gas_generator.eta_c``) that theta
+            has too, behind h.
+
+    Raises:
+        SignalError: unknown parameters, or some on which nothing depends.
     """
-    X, U, TH, Y = _joint_signals(apu, load_kind)
-    Z = apu.gas_generator.z
-    equations, z_of = _joint(apu, load_kind)
-    sizes = (("x", X), ("z", Z), ("u", U), ("theta", TH))
-    x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in sizes)
-    ode, alg, _ = equations(x, z, u, theta)
-    z_sol = z_of(x, u, theta)
-    f, _, y = equations(x, z_sol, u, theta)
-    name, signals = f"joint_averaged_{load_kind}", (X, Z, U, TH, Y)
-    return StateSpace.of(name, signals, (x, z, u, theta), dae=(ode, alg), f=f, g=y, z=z_sol)
+    gen = averaged_generator(apu.generator, load_kind)
+    parts = JointFamily.of(apu, gen, free)
+    return parts.member(apu, gen, _all_units(parts, load_kind)[1], free)
 
 
 def joint_vectors(
-    apu: Apu, point: JointPoint
+    apu: Apu, point: JointPoint, free: tuple[str, ...] = ()
 ) -> tuple[StateSpace, np.ndarray, np.ndarray, np.ndarray]:
     """Return the averaged unit of a steady point (:meth:`Apu.steady_state`), and x, u, theta there.
+
+    ``free`` are parameters that theta has too, see :func:`joint_averaged`.
 
     Raises:
         SignalError: the point's load is not balanced.
     """
     gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, point.generator)
-    ss = joint_averaged(apu, load_kind(point.generator))
+    ss = joint_averaged(apu, load_kind(point.generator), free)
     gas = GasGenerator.U.unpack(point.gas.u)
     values: Mapping[str, float] = {
         **{n: gas[n] for n in AMBIENT},
@@ -249,5 +293,6 @@ def joint_vectors(
         **{n: v for n, v in gen_ss.u.unpack(u_gen).items() if n != "w_r"},
     }
     x = np.concatenate([point.gas.x, apu.governor.start(gas["Wf"]), x_gen])
-    theta = np.concatenate([point.gas.theta, np.zeros(len(gen_ss.theta))])
+    own = [s.default for s in ss.theta[ss.theta.index(free[0]) :]] if free else []
+    theta = np.concatenate([point.gas.theta, np.zeros(len(gen_ss.theta)), own])
     return ss, x, ss.u.pack(values), theta

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from apu_casadi.core.checked import bounded as number
 from apu_casadi.core.errors import ScenarioError, nearest
-from apu_casadi.core.profiles.profile import Profile
+from apu_casadi.core.profiles.profile import Profile, Varying, at, later
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.gaspath import health
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY
@@ -24,6 +24,12 @@ HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
     {n: f.doc for n, f in health.HEALTH_FACTORS.items()}
 )
 """The health factors of the gas path, one when healthy, with their meaning."""
+
+STARTS = ("balanced", "settled")
+"""What a run may start from: the healthy unit with balanced loads, or what is there from the start.
+"""
+MOST = 4
+"""Generators that a unit may have; it has at least one."""
 
 HEALTH_LO, HEALTH_HI = health.RUN_RANGE
 """A health factor lies in (HEALTH_LO, HEALTH_HI]."""
@@ -215,24 +221,76 @@ def who(numbers: Sequence[int]) -> str:
     return f"generators {', '.join(first)} and {last}"
 
 
+class Jump(NamedTuple):
+    """An instant, s, at which a profile jumps."""
+
+    t: float
+
+
 class Holding(NamedTuple):
-    """What holds at an instant: load and fault of each generator, all health factors by name."""
+    """What holds from an instant on: numbers, profiles, and what is made of profiles.
+
+    The time of all profiles is that of the run.
+
+    Args:
+        loads, faults: of each generator.
+        factors: all health factors by name.
+        ambient: the day.
+        N_ref: governed speed, rad/s; None: that of the unit.
+    """
 
     loads: tuple[Any, ...]
-    faults: tuple[Fault | None, ...]
-    factors: Mapping[str, float]
+    faults: tuple[Any, ...]
+    factors: Mapping[str, Any]
+    ambient: Any = None
+    N_ref: Any = None
 
-    def after(self, events: Iterable[Event]) -> Holding:
+    def after(self, events: Iterable[Event | Jump]) -> Holding:
         """Return what holds after events."""
         now = self
         for e in events:
             if isinstance(e, HealthChange):
-                now = now._replace(factors={**now.factors, **e.factors})
+                new = {n: later(v, e.t) for n, v in e.factors.items()}
+                now = now._replace(factors={**now.factors, **new})
             elif isinstance(e, LoadChange):
-                now = now._replace(loads=_put(now.loads, e.generator, e.load))
+                now = now._replace(loads=_put(now.loads, e.generator, later(e.load, e.t)))
             elif isinstance(e, FaultChange):
-                now = now._replace(faults=_put(now.faults, e.generator, e.fault))
+                now = now._replace(faults=_put(now.faults, e.generator, later(e.fault, e.t)))
+            elif isinstance(e, SpeedChange):
+                now = now._replace(N_ref=later(e.N_ref, e.t))
         return now
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """All that may be a profile or made of profiles."""
+        return (*self.loads, *self.faults, *self.factors.values(), self.ambient, self.N_ref)
+
+    @property
+    def changing(self) -> bool:
+        """Whether anything changes without an event."""
+        return any(isinstance(x, Profile | Varying) for x in self.parts)
+
+    def at(self, t: float) -> Holding:
+        """Return the numbers of an instant, s."""
+        return Holding(
+            tuple(at(x, t) for x in self.loads),
+            tuple(at(x, t) for x in self.faults),
+            {n: at(v, t) for n, v in self.factors.items()},
+            at(self.ambient, t),
+            at(self.N_ref, t),
+        )
+
+
+def jumps(start: Holding, events: Sequence[Event], duration: float) -> list[Jump]:
+    """Return where profiles jump in a run, while they hold; ``events`` are in order."""
+    found, now, begin = set[float](), start, 0.0
+    for e in (*events, None):
+        end = duration if e is None else e.t
+        changing = {x for x in now.parts if isinstance(x, Profile | Varying) and end > begin}
+        found |= {t for x in changing for t in x.instants(duration) if begin < t < end}
+        if e is not None:
+            now, begin = now.after([e]), e.t
+    return [Jump(t) for t in sorted(found)]
 
 
 def _put(each: tuple[Any, ...], k: int | None, new: Any) -> tuple[Any, ...]:

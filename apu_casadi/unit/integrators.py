@@ -19,11 +19,13 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable, SimulationError
+from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
+from apu_casadi.machine.course import Course, Numbers
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.meanstep import MeanStep
@@ -104,6 +106,14 @@ class Phase:
     symmetric: bool
 
 
+class Way(NamedTuple):
+    """Load and fault on their way, one at least made of profiles, and the end of the run, s."""
+
+    load: Load | Varying[Load]
+    fault: Fault | Varying[Fault | None] | None
+    end: float
+
+
 class Step(NamedTuple):
     """A step that is asked for.
 
@@ -144,8 +154,12 @@ class Integrated(NamedTuple):
 
 
 class Integrator:
-    """Takes steps of one phase, or says why it cannot."""
+    """Takes steps of one phase, or says why it cannot.
 
+    ``phase`` may be replaced by one of other numbers.
+    """
+
+    phase: Phase
     quad: tuple[str, ...] = ()
 
     def __call__(self, step: Step) -> Integrated:
@@ -160,21 +174,35 @@ class Integrator:
         """Return what propagates, where many steps may be one function; else NotApplicable."""
         raise NotApplicable("exact propagation does not hold, or is not asked for")
 
+    def columns(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
+        """Return what propagates over steps with these middles, s, and its numbers in each."""
+        raise NotApplicable("exact propagation does not hold, or is not asked for")
+
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return instants and waveforms of the steps of a block, of all its samples."""
         return _NO_TIMES, _NO_WAVES
 
 
-def integrators(phase: Phase, settings: Settings, means: StepMeans) -> list[Integrator]:
-    """Return the integrators of a phase, in the order in which they are to be asked."""
+def integrators(
+    phase: Phase, settings: Settings, means: StepMeans, way: Way | None = None
+) -> list[Integrator]:
+    """Return the integrators of a phase, in the order in which they are to be asked.
+
+    Args:
+        way: load and fault of the phase where they change in it.
+    """
     always = Stepwise(phase, settings, means)
     if not settings.exact:
         return [always]
-    sampled: list[Integrator] = [Samples(phase, settings, means, fine=f) for f in (False, True)]
+    given = phase, settings, means, way
+    sampled: list[Integrator] = [Samples(*given, fine=f) for f in (False, True)]
     if settings.waveform_dt is not None:
         return [*sampled, always]
-    whole, rest = (Means(phase, settings, means, after=a) for a in (0.0, SETTLED))
-    return [whole, *sampled, Follow(always, rest, settings), always]
+    whole = Means(*given)
+    if way is not None:
+        return [whole, always]
+    follow = Follow(always, Means(*given, after=SETTLED), settings)
+    return [whole, *sampled, follow, always]
 
 
 F = TypeVar("F", MeanStep, Propagator)
@@ -189,15 +217,35 @@ class _Exact(Integrator, Generic[F]):
 
     otherwise: ClassVar[str]
 
-    def __init__(self, phase: Phase, settings: Settings, means: StepMeans) -> None:
-        self.phase, self.settings = phase, settings
+    def __init__(
+        self, phase: Phase, settings: Settings, means: StepMeans, way: Way | None = None
+    ) -> None:
+        self.phase, self.settings, self._way = phase, settings, way
+        self._course: Course[F] | None = None
         turn = (1 - SPEED_RANGE) * phase.gen.machine.w_rated * settings.dt
         self.quad = means.quad(short=turn < 2 * math.pi, symmetric=phase.symmetric)
         self._made: F | None = None
         self._refused = ""
 
-    def _prepare(self) -> F:
+    def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> F:
         raise NotImplementedError
+
+    def _numbers(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
+        """Return what propagates along the way over steps with these middles, s."""
+        assert self._way is not None
+        if self._course is None:
+            p, (load, fault, end) = self.phase, self._way
+            self._course = Course(p.gen, p.ss, load, fault, self._prepare, end)
+        return self._course.numbers(t, before)
+
+    def columns(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
+        """Return what propagates over steps with these middles, s, and its numbers in each."""
+        if self._way is not None:
+            return self._numbers(t, before)
+        fast, p = self.for_blocks(), self.phase
+        severity = () if p.fault is None else tuple(p.fault.severity.values())
+        each = (fast.vector, p.u, fast.theta, np.array(severity))
+        return fast, Numbers(*(np.repeat(a[:, None], t.size, axis=1) for a in each))
 
     def fast(self) -> F:
         """Return what propagates.
@@ -209,7 +257,7 @@ class _Exact(Integrator, Generic[F]):
             raise NotApplicable(self._refused)
         if self._made is None:
             try:
-                self._made = self._prepare()
+                self._made = self._prepare(self.phase.u, self.phase.theta)
             except SimulationError as error:
                 _LOG.info("%s: %s", self.otherwise, error)
                 self._refused = str(error)
@@ -226,7 +274,12 @@ class _Exact(Integrator, Generic[F]):
             raise NotApplicable(f"{step.h:g} s are not a whole exchange step")
         if step.since < SETTLED - SAME_INSTANT:
             raise NotApplicable(f"{step.since:g} s after a switch the windings have not settled")
-        return self.fast()
+        if self._way is None:
+            return self.fast()
+        middle = step.t0 + step.h / 2
+        fast, now = self._numbers(np.array([middle]), middle - min(step.since, step.h))
+        fast.put(now.vector[:, 0], now.theta[:, 0])
+        return fast
 
 
 class Means(_Exact[MeanStep]):
@@ -235,17 +288,29 @@ class Means(_Exact[MeanStep]):
     otherwise = "samples are needed also for means"
 
     def __init__(
-        self, phase: Phase, settings: Settings, means: StepMeans, *, after: float = 0.0
+        self,
+        phase: Phase,
+        settings: Settings,
+        means: StepMeans,
+        way: Way | None = None,
+        *,
+        after: float = 0.0,
     ) -> None:
-        super().__init__(phase, settings, means)
+        super().__init__(phase, settings, means, way)
         self.after = after
 
-    def _prepare(self) -> MeanStep:
+    def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> MeanStep:
         p, dt = self.phase, self.settings.dt
         first = 1 - (dt - self.after) / dt
-        within = first, 1 - first
         return MeanStep(
-            p.gen, p.ss, p.u, p.theta, dt=dt - self.after, quad=self.quad, within=within
+            p.gen,
+            p.ss,
+            u,
+            theta,
+            dt=dt - self.after,
+            quad=self.quad,
+            within=(first, 1 - first),
+            harmonics=harmonics,
         )
 
     def __call__(self, step: Step) -> Integrated:
@@ -266,9 +331,15 @@ class Samples(_Exact[Propagator]):
     otherwise = "exact propagation not used, CVODES instead"
 
     def __init__(
-        self, phase: Phase, settings: Settings, means: StepMeans, *, fine: bool = False
+        self,
+        phase: Phase,
+        settings: Settings,
+        means: StepMeans,
+        way: Way | None = None,
+        *,
+        fine: bool = False,
     ) -> None:
-        super().__init__(phase, settings, means)
+        super().__init__(phase, settings, means, way)
         self.fine = fine
         least, wanted = SUMMARY_SAMPLES[phase.fault is None], settings.n_out(settings.dt)
         if settings.waveform_dt is not None:
@@ -277,18 +348,19 @@ class Samples(_Exact[Propagator]):
         self.n = least if settings.waveform_dt is None else every * wanted
         self.stored = slice(every - 1, None, every)
 
-    def _prepare(self) -> Propagator:
+    def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> Propagator:
         p, outputs = self.phase, () if self.settings.waveform_dt is None else WAVEFORMS
         return Propagator(
             p.gen,
             p.ss,
-            p.u,
-            p.theta,
+            u,
+            theta,
             n_out=self.n,
             dt=self.settings.dt,
             outputs=outputs,
             quad=self.quad,
             fine=self.fine,
+            harmonics=harmonics,
         )
 
     def __call__(self, step: Step) -> Integrated:
@@ -302,10 +374,12 @@ class Samples(_Exact[Propagator]):
 
     def for_blocks(self) -> Propagator:
         """Return what propagates, where the coefficients are constant."""
-        fast = self.fast()
-        if not fast.constant:
-            raise NotApplicable(f"{fast.ss.name}: its coefficients depend on the rotor angle")
-        return fast
+        return _constant(self.fast())
+
+    def columns(self, t: np.ndarray, before: float) -> tuple[Propagator, Numbers]:
+        """Return what propagates over steps, where the coefficients are constant."""
+        fast, now = super().columns(t, before)
+        return _constant(fast), now
 
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stored samples of the steps of a block."""
@@ -317,6 +391,12 @@ class Samples(_Exact[Propagator]):
             return t, w
         kept = np.arange(self.n)[self.stored]
         return t, w[:, (self.n * np.arange(grid.size - 1)[:, None] + kept).ravel()]
+
+
+def _constant(fast: Propagator) -> Propagator:
+    if not fast.constant:
+        raise NotApplicable(f"{fast.ss.name}: its coefficients depend on the rotor angle")
+    return fast
 
 
 class Stepwise(Integrator):
@@ -396,20 +476,22 @@ def _wrapped(ss: StateSpace, x: np.ndarray) -> np.ndarray:
 
 
 @kept
-def ramped(ss: StateSpace) -> StateSpace:
-    """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input."""
+def ramped(ss: GeneratorModel) -> GeneratorModel:
+    """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input.
+
+    It is one of a family as the variant is: that of the ramped models of all machines.
+    """
     X = Signals([*ss.x, dataclasses.replace(ss.u["w_r"], name="w_r", default=None)])
     slope = Signal("w_r_dot", "rad/s^2", "slope of the electrical speed", nominal=1e3)
     U = Signals([slope if s.name == "w_r" else s for s in ss.u])
     at = ss.u.index("w_r")
-    x, z, u, theta = (
-        ca.SX.sym(label, len(s))
-        for label, s in (("x", X), ("z", ss.z), ("u", U), ("theta", ss.theta))
-    )
+    kind = ca.SX if ss.f.is_a("SXFunction") else ca.MX
+    sizes = (("x", X), ("z", ss.z), ("u", U), ("theta", ss.theta))
+    x, z, u, theta = (kind.sym(label, len(s)) for label, s in sizes)
     x_sg, rate = x[: len(ss.x)], u[at]
     u_sg = ca.vertcat(u[:at], x[len(ss.x)], u[at + 1 :])
     ode, alg = ss.residual(x_sg, z, u_sg, theta)
-    return StateSpace.of(
+    made = GeneratorModel.of(
         f"{ss.name}_ramped",
         (X, ss.z, U, ss.theta, ss.y),
         (x, z, u, theta),
@@ -418,3 +500,9 @@ def ramped(ss: StateSpace) -> StateSpace:
         g=ss.g(x_sg, u_sg, theta),
         z=ss.z_of(x_sg, u_sg, theta),
     )
+    if ss.reduced is not None:  # a family
+        inner, follow = ss.reduced
+        return dataclasses.replace(made, reduced=(ramped(inner), follow))
+    if isinstance(ss.family, GeneratorModel):
+        return dataclasses.replace(made, family=ramped(ss.family), numbers=ss.numbers)
+    return made

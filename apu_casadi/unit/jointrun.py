@@ -8,28 +8,27 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
+from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu, JointPoint
-from apu_casadi.unit.events import Ambient, Event, Holding
-from apu_casadi.unit.exchange import PAPER, governed_step
+from apu_casadi.unit.events import Event, Holding, Jump
+from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.integrators import Settings
 from apu_casadi.unit.jointstep import BLOCK
-from apu_casadi.unit.machines import Machines
+from apu_casadi.unit.machines import Inputs, Machines
 from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Row
-
-if TYPE_CHECKING:
-    from apu_casadi.machine.faults.fault import Fault
-    from apu_casadi.machine.loads.load import Load
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +36,54 @@ class Asked:
     """What a run is asked for; see :func:`apu_casadi.unit.multirate.simulate_joint`.
 
     Args:
-        loads, faults: of each generator from the start.
-        ambient, health: from the start; all health factors by name.
+        start: what holds from the start, profiles included.
         grid: exchange instants, s.
         phasors, noise, seed, hook: as there.
+        settled: whether loads and faults have been there for long.
     """
 
-    loads: tuple[Load, ...]
-    faults: tuple[Fault | None, ...]
-    ambient: Ambient
-    health: dict[str, float]
+    start: Holding
     grid: np.ndarray
     phasors: bool
     noise: Noise
     seed: int | None
     hook: Callable[[int, np.ndarray], np.ndarray] | None
+    settled: bool = False
+
+
+class Columns:
+    """Inputs of the unit in each step of a block, while the same profiles hold.
+
+    Args:
+        gg, now, here: gas generator, what holds, and its numbers at some instant.
+        shaft: the governor, with the governed speed.
+    """
+
+    def __init__(self, gg: GasGenerator, now: Holding, here: Holding, shaft: Link) -> None:
+        u = gg.U.pack(**{n: getattr(here.ambient, n) for n in AMBIENT}, Wf=0.0, PW=0.0)
+        full = gg.full(gg.THETA.pack(here.factors))
+        u, full = (np.repeat(a[:, None], BLOCK, axis=1) for a in (u, full))
+        self._given = Inputs(u, full, np.full(BLOCK, shaft.N_ref))
+        day = now.ambient.profiles if isinstance(now.ambient, Varying) else {}
+        self._day = [(gg.U.index(n), p) for n, p in day.items()]
+        health = {n: v for n, v in now.factors.items() if isinstance(v, Profile)}
+        self._health = [(gg.THETA.index(n), n, p) for n, p in health.items()]
+        self._speed, self._factors = now.N_ref, dict(here.factors)
+
+    def __call__(self, t: np.ndarray) -> tuple[Inputs, dict[str, Any]]:
+        """Return inputs and health factors of steps with these middles, s.
+
+        The next call overwrites the inputs.
+        """
+        given = self._given
+        factors = dict(self._factors) if self._health else self._factors
+        for i, profile in self._day:
+            given.u[i] = profile(t)
+        for i, name, profile in self._health:
+            given.theta[i] = factors[name] = profile(t)
+        if isinstance(self._speed, Profile):
+            given.N_ref[:] = self._speed(t)
+        return given, factors
 
 
 class JointRun:
@@ -66,6 +98,7 @@ class JointRun:
     asked: Asked
     settings: Settings
     now: Holding
+    here: Holding
     point: JointPoint
     machines: Machines
     x: np.ndarray
@@ -79,10 +112,20 @@ class JointRun:
         self, apu: Apu, asked: Asked, settings: Settings, rng: np.random.Generator
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
-        start = [load.balanced_part for load in asked.loads]
-        self.now = Holding(asked.loads, asked.faults, asked.health)
-        self.point = apu.steady_state(start, ambient=asked.ambient, health=self.now.factors)
-        self.machines = Machines(apu, self.point, self.now, settings, asked.phasors)
+        self.now, self.here = asked.start, asked.start.at(0.0)  # as asked, and its numbers
+        there: tuple[Any, ...] = ([load.balanced_part for load in self.here.loads], None)
+        if asked.settled:
+            there = self.here.loads, self.here.faults
+        more = {} if self.here.N_ref is None else {"N_ref": self.here.N_ref}
+        self.point = apu.steady_state(
+            *there, ambient=self.here.ambient, health=self.here.factors, **more
+        )
+        own: dict[str, Any] = {"end": float(asked.grid[-1]), "settled": asked.settled}
+        self.machines = Machines(apu, self.point, self.here, settings, asked.phasors, **own)
+        self.shaft = self._shaft()
+        self._changing = self.now.changing
+        self._middle = 0.0  # of the last step, s
+        self._columns: Columns | None = None
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)
@@ -95,15 +138,32 @@ class JointRun:
     def at_start(self) -> Row:
         """What is recorded of the first instant."""
         at_rest = self.machines.at_rest(self.point)
-        return Row(self.y, at_rest, self.now.factors, np.zeros(1))
+        return Row(self.y, at_rest, self.here.factors, np.zeros(1))
 
-    def switch(self, events: Sequence[Event], t: float) -> None:
+    def _shaft(self) -> Link:
+        shaft, N_ref = self.apu.shaft, self.here.N_ref
+        return shaft if N_ref is None else dataclasses.replace(shaft, N_ref=N_ref)
+
+    def switch(self, events: Sequence[Event | Jump], t: float) -> None:
         """Take the events of an instant, s, which are one switch, whatever their order."""
-        before, self.now = self.now, self.now.after(events)
-        if self.now.factors is not before.factors:
-            self.theta = self.apu.gas_generator.THETA.pack(self.now.factors)
-        if self.machines.switch(self.now, t) or events:
+        if self._changing and t > 0:
+            self._hold(self._middle, t)  # what the last step saw, which a block leaves open
+        self.now, self._columns = self.now.after(events), None
+        self._changing = self.now.changing
+        if self._hold(t + 2 * SAME_INSTANT, t, switched=True) or events:
             self.slope = None
+
+    def _hold(self, instant: float, t: float, *, switched: bool = False) -> bool:
+        """Hold the numbers of an instant, s, from t on; return whether a machine was switched."""
+        before, self.here = self.here, self.now.at(instant) if self._changing else self.now
+        here, gg = self.here, self.apu.gas_generator
+        if here.factors is not before.factors:
+            self.theta = gg.THETA.pack(here.factors)
+        if here.ambient is not before.ambient:
+            self.u[gg.U.indices(AMBIENT)] = [getattr(here.ambient, n) for n in AMBIENT]
+        if before.N_ref != here.N_ref:
+            self.shaft = self._shaft()
+        return self.machines.switch(self.now, here, t, switched=switched)
 
     def advance(self, k: int, until: float) -> tuple[int, Row]:
         """Go on by a block of exchange steps, or by one."""
@@ -112,18 +172,30 @@ class JointRun:
         return first_able(self._ways if free else self._ways[-1:], k)
 
     def _block(self, k: int) -> tuple[int, Row]:
-        grid = self.asked.grid[k : k + BLOCK + 1]
-        done, made = self.machines.block(self.x, self.z, self.governor, self.u, self.theta, grid)
+        grid, factors = self.asked.grid[k : k + BLOCK + 1], self.here.factors
+        state = self.x, self.z, self.governor
+        if self._changing:
+            if self._columns is None:
+                self._columns = Columns(self.apu.gas_generator, self.now, self.here, self.shaft)
+            middles = (grid[1:] + grid[:-1]) / 2
+            unit, factors = self._columns(middles)
+            done, made = self.machines.follow(*state, unit, grid, self._middle)
+            self._middle = float(middles[-1])
+        else:
+            done, made = self.machines.block(*state, self.u, self.theta, grid)
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
-        return BLOCK, self._row(done.y, made)
+        return BLOCK, self._row(done.y, made, factors)
 
-    def _row(self, y: np.ndarray, made: list[MachineMade]) -> Row:
+    def _row(
+        self, y: np.ndarray, made: list[MachineMade], factors: Mapping[str, Any] | None = None
+    ) -> Row:
         t = made[0].t
         if self.settings.waveform_dt is not None:
             for other in made[1:]:  # equal but for rounding: no generator goes before another
                 t = np.maximum(t, other.t)
-        return Row(y, self.machines.rows(made), self.now.factors, t)
+        factors = self.here.factors if factors is None else factors
+        return Row(y, self.machines.rows(made), factors, t)
 
     def _step(self, k: int) -> tuple[int, Row]:
         noise, way, gg = self.asked.noise, self.settings.way, self.apu.gas_generator
@@ -131,6 +203,9 @@ class JointRun:
             self.machines.disturb(self._rng.standard_normal, noise.w1, noise.w2)
         t0, N = float(self.asked.grid[k]), float(self.x[0])
         h = float(self.asked.grid[k + 1] - self.asked.grid[k])
+        if self._changing:
+            self._middle = t0 + h / 2
+            self._hold(self._middle, t0)
         u, theta = self.u, self.theta
 
         def machine(N: float, slope: float) -> tuple[float, list[MachineMade]]:
@@ -145,7 +220,7 @@ class JointRun:
         slope = self.slope or 0.0
         try:
             done = governed_step(
-                self.apu.shaft,
+                self.shaft,
                 way,
                 machine,
                 engine,
@@ -181,8 +256,8 @@ class JointRun:
         """Return the error of the step from instant k with its likely reason."""
         gg, (t, end) = self.apu.gas_generator, self.asked.grid[k : k + 2]
         Wf, PW = (float(v) for v in self.u[:2])
-        asked: dict[str, Any] = {"ambient": dataclasses.asdict(self.asked.ambient)}
+        asked: dict[str, Any] = {"ambient": dataclasses.asdict(self.here.ambient)}
         asked["PW"] = PW if math.isfinite(PW) else float(self.y[gg.Y.index("PW")])
-        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.now.factors, **asked)
+        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.here.factors, **asked)
         words = words or f"{error}; {validity.before(gg, t, self.y)}"
         return SimulationError(f"at t = {end:.6g} s: {words}")

@@ -87,7 +87,7 @@ class _Machine(NamedTuple):
 
 
 def block_function(
-    machines: Sequence[Fast], gas_step: ca.Function, link: Link, name: str
+    machines: Sequence[Fast], gas_step: ca.Function, link: Link, name: str, *, wide: bool = False
 ) -> ca.Function:
     """Build the block: (carry, u, theta, [u_sg, theta_sg, numbers, series, dt]) -> (last, y, ...).
 
@@ -101,6 +101,7 @@ def block_function(
         gas_step: (N, u, theta, dt, z) -> (N, y, z, residual).
         link: gearbox and governor of any group; the numbers of each are inputs.
         name: of the function.
+        wide: whether all that is held over a step comes in ``BLOCK`` columns, one for each.
     """
     law, (n_u, n_theta, n_z) = link.governor, (gas_step.numel_in(i) for i in (1, 2, 4))
     n_x = [len(m.ss.x) for m in machines]
@@ -137,12 +138,17 @@ def block_function(
     outs = [after, y, r, *(out for _, each in made.machine for out in each)]
     step = ca.Function("joint_step", [carry, *held], outs)
 
+    given_to = [*held]
+    if wide:
+        steady = [id(g.dt) for g in given]
+        given_to = [s if id(s) in steady else ca.MX.sym(s.name(), s.numel(), BLOCK) for s in held]
     now, rows = carry, []
-    for _ in range(BLOCK):
-        now, *row = step(now, *held)
+    for k in range(BLOCK):
+        these = [s[:, k] if s.size2() > 1 else s for s in given_to]
+        now, *row = step(now, *these)
         rows.append(row)
     last = [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))]
-    return ca.Function(name, [carry, *held], last)
+    return ca.Function(name, [carry, *given_to], last)
 
 
 class JointBlock(Rebuilt):
@@ -152,12 +158,15 @@ class JointBlock(Rebuilt):
         apu: the unit.
         machines: what propagates each group; a ``Propagator`` must have constant coefficients.
         links: of each group.
+        wide: whether what is held over a step changes from step to step (:meth:`followed`).
     """
 
     apu: Apu
     machines: Sequence[Fast]
 
-    def __init__(self, apu: Apu, machines: Sequence[Fast], links: Sequence[Link]) -> None:
+    def __init__(
+        self, apu: Apu, machines: Sequence[Fast], links: Sequence[Link], *, wide: bool = False
+    ) -> None:
         """Build or fetch the compiled block."""
         self.apu, self.machines = apu, tuple(machines)
         self._fixed = [
@@ -167,7 +176,7 @@ class JointBlock(Rebuilt):
         n_x = [len(m.ss.x) for m in machines]
         self._n_gov, self._n_x = len(apu.governor.X), n_x
         self._sampled = [m.advance.n_out() == 4 for m in machines]
-        self._call = _caller(apu.gas_generator.family, links[0], self.machines)
+        self._call = _caller(apu.gas_generator.family, links[0], self.machines, wide)
 
     def __call__(
         self,
@@ -184,10 +193,25 @@ class JointBlock(Rebuilt):
         Raises:
             NotApplicable: a check fails; step by step it is decided which, and what to do.
         """
-        carry = np.concatenate([N, z, governor, *x_sg])
         full = self.apu.gas_generator.full(theta)
         held = [a for own, fixed in zip(u_sg, self._fixed, strict=True) for a in (own, *fixed)]
-        last, y, residual, *rest = self._call(carry, u, full, *held)
+        return self.followed(N, z, governor, x_sg, [u, full, *held])
+
+    def followed(
+        self,
+        N: np.ndarray,
+        z: np.ndarray,
+        governor: tuple[float, ...],
+        x_sg: Sequence[np.ndarray],
+        held: Sequence[Any],
+    ) -> BlockResult:
+        """Advance ``BLOCK`` steps with all that :func:`block_function` takes beside the state.
+
+        Raises:
+            NotApplicable: a check fails; step by step it is decided which, and what to do.
+        """
+        carry = np.concatenate([N, z, governor, *x_sg])
+        last, y, residual, *rest = self._call(carry, *held)
         if not (np.all(residual <= RESIDUAL_TOL) and np.isfinite(last).all()):
             raise NotApplicable("a step of the block is not right: the cycle's residual")
         ends = np.cumsum([0, N.size, z.size, self._n_gov, *self._n_x]).tolist()
@@ -211,13 +235,14 @@ class JointBlock(Rebuilt):
         return BlockResult(N, z, tuple(x_gov.tolist()), y, made)
 
 
-def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast]) -> Caller:
+def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: bool) -> Caller:
     """One compiled block for each structure of gas generator, link and machines, and layout."""
 
     def make() -> Caller:
-        name = "joint_block_" + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
-        function = block_function(machines, family.step, link, name)
+        kind = "joint_course_" if wide else "joint_block_"
+        name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
+        function = block_function(machines, family.step, link, name, wide=wide)
         return Caller(compiled(function, level=3), copy=False)
 
-    key = (link.structure, *(m.layout for m in machines), backend_in_use())
+    key = (link.structure, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

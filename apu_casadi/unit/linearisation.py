@@ -215,6 +215,21 @@ class LinearModel:
         dy = self.C @ dx + (self.D_u @ du + self.D_theta @ dtheta)[:, None]
         return self.x0[:, None] + dx, self.y0[:, None] + dy
 
+    @property
+    def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """A, B, C, D with u and theta one after the other as inputs."""
+        B, D = np.hstack([self.B_u, self.B_theta]), np.hstack([self.D_u, self.D_theta])
+        return self.A, B, self.C, D
+
+    def to_scipy(self) -> Any:
+        """Return ``scipy.signal.StateSpace``, in deviations from the operating point.
+
+        Its inputs are u and theta, one after the other; names are those of the signals here.
+        """
+        from scipy.signal import StateSpace as Linear
+
+        return Linear(*self.matrices)
+
     def to_control(self) -> Any:
         """Return ``control.StateSpace`` of python-control, in deviations from the operating point.
 
@@ -231,10 +246,7 @@ class LinearModel:
                 "'python -m pip install control'"
             ) from e
         return control.ss(
-            self.A,
-            np.hstack([self.B_u, self.B_theta]),
-            self.C,
-            np.hstack([self.D_u, self.D_theta]),
+            *self.matrices,
             states=list(self.x.names),
             inputs=[*self.u.names, *self.theta.names],
             outputs=list(self.y.names),
@@ -252,31 +264,41 @@ def _step(signals: Signals, values: Mapping[str, float] | None) -> np.ndarray:
 
 
 @kept
-def _eliminated(ss: StateSpace) -> ca.Function:
-    """(x, u, theta) -> xdot, y, alg, d(xdot, y)/d(x, u, theta), with one search for z in all."""
+def _eliminated(ss: StateSpace, n: int) -> ca.Function:
+    """(x, u, theta, c) -> xdot, y, alg, d(xdot, y)/d(x, u, theta), with one search for z in all.
+
+    c are the parameters of ``ss`` from the n-th on: numbers of the unit.
+    """
     sx = all(f.is_a("SXFunction") for f in (ss.f, ss.g, ss.z_of, ss.residual))
     sym = ca.SX if sx else ca.MX
     args: list[Any] = [
-        sym.sym(n, len(s)) for n, s in (("x", ss.x), ("u", ss.u), ("theta", ss.theta))
+        sym.sym(label, m) for label, m in (("x", len(ss.x)), ("u", len(ss.u)), ("theta", n))
     ]
+    c = sym.sym("c", len(ss.theta) - n)
+    x, u, theta = args[0], args[1], ca.vertcat(args[2], c)
     # inlined, so that the search for z, which f, g and z_of each hold, is found to be the same
-    xdot, y, z = (f.call(args, True, False)[0] for f in (ss.f, ss.g, ss.z_of))
-    alg = ss.residual.call([args[0], z, *args[1:]], True, False)[1]
+    xdot, y, z = (f.call([x, u, theta], True, False)[0] for f in (ss.f, ss.g, ss.z_of))
+    alg = ss.residual.call([x, z, u, theta], True, False)[1]
     xdot, y, alg = ca.cse([xdot, y, alg])
     J = ca.densify(ca.jacobian(ca.vertcat(xdot, y), ca.vertcat(*args)))
-    return ca.Function(f"{ss.name}_linear", args, [xdot, y, alg, J], {"cse": True})
+    return ca.Function(f"{ss.name}_linear", [*args, c], [xdot, y, alg, J], {"cse": True})
 
 
 @kept
-def _explicit(ss: StateSpace, equations: ca.Function) -> ca.Function:
-    """(x, z, u, theta) -> xdot, y, alg, d(xdot, y, alg)/d(x, u, theta, z)."""
+def _explicit(equations: ca.Function, name: str, n: int) -> ca.Function:
+    """(x, z, u, theta, c) -> xdot, y, alg, d(xdot, y, alg)/d(x, u, theta, z).
+
+    c are the parameters of ``equations`` from the n-th on: numbers of the unit.
+    """
+    sizes = [equations.size1_in(i) for i in range(4)]
     x, z, u, theta = args = [
-        ca.MX.sym(n, len(s))
-        for n, s in (("x", ss.x), ("z", ss.z), ("u", ss.u), ("theta", ss.theta))
+        ca.MX.sym(label, m)
+        for label, m in zip(("x", "z", "u", "theta"), [*sizes[:3], n], strict=True)
     ]
-    xdot, alg, y = equations(*args)
+    c = ca.MX.sym("c", sizes[3] - n)
+    xdot, alg, y = equations(x, z, u, ca.vertcat(theta, c))
     J = ca.densify(ca.jacobian(ca.vertcat(xdot, y, alg), ca.vertcat(x, u, theta, z)))
-    return ca.Function(f"{ss.name}_linear_z", args, [xdot, y, alg, J])
+    return ca.Function(f"{name}_linear_z", [*args, c], [xdot, y, alg, J])
 
 
 def linearise(
@@ -290,13 +312,14 @@ def linearise(
 ) -> LinearModel:
     """Linearise a model about a point, which need not be steady.
 
-    The functions are built at the first call for a model and kept.
+    The functions are built at the first call for a model, or another unit of its family, and kept.
 
     Args:
         ss: the model.
         x, u, theta: packed vectors, shapes (nx,), (nu,), (nt,), SI.
-        equations, z: the same model as Function (x, z, u, theta) -> (ode, alg, y), and its solved
-            algebraic unknowns, shape (nz,); with both no search is made, which is faster.
+        equations, z: the same model, or its family, as Function (x, z, u, theta) -> (ode, alg, y),
+            and its solved algebraic unknowns, shape (nz,); with both no search is made, which is
+            faster.
 
     Raises:
         SignalError: a wrong shape, a value that is not finite, or one of equations and z alone.
@@ -309,13 +332,18 @@ def linearise(
         _vector(ss, label, signals, value)
         for label, signals, value in (("x", ss.x, x), ("u", ss.u, u), ("theta", ss.theta, theta))
     )
+    nt, numbers = len(ss.theta), np.array(ss.numbers)
     if equations is None:
-        out = _eliminated(ss)(x0, u0, theta0)
+        made = _eliminated(ss if ss.family is None else ss.family, nt)
+        out = made(x0, u0, theta0, numbers)
     else:
-        out = _explicit(ss, equations)(x0, _vector(ss, "z", ss.z, z), u0, theta0)
+        of_family = equations.size1_in(3) > nt
+        made = _explicit(equations, ss.name, nt)
+        z0 = _vector(ss, "z", ss.z, z)
+        out = made(x0, z0, u0, theta0, numbers if of_family else np.zeros(0))
     xdot, y, alg = (o.full().reshape(-1) for o in out[:3])
     J = out[3].full()
-    nx, nu, nt, ny = len(ss.x), len(ss.u), len(ss.theta), len(ss.y)
+    nx, nu, ny = len(ss.x), len(ss.u), len(ss.y)
 
     def at() -> str:
         given = {**ss.x.unpack(x0), **ss.u.unpack(u0), **ss.theta.unpack(theta0)}
@@ -370,7 +398,7 @@ def linearise_gas_generator(gg: GasGenerator, point: OperatingPoint) -> LinearMo
     ambient conditions.
     """
     return linearise(
-        gg.state_space, point.x, point.u, point.theta, equations=gg.equations, z=point.z
+        gg.state_space, point.x, point.u, point.theta, equations=gg.family.equations, z=point.z
     )
 
 
@@ -384,11 +412,19 @@ def linearise_generator(gen: Generator, point: GeneratorPoint) -> LinearModel:
     return linearise(*generator_vectors(gen, point))
 
 
-def linearise_joint(apu: Apu, point: JointPoint) -> LinearModel:
+def linearise_joint(apu: Apu, point: JointPoint, free: Sequence[str] = ()) -> LinearModel:
     """Linearise the whole governed unit at a steady point; theta holds health factors and h.
 
     Coupled by (1)-(3) with the power of every instant, not with the exchange of 20 ms.
+
+    Args:
+        apu, point: unit and point.
+        free: parameters of the unit by name (``machine.r_s``, ``gas_generator.eta_c``) that theta
+            holds as well.
+
+    Raises:
+        SignalError: unknown parameters, or some on which nothing depends.
     """
-    ss, x, u, theta = joint_vectors(apu, point)
-    equations = joint_equations(apu, load_kind(point.generator))
+    ss, x, u, theta = joint_vectors(apu, point, tuple(free))
+    equations = joint_equations(apu, load_kind(point.generator), tuple(free))
     return linearise(ss, x, u, theta, equations=equations, z=point.gas.z)

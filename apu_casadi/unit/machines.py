@@ -7,8 +7,8 @@ exchange steps where all can, else by single steps, each with the integrator tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,14 +33,27 @@ class Of(NamedTuple):
     Args:
         numbers: which they are.
         means: as they were averaged, or as they are kept.
-        fault: of each.
+        fault: of each; or severities by name, one for each step.
         w: waveforms, shape (``WAVEFORMS``, samples).
     """
 
     numbers: tuple[int, ...]
     means: RawMeans | np.ndarray
-    fault: Fault | None
+    fault: Fault | Mapping[str, np.ndarray] | None
     w: np.ndarray
+
+
+class Inputs(NamedTuple):
+    """What the unit takes beside its generators in each of some steps.
+
+    Args:
+        u, theta: inputs and full theta of the gas generator, a column for each step.
+        N_ref: governed speed, rad/s, (steps,).
+    """
+
+    u: np.ndarray
+    theta: np.ndarray
+    N_ref: np.ndarray
 
 
 def kinds(apu: Apu, start: Holding, events: Sequence[Event] = ()) -> list[tuple[int, ...]]:
@@ -64,31 +77,39 @@ class Machines:
         start: what holds then.
         settings: how they are integrated.
         phasors: whether phasors are wanted too.
+        settled: whether loads and faults have been there for long, and ``point`` is of them.
+        end: of the run, s.
     """
 
     groups: list[MachineStep]
 
     def __init__(
-        self, apu: Apu, point: JointPoint, start: Holding, settings: Settings, phasors: bool
+        self,
+        apu: Apu,
+        point: JointPoint,
+        start: Holding,
+        settings: Settings,
+        phasors: bool,
+        *,
+        settled: bool = False,
+        end: float = 0.0,
     ) -> None:
-        self.apu, self.settings = apu, settings
+        self.apu, self.settings, self._end = apu, settings, end
         self.means = StepMeans(apu.generator, phasors)
-        self.groups = [
-            MachineStep(
-                apu,
-                numbers,
-                point.of(numbers[0]),
-                start.loads[numbers[0] - 1].balanced_part,
-                settings,
-                self.means,
-            )
-            for numbers in kinds(apu, start)
-        ]
+        self.groups = []
+        for numbers in kinds(apu, start):
+            at = numbers[0] - 1
+            load, fault = start.loads[at], start.faults[at]
+            if not settled:
+                load, fault = load.balanced_part, None
+            own, how = point.of(numbers[0]), (settings, self.means)
+            self.groups.append(MachineStep(apu, numbers, own, load, fault, *how))
         self._forget()
 
     def _forget(self) -> None:
         self._block: JointBlock | None = None
         self._no_block = ""
+        self._wide: tuple[list[Any], JointBlock] | None = None
 
     def samples(self, grid: np.ndarray) -> int:
         """Waveform samples of a whole run, the start included; 0 where none are stored."""
@@ -102,11 +123,19 @@ class Machines:
         for group in self.groups:
             at = point.of(group.numbers[0])
             w = np.array([[at.y[n]] for n in WAVEFORMS])
-            found.append(Of(group.numbers, self.means.at_rest(at), None, w))
+            found.append(Of(group.numbers, self.means.at_rest(at), group.phase.fault, w))
         return found
 
-    def switch(self, now: Holding, t: float) -> bool:
-        """Change loads and faults at the instant t, s, where they differ."""
+    def switch(self, now: Holding, here: Holding, t: float, *, switched: bool = True) -> bool:
+        """Change loads and faults at the instant t, s, where they differ.
+
+        Args:
+            now, here: what holds, and its numbers.
+            switched: whether this is a switch, or goes on smoothly.
+
+        Returns:
+            Whether any generator was switched, or is no longer one of its group.
+        """
         changed, after = False, list[MachineStep]()
         for group in self.groups:
             members = group.numbers
@@ -114,9 +143,12 @@ class Machines:
                 [(now.loads[k - 1], now.faults[k - 1]) for k in members]
             ).items()
             parts = [(group.part(tuple(members[i - 1] for i in at)), own) for at, own in others]
-            for step, (load, fault) in [(group, fate), *parts]:
-                changed |= step.switch(load, fault, t)
+            for step, own in [(group, fate), *parts]:
+                k = step.numbers[0] - 1
+                step.follow(*own, self._end)
+                changed |= step.switch(here.loads[k], here.faults[k], t, smooth=not switched)
                 after.append(step)
+            changed |= bool(parts)
         self.groups = sorted(after, key=lambda g: g.numbers)
         if changed:
             self._forget()
@@ -161,10 +193,9 @@ class Machines:
         Raises:
             NotApplicable: that is not possible here.
         """
-        if not all(g.settled for g in self.groups):
-            raise NotApplicable("the windings have not settled")
         if self._no_block:
             raise NotApplicable(self._no_block)
+        self._check_block(grid)
         if self._block is None:
             try:
                 fast = [g.for_blocks() for g in self.groups]
@@ -172,18 +203,56 @@ class Machines:
             except NotApplicable as error:
                 self._no_block = str(error)
                 raise
-        if np.abs(np.diff(grid) - self.settings.dt).max() > SAME_INSTANT:
-            raise NotApplicable("the steps of a block are whole exchange steps")
         states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
         done = self._block(x, z, governor, u, theta, states, inputs)
         N = float(x[0])
         pairs = zip(self.groups, done.machines, strict=True)
         return done, [g.went_on(one, N, grid) for g, one in pairs]
 
+    def _check_block(self, grid: np.ndarray) -> None:
+        if not all(g.settled for g in self.groups):
+            raise NotApplicable("the windings have not settled")
+        if np.abs(np.diff(grid) - self.settings.dt).max() > SAME_INSTANT:
+            raise NotApplicable("the steps of a block are whole exchange steps")
+
+    def follow(
+        self,
+        x: np.ndarray,
+        z: np.ndarray,
+        governor: tuple[float, ...],
+        unit: Inputs,
+        grid: np.ndarray,
+        before: float,
+    ) -> tuple[BlockResult, list[MachineMade]]:
+        """Advance the whole unit over a block whose inputs have a column for each step.
+
+        Args:
+            before: the middle of the step before the block, s.
+
+        Raises:
+            NotApplicable: that is not possible here.
+        """
+        self._check_block(grid)
+        middles = (grid[1:] + grid[:-1]) / 2
+        given = [g.columns(middles, before) for g in self.groups]
+        fast = [one for one, _ in given]
+        layouts = [one.layout for one in fast]
+        if self._wide is None or self._wide[0] != layouts:
+            links = [g.link for g in self.groups]
+            self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
+        held: list[Any] = [unit.u, unit.theta]
+        for g, (one, own) in zip(self.groups, given, strict=True):
+            numbers = g.numbers_of_link
+            numbers[0] = unit.N_ref
+            held += [own.u, own.theta, numbers, own.vector, one.dt]
+        done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held)
+        N, pairs = float(x[0]), zip(self.groups, done.machines, given, strict=True)
+        return done, [g.went_on(one, N, grid, own.severity) for g, one, (_, own) in pairs]
+
     def rows(self, made: Sequence[MachineMade]) -> list[Of]:
         """What is to be recorded of what the groups made."""
         pairs = zip(self.groups, made, strict=True)
-        return [Of(g.numbers, m.means, g.phase.fault, m.w) for g, m in pairs]
+        return [Of(g.numbers, m.means, m.severity or g.phase.fault, m.w) for g, m in pairs]
 
     @property
     def V_ref(self) -> float | list[float]:

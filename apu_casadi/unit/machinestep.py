@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
+from apu_casadi.machine.course import Numbers
 from apu_casadi.machine.generator import Generator, GeneratorPoint
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import who
@@ -23,9 +25,10 @@ from apu_casadi.unit.integrators import (
     Phase,
     Settings,
     Step,
+    Way,
     integrators,
 )
-from apu_casadi.unit.jointstep import MachineBlock
+from apu_casadi.unit.jointstep import BLOCK, MachineBlock
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
 if TYPE_CHECKING:
@@ -44,12 +47,14 @@ class MachineMade(NamedTuple):
         x: state at the end.
         means: over the step, or over each.
         t, w: instants of the samples, s, and waveforms, shape (``WAVEFORMS``, samples).
+        severity: of a fault that changes over a block, by name.
     """
 
     x: np.ndarray
     means: RawMeans
     t: np.ndarray
     w: np.ndarray
+    severity: dict[str, np.ndarray] | None = None
 
 
 class MachineStep:
@@ -57,7 +62,7 @@ class MachineStep:
 
     Args:
         apu, numbers: the unit, and which of its generators they are, from 1.
-        point, load: the steady state to start from, and its load.
+        point, load, fault: the steady state to start from, and what holds in it.
         settings: how it is integrated.
         means: what is averaged.
     """
@@ -80,6 +85,7 @@ class MachineStep:
         numbers: tuple[int, ...],
         point: GeneratorPoint,
         load: Load,
+        fault: Fault | None,
         settings: Settings,
         means: StepMeans,
     ) -> None:
@@ -92,8 +98,10 @@ class MachineStep:
         self.nsteps = self.propagated = 0
         self.spikes: list[str] = []
         self._since = math.inf  # s since the last switch
-        symmetric = load.balanced and not settings.noisy
-        self._enter(Phase(self.gen, load, None, point.ss, self.u, np.zeros(0), symmetric))
+        self._way: Way | None = None
+        self._asked: tuple[Any, Any] = (load, fault)
+        symmetric = point.balanced and not settings.noisy
+        self._enter(Phase(self.gen, load, fault, point.ss, self.u, point.theta, symmetric))
 
     def part(self, numbers: tuple[int, ...]) -> MachineStep:
         """Let some of the generators go their own way from now on; returns them."""
@@ -104,21 +112,45 @@ class MachineStep:
         rest = tuple(k for k in self.numbers if k not in numbers)
         for part, its in ((self, rest), (other, numbers)):
             part.numbers, part._of_all = its, False
-            part.link = dataclasses.replace(self.link, pairs=len(its) / 2)
+            part.link, part._linked = dataclasses.replace(self.link, pairs=len(its) / 2), None
         return other
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
-        self._integrators = integrators(phase, self.settings, self.means)
-        self._at = phase.ss.u.index("w_r")
+        self._integrators = integrators(phase, self.settings, self.means, self._way)
+        self._at, self._V_ref_at = phase.ss.u.indices(["w_r", "V_ref"])
+        self._same: tuple[MeanStep | Propagator, Numbers] | None = None
+        self._linked: np.ndarray | None = None
 
-    def switch(self, load: Load, fault: Fault | None, t: float) -> bool:
-        """Change load and fault at the instant t, s, where they differ; the flux linkages stay."""
+    def follow(self, load: Any, fault: Any, end: float) -> None:
+        """Take what load and fault are made of, until the end of the run, s."""
+        if (load, fault) == self._asked:
+            return
+        self._asked = (load, fault)
+        changing = any(isinstance(x, Varying) for x in (load, fault))
+        self._way = Way(load, fault, end) if changing else None
+        self._enter(self.phase)
+
+    def switch(self, load: Load, fault: Fault | None, t: float, *, smooth: bool = False) -> bool:
+        """Change load and fault at the instant t, s, where they differ; the flux linkages stay.
+
+        Args:
+            smooth: they go on along their profiles, which is no switch unless the model changes.
+
+        Returns:
+            Whether there was a switch.
+        """
         old = self.phase
         if load == old.load and fault == old.fault:
             return False
         ss, theta = self.gen.variant(load, fault), self.gen.fault_vector(load, fault)
         u = self.gen.inputs(load, w_r=self.w_r, V_ref=self.V_ref)
+        if smooth and ss == old.ss:
+            self.u = u
+            self.phase = dataclasses.replace(old, load=load, fault=fault, u=u, theta=theta)
+            for each in self._integrators:
+                each.phase = self.phase
+            return False
         self.x = self.gen.transfer(
             self.x, old.ss, ss, u=self.u, theta=old.theta, u_target=u, theta_target=theta
         )
@@ -161,8 +193,40 @@ class MachineStep:
         """Return what propagates over many steps at once; else NotApplicable."""
         return self._integrators[0].for_blocks()
 
-    def went_on(self, done: MachineBlock, N: float, grid: np.ndarray) -> MachineMade:
-        """Go on from the end of a block over a grid, s, which began at the rotor speed N, rad/s."""
+    def columns(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
+        """Return what propagates over the steps of a block, and what it takes in each.
+
+        Args:
+            t, before: middles of the steps and of the one before, s.
+
+        Raises:
+            NotApplicable: exact propagation does not hold, or numbers change too fast.
+        """
+        if self._same is not None:
+            return self._same
+        fast, now = self._integrators[0].columns(t, before)
+        inputs = now.u.copy()
+        inputs[self._V_ref_at] = self.V_ref
+        made = fast, now._replace(u=inputs)
+        if self._way is None:
+            self._same = made
+        return made
+
+    @property
+    def numbers_of_link(self) -> np.ndarray:
+        """Numbers of the gearbox and the governor in a column for each step of a block."""
+        if self._linked is None:
+            self._linked = np.repeat(self.link.numbers[:, None], BLOCK, axis=1)
+        return self._linked
+
+    def went_on(
+        self, done: MachineBlock, N: float, grid: np.ndarray, severity: Any = ()
+    ) -> MachineMade:
+        """Go on from the end of a block over a grid, s, which began at the rotor speed N, rad/s.
+
+        Args:
+            severity: of the fault in each step, in the order of its names, where it changes.
+        """
         fast = self._integrators[0]
         t, w = fast.waves(done.waves, grid)
         self.propagated += grid.size - 1
@@ -170,4 +234,7 @@ class MachineStep:
         h, symmetric = self.settings.dt, self.phase.symmetric
         means = RawMeans.of(fast.quad, symmetric, done.means, h, self.w_r, grid[1:])
         self.x = done.x
-        return MachineMade(done.x, means, t, w)
+        fault = self.phase.fault
+        changing = self._way is not None and fault is not None and len(severity)
+        names = [s.name for s in fault.severities] if changing and fault is not None else []
+        return MachineMade(done.x, means, t, w, dict(zip(names, severity, strict=True)) or None)

@@ -39,10 +39,21 @@ import numpy as np
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityWarning, nearest
 from apu_casadi.core.means import RMS
+from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, run
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.events import Ambient, Event, all_factors, in_order
+from apu_casadi.unit.events import (
+    STARTS,
+    Ambient,
+    Event,
+    Holding,
+    Jump,
+    SpeedChange,
+    all_factors,
+    in_order,
+    jumps,
+)
 from apu_casadi.unit.exchange import EXCHANGES
 from apu_casadi.unit.integrators import SOLVERS, WAVEFORMS, Settings, ramped
 from apu_casadi.unit.jointrun import Asked, JointRun
@@ -52,16 +63,22 @@ from apu_casadi.unit.recorder import Recorder, stored_severities
 from apu_casadi.unit.stepmeans import MEANS
 
 if TYPE_CHECKING:
+    from typing import TypeAlias
+
     import xarray as xr
 
     from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
+
+    ALoad: TypeAlias = Load | Varying[Load]
+    AFault: TypeAlias = Fault | Varying[Fault | None] | None
 
 __all__ = [
     "EXCHANGES",
     "MEANS",
     "RMS",
     "SOLVERS",
+    "STARTS",
     "WAVEFORMS",
     "Noise",
     "exchange_grid",
@@ -70,8 +87,8 @@ __all__ = [
 ]
 
 
-def exchange_grid(duration: float, dt: float, events: Sequence[Event]) -> np.ndarray:
-    """Instants, s, of the exchange: multiples of dt, every event, and the end."""
+def exchange_grid(duration: float, dt: float, events: Sequence[Event | Jump]) -> np.ndarray:
+    """Instants, s, of the exchange: multiples of dt, every event or jump, and the end."""
     if not (math.isfinite(duration) and duration > 0):
         raise ScenarioError(f"duration must be > 0 s, got {duration!r}")
     if not (math.isfinite(dt) and 0 < dt <= 1.0):
@@ -88,10 +105,11 @@ def simulate_joint(
     apu: Apu,
     *,
     duration: float,
-    load: Load | Sequence[Load],
-    ambient: Ambient | None = None,
-    health: Mapping[str, float] | None = None,
-    fault: Fault | Sequence[Fault | None] | Mapping[int, Fault | None] | None = None,
+    load: ALoad | Sequence[ALoad],
+    ambient: Ambient | Varying[Ambient] | None = None,
+    health: Mapping[str, float | Profile] | None = None,
+    fault: AFault | Sequence[AFault] | Mapping[int, AFault] = None,
+    N_ref: float | Profile | None = None,
     events: Sequence[Event] = (),
     dt: float = 0.02,
     exchange: str = "paper",
@@ -101,6 +119,7 @@ def simulate_joint(
     seed: int | None = None,
     hook: Callable[[int, np.ndarray], np.ndarray] | None = None,
     solver: str = "auto",
+    start_from: str = "balanced",
     rtol: float = 1e-8,
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
@@ -110,20 +129,27 @@ def simulate_joint(
 ) -> xr.Dataset:
     """Simulate gas generator, generators and governor together, from a steady start.
 
-    Nothing moves before the first event.  A fault or an unbalanced load given for the start acts
-    from t = 0 on the steady healthy, balanced unit.
+    Nothing moves before the first event.  Factors, speed, and the numbers of loads, faults and the
+    day may be profiles (:func:`apu_casadi.core.profiles.profile.varying`), held over each step at
+    their value in its middle; where one jumps, a step begins.  A fault or an unbalanced load given
+    for the start acts from t = 0 on the steady healthy, balanced unit; or, with
+    ``start_from="settled"``, it has been there for long, and the run starts in the periodic state
+    of all generators.
 
     Args:
         apu, load, fault: the unit; load and fault from the start, of all generators, or a list with
             one for each; for the fault also a mapping by number of the generator, from 1.
         duration, dt: of the run, and exchange step, s.
         ambient, health: day (the default one if not given), and factors by name.
-        events: :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`.
+        N_ref: governed rotor speed, rad/s; default the unit's.
+        events: :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`,
+            :class:`SpeedChange`.
         exchange: one of ``EXCHANGES``, see the module's text.
         waveform_dt: sampling of the stored waveforms, s; None stores none.
         phasors: store fundamental phasors of voltages and currents of each exchange step, too.
         noise, seed: uncertainty and the seed of its random numbers.
         hook: processes the rotor speed between state update and output (Algorithm 2).
+        start_from: one of ``STARTS``, as above.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
         progress: called with (done, total) seconds.
         attrs: more attributes for the dataset.
@@ -133,8 +159,9 @@ def simulate_joint(
     Returns:
         xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms), see
         :mod:`apu_casadi.core.results`; what belongs to a generator also on ``generator`` where
-        they do not stay equal.  Attributes: what was asked, ``exchange_error`` (NaN with
-        state noise or a hook), ``validity`` and ``warnings``.
+        they do not stay equal; profiles as they were held.  Attributes: what was asked,
+        ``exchange_error`` (NaN with state noise, a hook or another governed speed), ``validity``
+        and ``warnings``.
 
     Warns:
         ValidityWarning, ExchangeWarning: see :mod:`apu_casadi.unit.validity`.
@@ -147,37 +174,38 @@ def simulate_joint(
     duration = number("duration", duration, error=ScenarioError)
     settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
     events = in_order(events, duration, generators=len(apu.machines))
+    start = Holding(
+        apu.each("load", load),
+        apu.each_fault(fault),
+        all_factors(health),
+        Ambient() if ambient is None else ambient,
+        None if N_ref is None else SpeedChange(0.0, N_ref).N_ref,
+    )
+    stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
     asked = Asked(
-        loads=apu.each("load", load),
-        faults=apu.each("fault", _by_number(apu, fault)),
-        ambient=Ambient() if ambient is None else ambient,
-        health=all_factors(health),
-        grid=exchange_grid(duration, settings.dt, events),
+        start=start,
+        grid=exchange_grid(duration, settings.dt, stops),
         phasors=phasors,
         noise=noise,
         seed=seed,
         hook=hook,
+        settled=_settled(start_from),
     )
     rng = np.random.default_rng(seed)
     system = JointRun(apu, asked, settings, rng)
     samples = system.machines.samples(asked.grid)
     means = {k: means_of(apu, k, phasors) for k in kinds(apu, system.now, events)}
-    severities = stored_severities(events, *asked.faults)
+    severities = stored_severities(events, *start.faults)
     record = Recorder(apu.gas_generator, asked.grid, samples, means, storage, severities)
     record.put(0, 1, system.at_start())
-    run(system, asked.grid, events, record=record.put, progress=progress)
+    run(system, asked.grid, stops, record=record.put, progress=progress)
     return _concluded(system, record, rng, exchange, events, warn_exchange, attrs or {})
 
 
-def _by_number(apu: Apu, fault: Any) -> Any:
-    """Return a mapping of faults by number as a list."""
-    if not isinstance(fault, Mapping):
-        return fault
-    n = len(apu.machines)
-    for k in fault:
-        if k not in range(1, n + 1):
-            raise ScenarioError(f"fault: generator {k!r}, but the unit has 1 to {n}")
-    return [fault.get(k) for k in range(1, n + 1)]
+def _settled(start_from: str) -> bool:
+    if start_from not in STARTS:
+        raise ScenarioError(f"start_from {start_from!r} {nearest(str(start_from), STARTS)}")
+    return start_from == "settled"
 
 
 def _settings(
@@ -218,8 +246,9 @@ def _concluded(
     rows, grid = record.instants(), asked.grid
     N, Wf = (np.asarray(rows[n]) for n in ("N", "Wf"))
     lost = math.nan
-    # state noise is drawn for each step: no other exchange has it
-    if asked.hook is None and not asked.noise.N:
+    # state noise is drawn for each step: no other exchange has it; the estimate has one speed
+    steered = asked.start.N_ref is not None or any(isinstance(e, SpeedChange) for e in events)
+    if asked.hook is None and not asked.noise.N and not steered:
         lost = validity.exchange_error(apu, system.point.gas, grid, N, Wf).error
     status = {
         "solver": settings.solver,
@@ -234,19 +263,20 @@ def _concluded(
         "V_ref": machines.V_ref,
     }
     told = runrecord.asked(
-        loads=asked.loads,
-        faults=asked.faults,
-        ambient=asked.ambient,
+        start=asked.start,
         events=events,
         seed=asked.seed,
     )
     told = {"solver": json.dumps(status), **told, "exchange_error": lost, **attrs}
-    ds = record.collect(apu, rows, asked.noise, rng, told)
+    more, signals = runrecord.followed(asked.start, events, grid)
+    ds = record.collect(apu, {**rows, **more}, asked.noise, rng, told, signals)
     notes = [ApuWarning(words) for words in (*machines.spikes, *record.warnings)]
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
     starved = validity.fuel_limited(apu, grid, N, Wf)
     unserved = [
-        validity.unserved(asked.loads[k[0] - 1], events, grid, P_e, k, of_all=len(record.of) == 1)
+        validity.unserved(
+            asked.start.loads[k[0] - 1], events, grid, P_e, k, of_all=len(record.of) == 1
+        )
         for k, P_e in record.of_each("P_e", rows).items()
     ]
     notes += [ValidityWarning(words) for words in (starved, *unserved) if words]

@@ -12,6 +12,7 @@ import numpy as np
 
 from apu_casadi.core.filearrays import RowFile
 from apu_casadi.core.measuring import measure
+from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.results import dataset
 from apu_casadi.core.runstorage import PIECE, place, row_file
 from apu_casadi.core.signals import Signal, Signals
@@ -40,13 +41,13 @@ class Row(NamedTuple):
     Args:
         y: outputs of the gas generator, shape (ny,) or (ny, steps).
         of: what each group of generators gave.
-        factors: health by name.
+        factors: health by name; numbers, or one for each step.
         t: instants of the waveform samples, s.
     """
 
     y: np.ndarray
     of: Sequence[Of]
-    factors: Mapping[str, float]
+    factors: Mapping[str, Any]
     t: np.ndarray
 
 
@@ -66,7 +67,7 @@ class _Kept:
     def __init__(self, numbers: tuple[int, ...], means: StepMeans, severities: Signals) -> None:
         self.numbers, self.of_step, self.severities = numbers, means, severities
         self._raw, self._raw_at = list[RawMeans](), 0
-        self._fault: Fault | None = None
+        self._fault: Fault | Mapping[str, np.ndarray] | None = None
         self._column = self._now(None)
 
     def allocate(self, steps: int, samples: int) -> None:
@@ -83,10 +84,12 @@ class _Kept:
             self._fault, self._column = row.fault, self._now(row.fault)
         self.severe[:, at] = self._column
 
-    def _now(self, fault: Fault | None) -> np.ndarray:
-        """Return the severities under a fault or without one, as a column."""
-        values = {} if fault is None else fault.severity
-        return np.array([[values.get(s.name, s.default or 0.0)] for s in self.severities])
+    def _now(self, fault: Fault | Mapping[str, np.ndarray] | None) -> np.ndarray:
+        """Return the severities under a fault or without one, as a column, or one for each step."""
+        given = fault if fault is None or isinstance(fault, Mapping) else fault.severity
+        values = given or {}
+        rows = [values.get(s.name, s.default or 0.0) for s in self.severities]
+        return _columns(rows)
 
     def _later(self, at: int, means: RawMeans) -> None:
         """Take means whose rms values are made together with those of their neighbours."""
@@ -156,7 +159,7 @@ class Recorder:
         self._first = self._end = 0  # instants in the arrays
         self._first_w = self._n = 0  # samples before those in the arrays, and in them
         self._residual = 0.0
-        self._factors: Mapping[str, float] | None = None
+        self._factors: Mapping[str, Any] | None = None
         self.file: RowFile | None = None
         where = place(size, storage)
         if where is None:
@@ -183,7 +186,7 @@ class Recorder:
         self.Y[:, at] = row.y.reshape(-1, n)
         if row.factors is not self._factors:
             self._factors = row.factors
-            self._column = np.array([*row.factors.values()])[:, None]
+            self._column = _columns([*row.factors.values()])
         self.held[:, at] = self._column
         parts = [next(of for of in row.of if kept.numbers[0] in of.numbers) for kept in self.of]
         for kept, of in zip(self.of, parts, strict=True):
@@ -333,10 +336,15 @@ class Recorder:
         noise: Noise,
         rng: np.random.Generator,
         attrs: Mapping[str, Any],
+        more: Sequence[Signal] = (),
     ) -> xr.Dataset:
-        """Put the run into a labelled dataset, with what noisy sensors read of it."""
+        """Put the run into a labelled dataset, with what noisy sensors read of it.
+
+        Args:
+            more: signals of what stands in the run beside the own ones.
+        """
         gg, y_sg, size = self.gg, apu.generator.state_space().y, len(self._by_number)
-        signals = [*gg.Y, *phasor_signals(), *self.severities, *_powers(size)]
+        signals = [*gg.Y, *phasor_signals(), *self.severities, *_powers(size), *more]
 
         def measured(signal: Any, values: np.ndarray) -> dict[str, Any]:
             name = f"{signal.name}_meas"
@@ -359,9 +367,19 @@ class Recorder:
         return dataset(times, values, signals=signals, attrs=told, generators=size)
 
 
-def stored_severities(events: Iterable[Event], *others: Fault | None) -> Signals:
+def _columns(rows: Sequence[Any]) -> np.ndarray:
+    """Return numbers, or arrays with one for each step, as rows of a matrix."""
+    size = max(np.size(row) for row in rows)
+    made = np.empty((len(rows), size))
+    for i, row in enumerate(rows):
+        made[i] = row
+    return made
+
+
+def stored_severities(events: Iterable[Event], *others: Any) -> Signals:
     """Return what a run stores of the severity of its faults, the TTSC's always."""
-    faults = (*(e.fault for e in events if isinstance(e, FaultChange)), *others)
+    given = (*(e.fault for e in events if isinstance(e, FaultChange)), *others)
+    faults = (f.example() if isinstance(f, Varying) else f for f in given)
     stored = [*_STORED, *(s for f in faults if f is not None for s in f.severities)]
     return Signals({s.name: s for s in stored}.values())
 

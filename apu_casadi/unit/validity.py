@@ -32,6 +32,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ApuWarning, ExchangeWarning, OperatingPointError, ValidityWarning
+from apu_casadi.core.profiles.profile import Varying, at, later
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
@@ -156,7 +157,7 @@ def fuel_limited(apu: Apu, t: np.ndarray, N: np.ndarray, Wf: np.ndarray) -> str 
 
 
 def unserved(
-    load: Load,
+    load: Load | Varying[Load],
     events: Sequence[Event],
     t: np.ndarray,
     P_e: np.ndarray,
@@ -174,13 +175,16 @@ def unserved(
     """
     of_these = (None, numbers[0])
     changes = [
-        (e.t, e.load) for e in events if isinstance(e, LoadChange) and e.generator in of_these
+        (e.t, later(e.load, e.t))
+        for e in events
+        if isinstance(e, LoadChange) and e.generator in of_these
     ]
     starts = [(0.0, load), *changes]
     for (start, x), end in zip(starts, [*(s for s, _ in changes), float(t[-1])], strict=True):
         k = int(np.searchsorted(t, end + 1e-9)) - 1
         if end - start < SETTLED:
             continue
+        x = at(x, float(t[max(k, 1) - 1 : k + 1].mean()))
         if P_e[k] < 0.9 * x.demand:
             each = "each generator" if of_all else who(numbers)
             return (

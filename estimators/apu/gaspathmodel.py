@@ -211,7 +211,7 @@ def gas_path_model(
     engines = gg.by_parameters if free else gg.family
     how: dict[str, Any] = {"power": power, "gains": gains, "consider": consider, "walks": walks}
     how |= {"governed": governed, "power_jumps": power_jumps, "sensors": sensors}
-    made = _family(engines, **how).unit(gg)
+    made = _family(engines, **how).member(gg.held)
     return augment(made, dict(free)) if free else made
 
 

@@ -69,15 +69,12 @@ class FilterStep(Parametric):
             triangular factors L of the covariance L L'.
         wide: makes the same filter in square-root form, for beliefs whose covariance double
             precision does not hold; None where there is none.
-        family: the step of the model's family, which is what :func:`run` runs, with the numbers of
-            the unit as arguments; None if the model has none.
     """
 
     model: FilterModel
     function: ca.Function
     root: bool = False
     wide: Callable[[], FilterStep] | None = None
-    family: FilterStep | None = None
 
     def __post_init__(self) -> None:
         f, (nx, nu, np_, _, ny) = self.function, self.model.sizes
@@ -96,6 +93,11 @@ class FilterStep(Parametric):
                 )
 
     @property
+    def family(self) -> FilterStep | None:
+        """The step of the model's family, which :func:`run` runs with the numbers of the unit."""
+        return self.__dict__.get("_family")
+
+    @property
     def shared(self) -> FilterStep:
         """The family's step, or the step itself if it has none: what to make functions of."""
         return self if self.family is None else self.family
@@ -112,7 +114,9 @@ class FilterStep(Parametric):
         out = f.call([m, P, u, like.full(p), y, R, dt])
         made = ca.Function(f.name(), [m, P, u, p, y, R, dt], out, f.name_in(), f.name_out())
         wide = None if self.wide is None else partial(_wide_unit, self.wide, like)
-        return FilterStep(like, made, self.root, wide, self)
+        step = FilterStep(like, made, self.root, wide)
+        step.__dict__["_family"] = self
+        return step
 
     @property
     def gives_roots(self) -> bool:

@@ -27,7 +27,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -37,12 +37,11 @@ from apu_casadi.core.discretisation import linearly_implicit_midpoint
 from apu_casadi.core.errors import ParameterError, SignalError, nearest
 from apu_casadi.core.sharing import Parametric, derived, of_family, remade
 from apu_casadi.core.signals import Signal, Signals
-from apu_casadi.core.statespace import StateSpace
+from apu_casadi.core.statespace import StateSpace, moves
 
 __all__ = [
     "CHECK_TOL",
     "FilterModel",
-    "Numbered",
     "Unknown",
     "augment",
     "biases",
@@ -91,14 +90,6 @@ class Unknown:
             raise ParameterError("Unknown: a considered parameter is a constant, walk must be 0")
 
 
-class Numbered(Protocol):
-    """What tells the numbers of a unit by name: a model of one, or the unit itself."""
-
-    @property
-    def held(self) -> dict[str, float]:
-        """The numbers."""
-
-
 @dataclass(frozen=True, eq=False)
 class FilterModel(Parametric):
     """A discrete-time model with named vectors; see the module's text.
@@ -112,8 +103,6 @@ class FilterModel(Parametric):
         walk: random-walk standard deviations, unit of x per sqrt(s), shape (nx,).
         lower, upper: bounds of x, shape (nx,).
         consider: states whose mean and variance the measurements do not touch.
-        family: the model whose known parameters are the unit's numbers, too; None if it has none.
-        numbers: what the family's p has beyond this one's, in its order.
 
     Raises:
         SignalError: a function's or vector's shape does not match the declared signals; a walk, a
@@ -132,8 +121,6 @@ class FilterModel(Parametric):
     lower: np.ndarray
     upper: np.ndarray
     consider: tuple[str, ...] = ()
-    family: FilterModel | None = field(default=None, repr=False)
-    numbers: tuple[float, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         nx, nu, np_, nw, ny = (len(s) for s in (self.x, self.u, self.p, self.w, self.y))
@@ -153,11 +140,6 @@ class FilterModel(Parametric):
             if shape != (nx,):
                 raise SignalError(f"{self.name}.{label}: shape ({nx},) expected, got {shape}")
         fixed = self.x.indices(self.consider)
-        if len(self.shared.p) - len(self.p) != len(self.numbers):
-            raise SignalError(
-                f"{self.name}: {len(self.numbers)} numbers for the "
-                f"{len(self.shared.p) - len(self.p)} parameters of its family"
-            )
         for i, s in enumerate(self.x):
             if not (math.isfinite(self.walk[i]) and self.walk[i] >= 0):
                 raise SignalError(
@@ -214,6 +196,14 @@ class FilterModel(Parametric):
         return cls(name, x, u, p, w, y, f, g, walk, lower, upper, held)
 
     @property
+    def family(self) -> FilterModel | None:
+        """The model whose known parameters are the unit's numbers, too; None if it has none.
+
+        Not a field: ``dataclasses.replace`` makes a model with functions of its own.
+        """
+        return self.__dict__.get("_family")
+
+    @property
     def shared(self) -> FilterModel:
         """The family, or the model itself if it has none: what to make functions of."""
         return self if self.family is None else self.family
@@ -221,8 +211,7 @@ class FilterModel(Parametric):
     @property
     def held(self) -> dict[str, float]:
         """Its numbers by name."""
-        names = [n for n in self.shared.p.names if n not in self.p]
-        return dict(zip(names, self.numbers, strict=True))
+        return dict(self.__dict__.get("_held", {}))
 
     @derived
     def _order(self) -> list[int]:
@@ -233,12 +222,16 @@ class FilterModel(Parametric):
     def full(self, p: Any) -> Any:
         """Return p of :attr:`shared`: this model's, shape (np,) or symbols, and its numbers."""
         if isinstance(p, ca.SX | ca.MX):
-            return ca.vertcat(p, ca.DM(list(self.numbers)))[self._order]
-        return np.append(p, self.numbers)[self._order]
+            return ca.vertcat(p, ca.DM([*self.held.values()]))[self._order]
+        return np.append(p, [*self.held.values()])[self._order]
 
-    def unit(self, like: Numbered) -> FilterModel:
-        """Return the model of one unit: this one's with those of its p held that ``like`` holds."""
-        numbers = {n: v for n, v in like.held.items() if n in self.p}
+    def unit(self, like: StateSpace | FilterModel) -> FilterModel:
+        """Return the member of this family that has the numbers of ``like``."""
+        return self.member(like.held)
+
+    def member(self, numbers: Mapping[str, float]) -> FilterModel:
+        """Return the model of one unit: this one's with its numbers, as far as p has them, held."""
+        numbers = {n: v for n, v in numbers.items() if n in self.p}
         scalar = self.transition.is_a("SXFunction") and self.output.is_a("SXFunction")
         x, u, _, w, dt = self.symbols(ca.SX if scalar else ca.MX)
         own = Signals([s for s in self.p if s.name not in numbers])
@@ -248,8 +241,8 @@ class FilterModel(Parametric):
         signals = self.x, self.u, own, self.w, self.y
         step, seen = self.transition(x, u, full, w, dt), self.output(x, u, full, w)
         made = FilterModel.of(self.name, signals, (x, u, p, w, dt), step, seen, like=self)
-        held = tuple(numbers[n] for n in self.p.names if n in numbers)
-        return dataclasses.replace(made, family=self, numbers=held)
+        made.__dict__.update(_family=self, _held=numbers)
+        return made
 
     @property
     def sizes(self) -> tuple[int, int, int, int, int]:
@@ -472,11 +465,10 @@ def augment(model: FilterModel, unknowns: Mapping[str, Unknown]) -> FilterModel:
     """
     moved = model.p.indices(list(unknowns))
     for i, name in zip(moved, unknowns, strict=True):
-        of = model.transition.jac_sparsity(0, 2), model.output.jac_sparsity(0, 2)
-        if "." in name and not any(s.colind()[i + 1] > s.colind()[i] for s in of):
+        if "." in name and not any(moves(f, 2, i) for f in (model.transition, model.output)):
             raise ParameterError(
-                f"{model.name}: no derivatives by {name}; a parameter of the gas generator is an "
-                "unknown of the filter that is made with it as free"
+                f"{model.name}: no derivatives by {name}: nothing depends on it, or it is held; "
+                "parameters of a gas generator are unknowns of a filter made with them free"
             )
     kept = [i for i in range(len(model.p)) if i not in moved]
     nx, n = len(model.x), len(moved)

@@ -30,6 +30,8 @@ scenario SCENARIO      | a name, a .toml or a .py file
                        | cvodes, idas, or propagator, another name of auto
 --exchange NAME        | of speed and fuel between the parts: paper, predicted (errs less at the
                        | same price), or corrected; default: the scenario's
+--start-from WORD      | balanced: a fault of the start acts from t = 0; settled: it has been there
+                       | for long; default: the scenario's
 --quiet                | no progress bar, no list of files
 """
 
@@ -44,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
         s = s.change(waveform_dt=None)
     if args.exchange is not None:
         s = s.change(exchange=args.exchange)
+    if args.start_from is not None:
+        s = s.change(start_from=args.start_from)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(s.name, s.duration, show=show) as progress:
@@ -100,6 +104,14 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 )
 
 
+_OF_EACH = {
+    *("load of each", "V rms a [V]", "I rms a [A]", "      b", "      c", "output of each [kW]"),
+    *("fault loss of each [kW]", "TTSC mu [%]", "  phase", "  k_rf", "  kappa"),
+    "  h = mu/(k_rf + 1 - mu)",
+}
+"""Rows of what a generator has of its own."""
+
+
 def made_with(report: dict[str, Any]) -> list[str]:
     """Return the lines that tell what a run was made with, and whether the model holds."""
     from apu_casadi.gaspath.conditions import day_words
@@ -109,6 +121,7 @@ def made_with(report: dict[str, Any]) -> list[str]:
     lines = []
     if report["ambient"]:
         lines.append(f"ambient: {day_words(report['ambient'])}")
+    lines += [f"profile of {words}" for words in report.get("profiles", ())]
     if solver:
         lines.append(
             f"solver {solver['solver']}, rtol {solver['rtol']:g}, atol {solver['atol']:g}; seed "
@@ -130,9 +143,19 @@ def made_with(report: dict[str, Any]) -> list[str]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return the phases side by side; means over the end of each phase, then extremes over it."""
-    columns = [[r["name"], *(show(r) for _, show in _ROWS)] for r in rows]
-    heads = ["", *(name for name, _ in _ROWS)]
+    """Return the phases side by side; means over the end of each phase, then extremes over it.
+
+    Where generators differ, what each has of its own follows for one after the other.
+    """
+    several = "generators" in rows[0]
+    of_unit = [(name, show) for name, show in _ROWS if not (several and name in _OF_EACH)]
+    heads = ["", *(name for name, _ in of_unit)]
+    columns = [[r["name"], *(show(r) for _, show in of_unit)] for r in rows]
+    own = [(name.replace(" of each", ""), show) for name, show in _ROWS if name in _OF_EACH]
+    for k, first in enumerate(rows[0].get("generators", ())):
+        heads += [f"generator {first['generator']}", *(f"  {name}" for name, _ in own)]
+        for column, r in zip(columns, rows, strict=True):
+            column += ["", *(show(r["generators"][k]) for _, show in own)]
     left = max(len(h) for h in heads)
     widths = [max(len(c) for c in column) for column in columns]
     lines = []

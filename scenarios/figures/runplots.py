@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import RPM, phases
+from apu_casadi.core.results import RPM, generators_of, of_generator, phases
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import SEVERITY, caption_of, scenario_of
@@ -117,17 +117,30 @@ def _segments(
     return [(instant(a), instant(b), a) for a, b in zip(cuts, ends, strict=True) if b > a]
 
 
-def _load_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> list[tuple[float, float, str]]:
-    """Return (start, end, words) of the loads, from the scenario or else from the mean power."""
-    table = scenario_of(ds)
+def _load_lane(
+    ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int | None = None
+) -> list[tuple[float, float, str]]:
+    """Return (start, end, words) of the loads, from the scenario or else from the mean power.
+
+    Args:
+        ds: the run, as generator ``number`` has it; None: all are alike.
+    """
+    table, of_these = scenario_of(ds), (None, number or 1)
     steps = [(p.get("start"), p.get("load")) for p in table.get("phase", ())]
-    steps += [(e.get("time"), e.get("load")) for e in table.get("event", ())]
+    steps += [
+        (e.get("time"), e.get("load"))
+        for e in table.get("event", ())
+        if e.get("generator") in of_these
+    ]
+    at = (number or 1) - 1
+    steps = [(s, x[at] if isinstance(x, list) and at < len(x) else x) for s, x in steps]
     loads = sorted(((float(s), x) for s, x in steps if isinstance(x, dict)), key=lambda s: s[0])
     t_end = rows[-1]["end"]
     loads = [x for x in loads if x[0] < t_end]
     if loads:
         ends = [s for s, _ in loads[1:]] + [t_end]
-        return [(s, e, _load_words(x)) for (s, x), e in zip(loads, ends, strict=True)]
+        n = int(ds.attrs.get("generators", 2)) if number is None else 1
+        return [(s, e, _load_words(x, n)) for (s, x), e in zip(loads, ends, strict=True)]
     t, P = ds["time"].values, ds["P_e"].values
     lane = []
     for p in rows:
@@ -136,7 +149,7 @@ def _load_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> list[tuple[flo
     return lane
 
 
-def _load_words(x: dict[str, Any]) -> str:
+def _load_words(x: dict[str, Any], n: int) -> str:
     kind = x.get("kind", "")
     words = {
         "R": "resistive",
@@ -147,7 +160,8 @@ def _load_words(x: dict[str, Any]) -> str:
     }.get(kind, str(kind))
     if x.get("unbalance") and len(set(x["unbalance"])) > 1:
         words += ", unbalanced"
-    return f"2\u00a0×\u00a0{x['power_kW']:g}\u00a0kW\n{words}" if "power_kW" in x else words
+    times = f"{n}\u00a0×\u00a0" if n > 1 else ""
+    return f"{times}{x['power_kW']:g}\u00a0kW\n{words}" if "power_kW" in x else words
 
 
 def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
@@ -202,11 +216,20 @@ def figure_20(ds: xr.Dataset) -> Figure:
     """
     fs.need(ds, [*HEALTH_FACTORS, *SEVERITY, "P_e"])
     rows = phases(ds)
-    loads = [(a, b, w, LOADS[i % 2]) for i, (a, b, w) in enumerate(_load_lane(ds, rows))]
-    gas, stator = _gas_lane(ds, rows), _stator_lane(ds, rows)
-    lanes = {"Electrical load": loads, "Gas path": gas, "Stator": stator}
+    numbers = generators_of(ds)
+    several = len(numbers) > 1
+    loads, stators = {}, {}
+    for k in numbers:
+        own, of = of_generator(ds, k), f" {k}" if several else ""
+        steps = enumerate(_load_lane(own, rows, k if several else None))
+        loads[f"Load{of}" if several else "Electrical load"] = [
+            (a, b, w, LOADS[i % 2]) for i, (a, b, w) in steps
+        ]
+        stators[f"Stator{of}"] = _stator_lane(own, rows)
+    lanes: dict[str, Lane] = {**loads, "Gas path": _gas_lane(ds, rows), **stators}
+    n = int(ds.attrs.get("generators", 2))
     with fs.drawing():
-        fig = fs.new_figure(3.7)
+        fig = fs.new_figure(3.7 + 0.8 * (len(lanes) - 3))
         m = fs.margins(fig, top=0.45, bottom=0.8)
         ax = fig.add_axes((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
         fs.bands(ax, rows, names=True)
@@ -224,5 +247,6 @@ def figure_20(ds: xr.Dataset) -> Figure:
         ax.tick_params(axis="y", length=0)
         ax.spines["left"].set_visible(False)
         ax.set_xlabel("Time [s]")
-        caption_of(fig, ds, "fig20_phases", "Load of each of the two generators at rated voltage.")
+        of = {1: "the generator", 2: "each of the two generators"}.get(n, f"each of {n} generators")
+        caption_of(fig, ds, "fig20_phases", f"Load of {of} at rated voltage.")
     return fig

@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi.core.results import GENERATOR, generators_of, of_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios.figures.figstyle import caption
 
@@ -39,20 +41,31 @@ def _rows(ds: xr.Dataset, name: str) -> list[dict[str, Any]]:
     return [r for r in found if isinstance(r, dict)] if isinstance(found, list) else []
 
 
-def fault_phase(ds: xr.Dataset, t: float) -> str:
+def fault_phase(ds: xr.Dataset, t: float, number: int = 1) -> str:
     """Tell the phase of the stator fault that holds at ``t`` [s]; "" where it is not recorded."""
-    held = [r.get("phase") for r in _rows(ds, "faults") if float(r.get("t", 0.0)) < t - 1e-9]
+    rows = [r for r in _rows(ds, "faults") if r.get(GENERATOR, number) == number]
+    held = [r.get("phase") for r in rows if float(r.get("t", 0.0)) < t - 1e-9]
     return f" of phase {held[-1]}" if held and held[-1] else ""
 
 
+def _loads_of(ds: xr.Dataset, number: int) -> list[str]:
+    """Return the loads of a generator in words, of many the first two."""
+    rows = [r for r in _rows(ds, "loads") if r.get(GENERATOR, number) == number]
+    loads = list(dict.fromkeys(str(r.get("load")) for r in rows))
+    return [*loads[:2], f"{len(loads) - 2} more"] if len(loads) > 3 else loads
+
+
 def made_with(ds: xr.Dataset) -> str:
-    """Tell loads, ambient conditions, solver, exchange, seed and version of a run, if recorded."""
+    """Tell unit, loads, day, solver, exchange, seed and version of a run, if recorded."""
     words = []
-    loads = list(dict.fromkeys(str(r.get("load")) for r in _rows(ds, "loads")))
-    if len(loads) > 3:
-        loads[2:] = [f"{len(loads) - 2} more"]
-    if loads:
-        words.append(f"Load of each generator {', then '.join(loads)}")
+    engine = scenario_of(ds).get("engine")
+    words += [f"Unit {Path(str(engine)).stem}"] if engine else []
+    numbers = generators_of(ds)
+    by_number = {k: _loads_of(ds, k) for k in numbers}
+    alike = all(loads == by_number[numbers[0]] for loads in by_number.values())
+    for k, loads in list(by_number.items())[: 1 if alike else None]:
+        of = "each generator" if alike else f"generator {k}"
+        words += [f"Load of {of} {', then '.join(loads)}"] if loads else []
     try:
         day, solver = json.loads(ds.attrs["ambient"]), json.loads(ds.attrs["solver"])
         words.append(
@@ -79,6 +92,13 @@ def _severity_note(ds: xr.Dataset) -> str:
     """Tell the severity of the last stator fault: always mu, k_rf and kappa together."""
     if not all(n in ds for n in SEVERITY):
         return ""
+    numbers = generators_of(ds)
+    notes = [_note_of(of_generator(ds, k), k, of_all=len(numbers) == 1) for k in numbers]
+    return " ".join(n for n in notes if n)
+
+
+def _note_of(ds: xr.Dataset, number: int, *, of_all: bool) -> str:
+    """Tell it of one generator, given the run as that has it."""
     mu = ds["mu"].values
     hit = np.flatnonzero(mu > 0)
     if hit.size == 0:
@@ -86,13 +106,22 @@ def _severity_note(ds: xr.Dataset) -> str:
     k = hit[-1]
     m, r, c = (float(ds[n].values[k]) for n in SEVERITY)
     kappa = f"κ = µ = {c:g}" if abs(c - m) < 1e-12 else f"κ = {c:g}"
-    where = fault_phase(ds, float(ds["time"].values[k]))
+    where = fault_phase(ds, float(ds["time"].values[k]), number)
+    where += "" if of_all else f" of generator {number}"
     return f"TTSC{where}: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
 
 
-def caption_of(fig: Figure, ds: xr.Dataset, key: str, more: str = "") -> None:
-    """Write number, title, scenario, severity and what the run was made with under a figure."""
+def caption_of(
+    fig: Figure, ds: xr.Dataset, key: str, more: str = "", number: int | None = None
+) -> None:
+    """Write number, title, scenario, severity and what the run was made with under a figure.
+
+    Args:
+        more: further words.
+        number: of the generator that is drawn; None: the unit, or each.
+    """
     name = scenario_of(ds).get("name", "")
-    words = [f"Figure {key[3:5]}. {FIGURES[key]}.", f"Scenario “{name}”." if name else ""]
+    title = FIGURES[key] if number is None else f"{FIGURES[key]} {number}"
+    words = [f"Figure {key[3:5]}. {title}.", f"Scenario “{name}”." if name else ""]
     words += [_severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
     caption(fig, " ".join(w for w in words if w))

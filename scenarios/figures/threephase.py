@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import phases
+from apu_casadi.core.results import generators_of, of_generator, phases
 from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import caption_of
 
@@ -77,7 +77,12 @@ def _envelopes(ax: Axes, ds: xr.Dataset, names: Sequence[str]) -> None:
             ax.plot(x, edge, color=fs.ABC[p], lw=fs.NESTED[p], solid_capstyle="butt")
 
 
-def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str) -> Figure:
+def _three_phase(
+    run: xr.Dataset, key: str, symbol: str, label: str, number: int | None = None
+) -> Figure:
+    if number is None and len(generators_of(run)) > 1:
+        number = 1
+    ds = run if number is None else of_generator(run, number)
     names = [f"{symbol}_{p}" for p in "abc"]
     rms = [f"{symbol.upper()}_{p}_rms" for p in "abc"]
     waves = "time_w" in ds.coords
@@ -114,7 +119,7 @@ def _three_phase(ds: xr.Dataset, key: str, symbol: str, label: str) -> Figure:
             draw(fig, outer[row])
         told = "Envelope: extremes of all samples. Enlarged rms: of each exchange step."
         few = "First four phases enlarged." if len(rows) > 4 else ""
-        caption_of(fig, ds, key, f"{told if waves else ''} {few}".strip())
+        caption_of(fig, run, key, f"{told if waves else ''} {few}".strip(), number)
     return fig
 
 
@@ -188,15 +193,19 @@ def _rms_row(fig: Figure, spec: Any, *, ds: xr.Dataset, rms: Sequence[str], even
             ax.set_ylabel(f"rms [{unit}]")
 
 
-def figure_24(ds: xr.Dataset) -> Figure:
+def figure_24(ds: xr.Dataset, generator: int | None = None) -> Figure:
     """Draw the phase currents [A]: envelope, steady cycles, events.  Without waveforms: rms only.
+
+    Args:
+        ds: the run.
+        generator: which of those that differ; default the first.
 
     Raises:
         DataError: a variable is missing.
     """
-    return _three_phase(ds, "fig24_currents", "i", "Current [A]")
+    return _three_phase(ds, "fig24_currents", "i", "Current [A]", generator)
 
 
-def figure_25(ds: xr.Dataset) -> Figure:
+def figure_25(ds: xr.Dataset, generator: int | None = None) -> Figure:
     """Draw the phase voltages [V] as :func:`figure_24` draws the currents."""
-    return _three_phase(ds, "fig25_voltages", "v", "Voltage [V]")
+    return _three_phase(ds, "fig25_voltages", "v", "Voltage [V]", generator)

@@ -125,7 +125,7 @@ def _option(words: list[str]) -> tuple[list[str], dict[str, Any]]:
     if flags[0].startswith("-") and not {"metavar", "type", "choices"} & set(options):
         on = options.get("default") == "on"
         options |= _ON if on else {"action": "store_true"}
-    if "default" in options and "type" in options:
+    if "type" in options and isinstance(options.get("default"), str):
         options["default"] = options["type"](options["default"])
     return flags, options
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
-from apu_casadi.core.sharing import Parametric, last
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.core.sharing import Parametric, last, of_family, remade
+from apu_casadi.machine.machinedata import MachineParameters, require_linear
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
@@ -37,6 +38,7 @@ from estimators.apu.electrical.terminalsignals import (
 from estimators.apu.electrical.tuning import (
     ANGLE_WALK_CONSIDERED,
     FLUX_WALK,
+    FREE_SIGMA,
     H_SIGMA,
     H_WALK,
     H_WALK_GAINS,
@@ -212,22 +214,31 @@ class ElectricalFilter(Parametric):
         spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
         spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
         spread |= {f"gain_{n}": self.sensors[n].gain for n in GAIN_SENSORS}
+        own = self.machine.held("machine")
+        means |= {n: v for n, v in own.items() if n in means}
+        spread |= {n: FREE_SIGMA * abs(v) for n, v in own.items()}
         spread = {n: spread[n] for n in means}
-        for n, size in (sigma or {}).items():
+        for n, value in (sigma or {}).items():
             self.model.x.index(n)
-            spread[n] = size
+            spread[n] = value
         prior = Belief.of(self.model.x, means, spread)
         e = 1e-6
+        # of a parameter the same share of it
+        size = dict.fromkeys(means, 1.0) | {n: abs(v) for n, v in own.items() if n in means}
         moved = {n: self._start(first, h=e) for n in SHUNTS.names}
         moved |= {"g_shunt": self._start(first, Y=Y_START + e)}
         moved |= {"b_shunt": self._start(first, Y=Y_START - 1j * e)}
         moved |= {f"gain_{n}": self._start(first, {n: -e}) for n in GAIN_SENSORS}
+        for n in own.keys() & means.keys():
+            more = self.machine.symbolic(**{n.partition(".")[2]: own[n] + e * size[n]})
+            moved[n] = dataclasses.replace(self, machine=more)._start(first)
         turned = np.eye(len(self.model.x))
         for name, there in moved.items():
             if name in self.model.x.names:
                 for n in at:
                     change = there[n] - at[n]
-                    slope = (math.remainder(change, 2 * math.pi) if n == "theta_e" else change) / e
+                    change = math.remainder(change, 2 * math.pi) if n == "theta_e" else change
+                    slope = change / (e * size[name])
                     turned[self.model.x.index(n), self.model.x.index(name)] += slope
         return Belief(self.model.x, prior.mean, turned @ prior.cov @ turned.T)
 
@@ -320,7 +331,6 @@ def _window_starts(t: np.ndarray, window: float, start: float | None) -> np.ndar
     return np.flatnonzero(np.diff(k, prepend=-np.inf))
 
 
-@last(32)
 def electrical_filter(
     machine: MachineParameters | None = None,
     *,
@@ -332,6 +342,7 @@ def electrical_filter(
     phases: tuple[str, ...] = PHASES,
     kappa: float | None = None,
     phase: str | None = None,
+    free: Mapping[str, Unknown] | None = None,
 ) -> ElectricalFilter:
     """Make the electrical filter.
 
@@ -353,11 +364,15 @@ def electrical_filter(
             i_shunt, g_shunt and b_shunt of one ``phase`` instead of three h;
             :func:`~.faults.leaky_fault` gives mu and k_rf.
         phase: the faulty phase, with ``kappa`` only.
+        free: parameters of the machine that are states, by name (``machine.r_s``); their prior
+            means are those of ``machine``, their standard deviations ``FREE_SIGMA`` of them.
 
     Raises:
         ParameterError: unknown choice, kappa without phase or the other way round.
+        SignalError: unknown parameter in ``free``.
     """
     machine = MachineParameters() if machine is None else machine
+    require_linear(machine, "the electrical filter")
     if gains not in GAINS:
         raise ParameterError(f"gains {gains!r} {nearest(str(gains), GAINS)}")
     wrong = [k for k in (*phases, *([] if phase is None else [phase])) if k not in PHASES]
@@ -371,6 +386,35 @@ def electrical_filter(
         raise ParameterError("gains are estimated with full coupling (kappa=None) only")
     if kappa is not None and not 0 < kappa <= 1:
         raise ParameterError(f"kappa = {kappa!r} must lie in (0, 1]")
+    unknowns = tuple((free or {}).items())
+    return _filter(
+        machine, sensors, h_walk, flux_walk, gains, power, phases, kappa, phase, unknowns
+    )
+
+
+@remade
+@of_family
+def _estimating(
+    model: FilterModel, unknown: Mapping[str, Unknown], walks: Mapping[str, float]
+) -> FilterModel:
+    """Return the model with what is estimated as states."""
+    return augment(model, unknown).with_walk(walks).expanded()
+
+
+@last(32)
+def _filter(
+    machine: MachineParameters,
+    sensors: SensorSet,
+    h_walk: float | None,
+    flux_walk: float,
+    gains: str,
+    power: bool,
+    phases: tuple[str, ...],
+    kappa: float | None,
+    phase: str | None,
+    free: tuple[tuple[str, Unknown], ...],
+) -> ElectricalFilter:
+    """Make the filter of checked choices."""
     model = electrical_model(machine, sensors, power, kappa, phase, gains != "none")
     walks = dict.fromkeys((n for n in FLUXES.names), flux_walk)
     if h_walk is None:
@@ -388,5 +432,5 @@ def electrical_filter(
         walks["theta_e"] = ANGLE_WALK_CONSIDERED
     if gains != "none":
         unknown |= {f"gain_{n}": Unknown(consider=gains == "consider") for n in GAIN_SENSORS}
-    model = augment(model, unknown).with_walk(walks).expanded()
+    model = _estimating(model, unknown | dict(free), walks)
     return ElectricalFilter(model, machine, sensors, gains, kappa, phase, power)

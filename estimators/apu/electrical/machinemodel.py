@@ -42,10 +42,11 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from apu_casadi.core.sharing import remade
+from apu_casadi.core.parameters import of_symbols
+from apu_casadi.core.sharing import last, remade
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.machine.generatormodel import ANGLE
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.machinedata import MACHINE, MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES, Abc, Qd0, abc_to_qd0, qd0_to_abc
 from apu_casadi.machine.terminals import (
     FLUXES,
@@ -259,7 +260,9 @@ def electrical_model(
     phase: str | None,
     with_gains: bool,
 ) -> FilterModel:
-    """Write the discrete model; h or the admittance, and the gains, are parameters of it.
+    """Make the discrete model; h or the admittance, and the gains, are parameters of it.
+
+    It is one of a family, of which the machine's parameters are known parameters as well.
 
     Args:
         p: machine parameters.
@@ -268,9 +271,18 @@ def electrical_model(
         kappa, phase: leakage partition and faulty phase of a leaky fault, or None and None.
         with_gains: whether the model has gain errors, and predictions of the readings as inputs.
     """
+    return _family(sensors, power, kappa, phase, with_gains).member(p.held("machine"))
+
+
+@last(32)
+def _family(
+    sensors: SensorSet, power: bool, kappa: float | None, phase: str | None, with_gains: bool
+) -> FilterModel:
+    """Write the model of all machines."""
     X, U, PAR, W = _signals(power, kappa is not None, with_gains)
     (xv, x), (uv, u), (pv, par), (wv, w) = X.sx(), U.sx(), PAR.sx(), W.sx()
-    dt = ca.SX.sym("dt")
+    dt, numbers = ca.SX.sym("dt"), ca.SX.sym("machine", len(MACHINE))
+    p, pv = of_symbols(MachineParameters, numbers), ca.vertcat(pv, numbers)
     seen = _readings(sensors, x["theta_e"], u, par, w, dt, with_gains)
     # x(k) = s(k) + G (reading - error - what s(k) holds of it)
     added = seen.added
@@ -315,6 +327,6 @@ def electrical_model(
         x1[X.index("energy")] = u["keep"] * x["energy"] + dt * y["P_total"]
     name = f"electrical_{'shunts' if branch is None else 'leaky'}"
     name += ("_power" if power else "") + ("_gains" if with_gains else "")
-    signals = X, U, PAR, W, Signals([OUTPUTS[k] for k in MEASURED])
+    signals = X, U, PAR + MACHINE, W, Signals([OUTPUTS[k] for k in MEASURED])
     step, output = (x1, ca.SX(0)), (ca.vertcat(*read), ca.SX(0))
     return FilterModel.of(name, signals, (xv, uv, pv, wv, dt), step, output, cse=True)

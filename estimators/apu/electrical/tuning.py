@@ -71,6 +71,8 @@ START_SIGMA = {
     "lam_kq": 1.5e-3,
     "theta_e": 0.01,
 }
+#: Standard deviation of a free parameter of the machine at the start, of its value.
+FREE_SIGMA = 0.1
 #: Standard deviation of each h at the start.
 H_SIGMA = 1e-2
 #: A step of h is looked for in windows of this many samples (5 ms) ...

@@ -143,7 +143,7 @@ def _matched() -> _Case:
 
 def _simulated(case: str) -> _Case:
     """A short circuit and an unbalanced load, simulated, from the first period on."""
-    walks = CONSTANT if case == "constant" else {}
+    walks: dict[str, Any] = CONSTANT if case == "constant" else {}
     filt = electrical_filter(gains=_KINDS.get(case, "none"), **walks)
     fault = Ttsc(0.05, 0.05 / DETECT["mismatched"][0] - 0.95, phase="b")
     before = ((-0.25, FULL_UNBALANCED), (-0.25, fault))
