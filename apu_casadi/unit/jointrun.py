@@ -39,6 +39,7 @@ class Asked:
         start: what holds from the start, profiles included.
         grid: exchange instants, s.
         phasors, noise, seed, hook: as there.
+        settled: whether loads and faults have been there for long.
     """
 
     start: Holding
@@ -47,6 +48,7 @@ class Asked:
     noise: Noise
     seed: int | None
     hook: Callable[[int, np.ndarray], np.ndarray] | None
+    settled: bool = False
 
 
 class Columns:
@@ -111,14 +113,15 @@ class JointRun:
     ) -> None:
         self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
         self.now, self.here = asked.start, asked.start.at(0.0)  # as asked, and its numbers
-        start, more = [load.balanced_part for load in self.here.loads], {}
-        if self.here.N_ref is not None:
-            more = {"N_ref": self.here.N_ref}
+        there: tuple[Any, ...] = ([load.balanced_part for load in self.here.loads], None)
+        if asked.settled:
+            there = self.here.loads, self.here.faults
+        more = {} if self.here.N_ref is None else {"N_ref": self.here.N_ref}
         self.point = apu.steady_state(
-            start, ambient=self.here.ambient, health=self.here.factors, **more
+            *there, ambient=self.here.ambient, health=self.here.factors, **more
         )
-        end = float(asked.grid[-1])
-        self.machines = Machines(apu, self.point, self.here, settings, asked.phasors, end=end)
+        own: dict[str, Any] = {"end": float(asked.grid[-1]), "settled": asked.settled}
+        self.machines = Machines(apu, self.point, self.here, settings, asked.phasors, **own)
         self.shaft = self._shaft()
         self._changing = self.now.changing
         self._middle = 0.0  # of the last step, s

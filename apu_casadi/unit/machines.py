@@ -77,6 +77,7 @@ class Machines:
         start: what holds then.
         settings: how they are integrated.
         phasors: whether phasors are wanted too.
+        settled: whether loads and faults have been there for long, and ``point`` is of them.
         end: of the run, s.
     """
 
@@ -90,21 +91,19 @@ class Machines:
         settings: Settings,
         phasors: bool,
         *,
+        settled: bool = False,
         end: float = 0.0,
     ) -> None:
         self.apu, self.settings, self._end = apu, settings, end
         self.means = StepMeans(apu.generator, phasors)
-        self.groups = [
-            MachineStep(
-                apu,
-                numbers,
-                point.of(numbers[0]),
-                start.loads[numbers[0] - 1].balanced_part,
-                settings,
-                self.means,
-            )
-            for numbers in kinds(apu, start)
-        ]
+        self.groups = []
+        for numbers in kinds(apu, start):
+            at = numbers[0] - 1
+            load, fault = start.loads[at], start.faults[at]
+            if not settled:
+                load, fault = load.balanced_part, None
+            own, how = point.of(numbers[0]), (settings, self.means)
+            self.groups.append(MachineStep(apu, numbers, own, load, fault, *how))
         self._forget()
 
     def _forget(self) -> None:
@@ -124,7 +123,7 @@ class Machines:
         for group in self.groups:
             at = point.of(group.numbers[0])
             w = np.array([[at.y[n]] for n in WAVEFORMS])
-            found.append(Of(group.numbers, self.means.at_rest(at), None, w))
+            found.append(Of(group.numbers, self.means.at_rest(at), group.phase.fault, w))
         return found
 
     def switch(self, now: Holding, here: Holding, t: float, *, switched: bool = True) -> bool:

@@ -62,7 +62,7 @@ class MachineStep:
 
     Args:
         apu, numbers: the unit, and which of its generators they are, from 1.
-        point, load: the steady state to start from, and its load.
+        point, load, fault: the steady state to start from, and what holds in it.
         settings: how it is integrated.
         means: what is averaged.
     """
@@ -85,6 +85,7 @@ class MachineStep:
         numbers: tuple[int, ...],
         point: GeneratorPoint,
         load: Load,
+        fault: Fault | None,
         settings: Settings,
         means: StepMeans,
     ) -> None:
@@ -98,9 +99,9 @@ class MachineStep:
         self.spikes: list[str] = []
         self._since = math.inf  # s since the last switch
         self._way: Way | None = None
-        self._asked: tuple[Any, Any] = (load, None)
-        symmetric = load.balanced and not settings.noisy
-        self._enter(Phase(self.gen, load, None, point.ss, self.u, np.zeros(0), symmetric))
+        self._asked: tuple[Any, Any] = (load, fault)
+        symmetric = point.balanced and not settings.noisy
+        self._enter(Phase(self.gen, load, fault, point.ss, self.u, point.theta, symmetric))
 
     def part(self, numbers: tuple[int, ...]) -> MachineStep:
         """Let some of the generators go their own way from now on; returns them."""
