@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from apu_casadi.core.errors import OperatingPointError
+from apu_casadi.core.means import PHASORS, RMS, SEQUENCES, sequences
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import Load
@@ -64,6 +65,22 @@ class GeneratorPoint:
     def turn(self) -> Turn:
         """States and outputs over one turn from here."""
         return Turn.of(self.ss, self.x if self.states is None else self.states, self.u, self.theta)
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """Outputs by name; of a periodic state means and, of what alternates, rms values.
+
+        Symmetrical components of its fundamentals, V, A and ratios, are among them.
+        """
+        if self.balanced:
+            return {n: float(v) for n, v in self.y.items()}
+        phasors = [self.turn.phasor(n) for n in PHASORS.values()]
+        parts = np.array([x for V in phasors for x in (V.real, V.imag)])
+        found = {n: self.turn.rms(n.removesuffix("_rms").lower()) for n in RMS}
+        found |= dict(zip(SEQUENCES, sequences(parts).tolist(), strict=True))
+        found["i_fault_rms"] = self.turn.rms("i_fault")
+        names = ["V_fd", "i_fd", "E_fd", "T_e", "P_e", "P_loss_fault", "P_total"]
+        return found | {n: self.turn.mean(n) for n in names}
 
     def mean(self, name: str) -> float:
         """Return the mean of an output over a turn."""

@@ -112,10 +112,12 @@ def magnetics(p: MachineParameters, S_10: float | None, S_12: float | None) -> M
     """Return the machine with saturation as asked for: None leaves it, S_10 = 0 is without.
 
     Raises:
-        ParameterError: a value out of range.
+        ParameterError: a value out of range, or S_12 alone for a linear machine.
     """
-    if S_10 is None and (S_12 is None or isinstance(p, SaturatedMachine)):
-        return p if S_12 is None else p.change(S_12=S_12)
+    if S_10 is None:
+        if S_12 and not isinstance(p, SaturatedMachine):
+            raise ParameterError(f"machine.S_12 = {S_12:g} needs machine.S_10 > 0 beside it")
+        return p if not S_12 else p.change(S_12=S_12)
     own = {f.name: getattr(p, f.name) for f in fields(MachineParameters)}
     if S_10 == 0:
         return MachineParameters(**own)
