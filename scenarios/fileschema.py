@@ -20,7 +20,7 @@ from apu_casadi.gaspath.health import HEALTH_FACTORS
 from apu_casadi.machine.faults.fault import FAULTS, Fault
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
-from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST
+from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST, STARTS
 from scenarios.reading import DEFAULT_FAULT, names_of
 from scenarios.schema import CHANGES, EXCHANGES, FILE_KEYS, Change, Phase, Scenario
 
@@ -223,6 +223,7 @@ def _scenario() -> Table:
         "phase": _row(Phase) | {"minItems": 1},
         "event": _row(Change),
         "exchange": {"enum": list(EXCHANGES)},
+        "start_from": {"enum": list(STARTS)},
         "noise": _noise(),
         "seed": {"type": "integer", "minimum": 0},
         "parameters": _parameters(),

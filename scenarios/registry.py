@@ -221,6 +221,7 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
         **{k: scenario[k] for k in ("engine", "governor", "extensions") if k in scenario},
         **({"assumed_engine": json.loads(ds.attrs["assumed"])} if "assumed" in ds.attrs else {}),
         **conditions(ds),
+        "profiles": profiles(ds),
         "phases": phase_summary(ds),
         "validity": json.loads(ds.attrs.get("validity", "[]")),
         "warnings": found_in(ds),
@@ -242,6 +243,23 @@ def conditions(ds: xr.Dataset) -> dict[str, Any]:
         "exchange_error": float(error) if math.isfinite(error) else None,
         "seed": None if isinstance(seed, str) else int(seed),
     }
+
+
+def profiles(ds: xr.Dataset) -> list[str]:
+    """Return the profiles that a run followed, one in words each."""
+    try:
+        given = json.loads(ds.attrs["profiles"])
+        return [_profile_words(**g) for g in given]
+    except (KeyError, TypeError, ValueError):
+        return []
+
+
+def _profile_words(
+    t: float, part: str, name: str, profile: str, generator: int | None = None
+) -> str:
+    of = f"{part} {name}" if part in ("load", "fault") else name
+    of += "" if generator is None else f" of generator {generator}"
+    return f"{of}{f', from {t:g} s' if t else ''}: {profile}"
 
 
 def _table(ds: xr.Dataset, name: str) -> dict[str, Any]:

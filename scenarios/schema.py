@@ -61,6 +61,7 @@ from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import (
+    STARTS,
     Ambient,
     Event,
     FaultChange,
@@ -283,6 +284,8 @@ class Scenario(_Plain):
         waveform_dt: sampling step of the waveforms; None for no waveforms (0 in a file).
         exchange: how speed and fuel pass between the two parts: ``paper``, ``predicted`` or
             ``corrected``, see :func:`apu_casadi.unit.multirate.simulate_joint`.
+        start_from: ``balanced``, where a fault or an unbalanced load of the start acts from t = 0
+            on a healthy unit, or ``settled``, where it has been there for long.
         noise: process and measurement noise; None for none.
         seed: seed of the noise.
         parameters: changed parameters of the unit, by dotted name (``machine.r_s``).
@@ -306,6 +309,7 @@ class Scenario(_Plain):
     dt: float = field(default=0.02, metadata=limits(lo=1e-4, hi=0.2, unit="s"))
     waveform_dt: float | None = field(default=50e-6, metadata=limits(lo=1e-6, unit="s"))
     exchange: str = "paper"
+    start_from: str = "balanced"
     noise: Noise | None = field(default=None, hash=False)
     seed: int | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
@@ -333,6 +337,8 @@ class Scenario(_Plain):
         text_of(self.exchange, "exchange")
         hint = f"unknown {self.exchange!r} {nearest(self.exchange, EXCHANGES)}"
         require(self.exchange in EXCHANGES, "exchange", hint)
+        hint = f"unknown {self.start_from!r} {nearest(str(self.start_from), STARTS)}"
+        require(self.start_from in STARTS, "start_from", hint)
         if self.seed is not None:
             whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
             require(whole and self.seed >= 0, "seed", f"a whole number >= 0, got {self.seed!r}")
@@ -499,6 +505,8 @@ class Scenario(_Plain):
         table |= {"phase": [p.to_dict() for p in self.phases]}
         if self.exchange != "paper":
             table["exchange"] = self.exchange
+        if self.start_from != "balanced":
+            table["start_from"] = self.start_from
         noise = {} if self.noise is None else dataclasses.asdict(self.noise)
         more = {
             "event": [c.to_dict() for c in self.changes],
@@ -548,6 +556,7 @@ class Scenario(_Plain):
         if isinstance(fault, tuple):
             fault = {f.generator: f.fault for f in fault}
         start = {"load": first.load, "health": health, "fault": fault}
+        start |= {} if self.start_from == "balanced" else {"start_from": self.start_from}
         return start if N_ref is None else {**start, "N_ref": N_ref}
 
     def events(self) -> tuple[Event, ...]:

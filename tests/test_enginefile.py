@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from apu_casadi.core import backend, results
-from apu_casadi.core.errors import ApuError, DataError
+from apu_casadi.core.errors import ApuError, DataError, ParameterError
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimbatch import performance_deck
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.machine.machinedata import magnetics
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import GAS, Engine, read_unit, write_unit
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
@@ -97,6 +98,23 @@ def test_any_unit_comes_back_from_its_file(tmp_path, tpe):
     assert (tmp_path / "mine-compressor.csv").exists()
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_a_saturating_generator_is_kept(tmp_path, first):
+    """Beside one that is linear, in either place; what is not given of it is assumed."""
+    gen = Apu().generator
+    other = dataclasses.replace(gen, machine=magnetics(gen.machine, 0.08, 0.25))
+    unit = Apu().with_generators(*((other, gen) if first else (gen, other)))
+    write_unit(unit, tmp_path / "s.toml")
+    assert read_unit(tmp_path / "s.toml").unit == unit
+    (tmp_path / "t.toml").write_text("[generator.machine]\nS_10 = 0.15")
+    back = read_unit(tmp_path / "t.toml")
+    assert back.unit.generator.machine == magnetics(gen.machine, 0.15, None)
+    assert "machine.S_12" in {a.name for a in back.assumed}
+    (tmp_path / "t.toml").write_text("[generator.machine]\nS_10 = 0.3")
+    with pytest.raises(ParameterError, match=r"t\.toml.*S_12 = 0\.3 must be > 1\.2 S_10"):
+        read_unit(tmp_path / "t.toml")
+
+
 def test_units_are_converted_and_the_rest_is_assumed(tmp_path):
     """Each left-out number is listed once with value, unit and source; maps too."""
     path = tmp_path / "part.toml"
@@ -132,6 +150,49 @@ T5_max = { value = 700.0, unit = "degC" }
     assert gas == {"gas_generator", "compressor_map", "turbine_map", "limits"}
 
 
+def test_several_generators(tmp_path, capsys, monkeypatch):
+    """One table for all, or one for each: a further one is the first but for what it says."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "several.toml"
+    path.write_text("[generator]\ncount = 3\nneutral = 'isolated'\n")
+    three = read_unit(path)
+    assert three.unit == Apu().change({"generator.count": 3, "generator.neutral": "isolated"})
+    assert "generator.count" not in {a.name for a in three.assumed}
+    path.write_text("""
+[coupling]
+eta_gtSg = 0.99
+[[generator]]
+[generator.machine]
+r_s = 0.005
+[[generator]]
+neutral = "isolated"
+machine.P_rated = { value = 60, unit = "kW", source = "plate" }
+[generator.coupling]
+gear = 3.2
+""")
+    two = read_unit(path)
+    a, b = two.unit.machines
+    assert (a.generator.machine.r_s, b.generator.machine.r_s) == (0.005, 0.005)
+    assert (a.generator.machine.P_rated, b.generator.machine.P_rated) == (225e3, 60e3)
+    assert (a.generator.neutral, b.generator.neutral) == ("grounded", "isolated")
+    assert (a.coupling.eta_gtSg, b.coupling.eta_gtSg, b.coupling.gear) == (0.99, 0.99, 3.2)
+    assert two.sources == {"generator2.machine.P_rated": "plate"}
+    assert not {"machine.r_s", "coupling.eta_gtSg"} & {n.name for n in two.assumed}
+    again = tmp_path / "again.toml"
+    for e in (three, two):
+        write_unit(e, again)
+        assert read_unit(again).unit == e.unit and read_unit(again).assumed == ()
+    assert main(["trim", "--engine", str(again), "--load", "50e3", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    one, other = report["generators"]
+    assert report["generator"] == one and one["P_total"] != other["P_total"]
+    assert main(["estimate", "joint", "--engine", str(again), "--scenario", "quiet"]) == 2
+    said = capsys.readouterr().err
+    assert "the joint estimation needs equal generators; these differ: ['generator2." in said
+    path.write_text("[[generator]]\n")
+    assert len(read_unit(path).unit.machines) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -145,7 +206,11 @@ T5_max = { value = 700.0, unit = "degC" }
         ("[generator.exciter]\nK_A = 'high'", r"\[generator.exciter\]: .*K_A \[1\].*number"),
         ("[generator]\nneutral = 'open'", r"\[generator\]: neutral = 'open' .*isolated"),
         ("generator = 3", r"\[generator\]: a table is expected, got 3"),
-        ("[[generator]]\n[[generator]]\nneutral = 'isolated'", r"\[\[generator\]\] tables differ"),
+        ("[generator]\ncount = 5", r"\[generator\]: count = 5; a unit has 1 to 4 generators"),
+        ("[generator]\ncount = 2.0", r"\[generator\]: count = 2\.0; a unit has"),
+        ("generator = []", r"no \[\[generator\]\]; a unit has 1 to 4"),
+        (5 * "[[generator]]\n", r"\[\[generator\]\] 5: count = 1; a unit has 1 to 4"),
+        ("[[generator]]\n[generator.machine]\nr = 1", r"\[\[generator.machine\]\] 1: unknown 'r'"),
         ("[coupling]\ngear = 0.0", r"\[coupling\]: .*gear \[1\] = 0 is outside"),
         ("[coupling]\neta_gt = 1.0", r"\[coupling\]: unknown 'eta_gt' .*eta_gtSg"),
         ("[limits]\nT4max = 1", r"\[limits\]: unknown 'T4max' .*T4_max"),
@@ -201,6 +266,7 @@ def test_figures_that_were_not_put_in_are_predicted(tpe):
     assert {a.name.split(".")[0] for a in tpe.assumed} >= {"machine", "exciter", "limits"}
 
 
+@pytest.mark.compiled
 def test_the_second_unit_compiles_nothing(tpe, monkeypatch):
     """Trim, deck and a joint run with load step and both faults, on what the default unit made."""
 
@@ -265,11 +331,13 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
         "deck --altitude 0 --mach 0 --json": None,
         "linearise --no-figures --json": None,
         "identify --json": None,
-        "calibrate bench.csv --free compressor_map.a_W --json": None,
+        "calibrate bench.csv --free compressor_map.a_W --json --write-engine mine.toml": None,
         "fit data.csv --steady --altitude 0 --json": None,
         "run short.toml --no-figures --json": None,
         "campaign --base short.toml --runs 1 --workers 1 --json": None,
         "maps --no-lines": "stderr",
+        "export c gas_generator.step --out c --json": None,
+        "export fmu gas_generator --no-library --out g.fmu --json": None,
     }
     for command, where in commands.items():
         assert main([*command.split(), "--engine", "tpe331"]) == 0, command
@@ -285,6 +353,18 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
         assert ("machine.r_s" in by_name) != alone, command
         assert ("gas_generator.LHV" in by_name) == ("--voltage" not in command), command
         assert "APS5000" not in out and "36050" not in out
+    assert (
+        main(["run", "short.toml", "--no-figures", "--quiet", "--out", ".", "--solver", "cvodes"])
+        == 0
+    )
+    capsys.readouterr()
+    assert main(["fit", "short.nc", "--estimate", "f_eta_c", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["read_as"]
+    assert "short.nc is a run of tpe331: give --engine tpe331" in said
+    mine = read_unit("mine.toml")
+    assert mine.sources["compressor_map.a_W"] == "fitted to bench.csv (apu calibrate)"
+    assert mine.unit.parameters()["compressor_map.a_W"] == pytest.approx(0.0, abs=1e-6)
+    assert mine.sources["gas_generator.W2"] == "[1]" and mine.assumed == ()
     deck = results.load("deck.nc")
     assert float(deck["PW"].values[-1]) == 746e3 and deck.attrs["engine"] == "tpe331"
     assert main(["trim", "--engine", "tpe331", "--power", "5e5"]) == 0

@@ -319,8 +319,8 @@ def test_gas_generator_by_model_exchange(built, asked, tmp_path):
     u, start = np.array(at.u), {"f_W_c": 0.97}
     theta = gg.THETA.pack(start)
     ds = simulate(gg.state_space, at.x, t, u, theta=theta, rtol=1e-10, atol=1e-12)
-    v = exchanged(built("gas_generator"), tmp_path, instants=t, names=names, start=start,
-                  rtol=1e-9, atol=1e-9)  # fmt: skip
+    how = {"start": start, "rtol": 1e-9, "atol": 1e-9}
+    v = exchanged(built("gas_generator"), tmp_path, instants=t, names=names, **how)
     close(v, names, ds)
 
 

@@ -15,12 +15,17 @@ from functools import cached_property
 import numpy as np
 
 from apu_casadi.core.errors import OperatingPointError
+from apu_casadi.core.means import PHASORS, RMS, SEQUENCES, sequences
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import Load
-from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
+from apu_casadi.machine.machinedata import (
+    ExciterParameters,
+    MachineParameters,
+    SaturatedMachine,
+)
 from apu_casadi.machine.periodic import Turn
-from apu_casadi.machine.wrsg import Windings
+from apu_casadi.machine.wrsg import Windings, saturation
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,22 @@ class GeneratorPoint:
         """States and outputs over one turn from here."""
         return Turn.of(self.ss, self.x if self.states is None else self.states, self.u, self.theta)
 
+    @property
+    def summary(self) -> dict[str, float]:
+        """Outputs by name; of a periodic state means and, of what alternates, rms values.
+
+        Symmetrical components of its fundamentals, V, A and ratios, are among them.
+        """
+        if self.balanced:
+            return {n: float(v) for n, v in self.y.items()}
+        phasors = [self.turn.phasor(n) for n in PHASORS.values()]
+        parts = np.array([x for V in phasors for x in (V.real, V.imag)])
+        found = {n: self.turn.rms(n.removesuffix("_rms").lower()) for n in RMS}
+        found |= dict(zip(SEQUENCES, sequences(parts).tolist(), strict=True))
+        found["i_fault_rms"] = self.turn.rms("i_fault")
+        names = ["V_fd", "i_fd", "E_fd", "T_e", "P_e", "P_loss_fault", "P_total"]
+        return found | {n: self.turn.mean(n) for n in names}
+
     def mean(self, name: str) -> float:
         """Return the mean of an output over a turn."""
         constant = self.balanced and name[:2] not in ("v_", "i_")
@@ -77,6 +98,8 @@ class AtRest:
     def field(self, V_t: float, Z: complex, w_r: float) -> tuple[float, Windings]:
         """Return V_fd (V) and the steady currents for a terminal voltage (V rms) and impedance."""
         p = self.machine
+        if isinstance(p, SaturatedMachine):
+            return _saturated_field(p, V_t, Z, w_r)
         X_d, X_q = Z.imag + w_r * (p.L_md + p.L_ls), Z.imag + w_r * (p.L_mq + p.L_ls)
         R_t = Z.real + p.r_s
         if not R_t**2 + X_d * X_q > 0:
@@ -141,6 +164,30 @@ class AtRest:
                     + (f"; {load.caveat}" if load.caveat else "")
                 )
         return _root(excess, low, low / 0.99)
+
+
+def _saturated_field(
+    p: SaturatedMachine, V_t: float, Z: complex, w_r: float
+) -> tuple[float, Windings]:
+    """Do :meth:`AtRest.field` where the d axis saturates.
+
+    The q axis does not, so that V + (r_s + j w_r L_q) I lies along it: that gives i_q and i_d, and
+    v_q + r_s i_q = w_r lambda_d the flux linkage that the field has to drive.
+    """
+    V = complex(math.sqrt(2.0) * V_t)
+    I = V / Z
+    along = V + complex(p.r_s, w_r * (p.L_mq + p.L_ls)) * I
+    turn = abs(along) / along
+    V, I = V * turn, I * turn
+    i_q, i_d = I.real, -I.imag
+    lam_md = (V.real + p.r_s * i_q) / w_r + p.L_ls * i_d
+    i_fd = lam_md * (1.0 + saturation(p, lam_md)[0]) / p.L_md + i_d
+    if not i_fd > 0:
+        raise OperatingPointError(
+            f"a load of {Z:.4g} ohm excites the generator by itself at w_r = {w_r:.5g} rad/s: "
+            f"{V_t:.5g} V would need a field current of {i_fd:.4g} A"
+        )
+    return p.r_fd * i_fd, Windings(i_q, i_d, 0.0, i_fd, 0.0, 0.0)
 
 
 def _root(excess: Callable[[float], float], low: float, high: float) -> float:

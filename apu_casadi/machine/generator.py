@@ -29,7 +29,7 @@ from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine import wrsg
 from apu_casadi.machine.atrest import AtRest, GeneratorPoint
 from apu_casadi.machine.faults.fault import FAULTS, Fault, FaultStructure
-from apu_casadi.machine.generatormodel import GeneratorModel, Structure, variant
+from apu_casadi.machine.generatormodel import GeneratorModel, Shaft, Structure, variant
 from apu_casadi.machine.loads.load import LOADS, Load, LoadStructure
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from apu_casadi.machine.periodic import Closing, Turn, solve_periodic
@@ -39,6 +39,7 @@ __all__ = ["Generator", "GeneratorPoint", "fault_of_kind", "load_of_kind"]
 
 NEUTRALS = ("grounded", "isolated")
 EXCITATIONS = ("regulated", "constant")
+POWERS = ("paper", "torque")
 
 SAME_INSTANT = 1e-9  # s; switches closer than this are one
 #: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to
@@ -59,18 +60,22 @@ class Generator(Parametric):
             load; ``"isolated"`` leaves the load's star point free.
         excitation: ``"regulated"`` by the AC5A, or ``"constant"``: the field voltage stays what it
             is at the start, as in an open-loop test.
+        power: what loads the shaft, ``P_total``: ``"paper"`` is eq. (8), output and extra loss of
+            the fault over eta_sg; ``"torque"`` the torque's power and :attr:`P_fixed`.
 
     Raises:
-        ParameterError: unknown neutral or excitation.
+        ParameterError: unknown neutral, excitation or power.
     """
 
     machine: MachineParameters = field(default_factory=MachineParameters)
     exciter: ExciterParameters = field(default_factory=ExciterParameters)
     neutral: str = "grounded"
     excitation: str = "regulated"
+    power: str = "paper"
 
     def __post_init__(self) -> None:
-        for what, known in (("neutral", NEUTRALS), ("excitation", EXCITATIONS)):
+        choices = {"neutral": NEUTRALS, "excitation": EXCITATIONS, "power": POWERS}
+        for what, known in choices.items():
             value = getattr(self, what)
             if value not in known:
                 raise ParameterError(f"{what} {value!r} {nearest(value, known)}")
@@ -99,7 +104,7 @@ class Generator(Parametric):
         return _variant(self, self._structure(beside, found))
 
     def _structure(self, load: Load, fault: FaultStructure | None = None) -> Structure:
-        how = (self.neutral, self.exciter.absent, self.excitation)
+        how = (self.neutral, self.exciter.absent, self.excitation, type(self.machine), self.power)
         return Structure(LoadStructure.of(load), fault, *how)
 
     def fault_kind(self, load: Load, fault: Fault | None) -> str | None:
@@ -219,6 +224,19 @@ class Generator(Parametric):
         E_fd = self._rest.field(V_t, complex(R), p.w_rated)[0] / p.V_fd_base
         V_ref = ac5a.exciter_steady(self.exciter, E_fd=E_fd, V_t=V_t / p.V_rated_rms)[1]
         return float(V_ref)
+
+    @derived
+    def P_fixed(self) -> float:
+        """Iron and friction loss, W, at rated speed, with which the healthy efficiency is eta_sg.
+
+        Output over eta_sg, less the torque's power, at the rated load of :attr:`V_ref_default`.
+        Assumed in proportion to speed, and the same at any load: Table 1 tells none of its parts.
+        """
+        p, R = self.machine, complex(3.0 * self.machine.V_rated_rms**2 / self.machine.P_rated)
+        i = self._rest.field(V_TABLE_7 * p.V_rated_rms / 230.0, R, p.w_rated)[1]
+        P_e = 1.5 * R.real * (i.sq**2 + i.sd**2)
+        torque = wrsg.torque(p, lam=wrsg.flux_linkages(p, i), i=i)
+        return float(P_e / p.eta_sg - torque * p.w_rated / p.n_pp)
 
     @property
     def _rest(self) -> AtRest:
@@ -507,7 +525,8 @@ def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[s
 
 @kept
 def _variant(gen: Generator, structure: Structure) -> GeneratorModel:
-    return variant(structure, gen.machine, gen.exciter)
+    shaft = Shaft(gen.P_fixed if gen.power == "torque" else 0.0)
+    return variant(structure, gen.machine, gen.exciter, shaft)
 
 
 def load_of_kind(kind: str) -> Load:

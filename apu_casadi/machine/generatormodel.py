@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,11 @@ from apu_casadi.machine import wrsg
 from apu_casadi.machine.faults.fault import AtFault, Branch, FaultStructure
 from apu_casadi.machine.faults.fault import Own as OwnOfFault
 from apu_casadi.machine.loads.load import AtLoad, LoadStructure, by_phase
-from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
+from apu_casadi.machine.machinedata import (
+    ExciterParameters,
+    MachineParameters,
+    SaturatedMachine,
+)
 from apu_casadi.machine.park import Abc, Qd0, abc_to_qd0, qd0_to_abc, speed_voltage
 from apu_casadi.machine.wrsg import Windings
 
@@ -50,6 +54,15 @@ NOISE = (
 )
 #: A difference of phase voltages: megavolts when a switch opens, so the nominal is large.
 V_N = Signal("v_n", "V", "load star point to machine neutral", nominal=1e4)
+FIXED_LOSS = Signal("shaft.P_fixed", "W", "iron and friction loss at rated speed", nominal=2e4)
+
+
+class Shaft(NamedTuple):
+    """What takes power of the shaft beside the torque: :data:`FIXED_LOSS`."""
+
+    P_fixed: float = 0.0
+
+
 OUTPUTS = Signals(
     [
         *by_phase("v", "V", "terminal voltage of phase {} to the machine's neutral", nominal=300.0),
@@ -77,7 +90,8 @@ class GeneratorModel(StateSpace):
     Args:
         load, fault: structures that it is built of.
         linear: names of the states that are linear at constant speed with the exciter held; empty
-            where the load is not.
+            where the load or the machine is not.
+        nonlinear: which of them is not, in words; "" where both are.
         reversing: those of them that change their sign when the rotor has turned by half a turn.
         exciter: Function (x, V_t, V_ref, theta) -> rates of the exciter's states, in the order of
             ``x``, from a terminal voltage in V rms.
@@ -88,6 +102,7 @@ class GeneratorModel(StateSpace):
     load: LoadStructure | None = None
     fault: FaultStructure | None = None
     linear: tuple[str, ...] = ()
+    nonlinear: str = ""
     reversing: tuple[str, ...] = ()
     exciter: ca.Function = field(default=None, repr=False)
     reduced: tuple[GeneratorModel, ca.Function] | None = field(default=None, repr=False)
@@ -120,8 +135,9 @@ class Structure(Parametric):
     """What the equations of a generator depend on, beside numbers.
 
     Args:
-        load, fault, neutral, excitation: as of the generator.
+        load, fault, neutral, excitation, power: as of the generator.
         absent: parameters of the exciter that do not count (:attr:`ExciterParameters.absent`).
+        machine: what the machine's parameters are of, linear or saturating.
     """
 
     load: LoadStructure
@@ -129,13 +145,22 @@ class Structure(Parametric):
     neutral: str
     absent: tuple[str, ...] = ()
     excitation: str = "regulated"
+    machine: type[MachineParameters] = MachineParameters
+    power: str = "paper"
 
     @property
     def name(self) -> str:
         """Name of the model."""
         parts = ["generator", self.load.kind, self.fault.kind if self.fault else "healthy"]
         parts += [] if self.grounded else ["isolated"]
-        return "_".join(parts + ([] if self.excitation == "regulated" else ["constant_field"]))
+        parts += [] if self.excitation == "regulated" else ["constant_field"]
+        parts += ["saturated"] if self.saturated else []
+        return "_".join(parts + ([] if self.power == "paper" else [self.power]))
+
+    @property
+    def saturated(self) -> bool:
+        """Whether the machine is not linear."""
+        return issubclass(self.machine, SaturatedMachine)
 
     @property
     def grounded(self) -> bool:
@@ -165,17 +190,18 @@ class Structure(Parametric):
         Z = [*v, *([] if self.grounded else [V_N]), *fault.unknowns, *load.unknowns]
         return Signals(X), Signals(Z), self.inputs, Signals(fault.theta)
 
-    def parameters(self) -> tuple[Signals, Signals]:
-        """Return the parameters of machine and exciter that count."""
+    def parameters(self) -> tuple[Signals, Signals, Signals]:
+        """Return the parameters of machine, exciter and shaft that count."""
         names = [f.name for f in fields(ExciterParameters) if f.name not in self.absent]
         return (
-            MachineParameters().signals("machine"),
+            self.machine().signals("machine"),
             ExciterParameters().signals("exciter", names),
+            Signals([FIXED_LOSS] if self.power == "torque" else []),
         )
 
-    def numbers(self, p: MachineParameters, e: ExciterParameters) -> list[float]:
+    def numbers(self, p: MachineParameters, e: ExciterParameters, shaft: Shaft) -> list[float]:
         """Return their values."""
-        parts = zip((p, e), self.parameters(), strict=True)
+        parts = zip((p, e, shaft), self.parameters(), strict=True)
         return [getattr(x, n.split(".")[1]) for x, part in parts for n in part.names]
 
     @property
@@ -186,11 +212,17 @@ class Structure(Parametric):
     @property
     def linear(self) -> tuple[str, ...]:
         """States of the windings, the fault and the load, where all of them are linear."""
-        if not self.load.load.linear:
+        if not self.load.load.linear or self.saturated:
             return ()
         fluxes = [s.name for s in FLUXES if self.grounded or s.name != "lam_s0"]
         fault = [s.name for s in self.own_of_fault.states]
         return (*fluxes, *fault, *(s.name for s in self.load.load.own.states))
+
+    @property
+    def nonlinear(self) -> str:
+        """What is not linear, in words."""
+        parts = [] if self.load.load.linear else ["its load is not linear"]
+        return "; ".join(parts + (["its machine saturates"] if self.saturated else []))
 
     @property
     def reversing(self) -> tuple[str, ...]:
@@ -207,19 +239,24 @@ def family(structure: Structure) -> GeneratorModel:
     theta has the parameters of the fault, the machine and the exciter.
     """
     X, Z, U, TH = structure.signals()
-    of_machine, of_exciter = structure.parameters()
+    of_machine, of_exciter, of_shaft = structure.parameters()
     (xv, x), (zv, z), (uv, u), (tv, th) = X.sx(), Z.sx(), U.sx(), TH.sx()
     pv, ev = ca.SX.sym("machine", len(of_machine)), ca.SX.sym("exciter", len(of_exciter))
-    p = MachineParameters().symbolic(**_by_field(of_machine, pv))
+    lv = ca.SX.sym("shaft", len(of_shaft))
+    p = structure.machine().symbolic(**_by_field(of_machine, pv))
     e = structure.exciter.symbolic(**_by_field(of_exciter, ev))
     V_t, V_ref = ca.SX.sym("V_t"), ca.SX.sym("V_ref")
     ode, alg, y = equations(structure, p, e, x, z, u, th)
+    if structure.power == "torque":
+        w_m, part = u["w_r"] / p.n_pp, u["w_r"] / p.w_rated
+        y["P_total"] = 2.0 * (y["T_e"] * w_m + lv[0] * part)
     dex = exciter_rates(structure, p, e, x, V_t, V_ref)
     ode_v, alg_v, y_v = X.stack(ode), ca.vertcat(*alg), OUTPUTS.stack(y)
     z_expr = solve_linear(ca.jacobian(alg_v, zv), -ca.substitute(alg_v, zv, ca.SX.zeros(len(Z))))
     f_v, g_v = ca.substitute([ode_v, y_v], [zv], [z_expr])
     exciter = ca.vertcat(*(dex[n] for n in X.names if n in dex))
-    theta, signals = ca.vertcat(tv, pv, ev), Signals([*TH, *of_machine, *of_exciter])
+    theta = ca.vertcat(tv, pv, ev, lv)
+    signals = Signals([*TH, *of_machine, *of_exciter, *of_shaft])
     symbols = (xv, zv, uv, V_t, V_ref)
     expressions = [ode_v, alg_v, f_v, g_v, z_expr, exciter]
     reduced, follow, by = ca.extract_parametric(
@@ -265,16 +302,19 @@ def _told(made: GeneratorModel, structure: Structure, exciter: ca.Function) -> G
         load=structure.load,
         fault=structure.fault,
         linear=linear,
+        nonlinear=structure.nonlinear,
         reversing=reversing,
         exciter=exciter,
     )
 
 
-def variant(structure: Structure, p: MachineParameters, e: ExciterParameters) -> GeneratorModel:
+def variant(
+    structure: Structure, p: MachineParameters, e: ExciterParameters, shaft: Shaft
+) -> GeneratorModel:
     """Return the model of one unit, a member of the family."""
     whole = family(structure)
     theta = structure.signals()[3]
-    made = GeneratorModel.member(structure.name, whole, theta, structure.numbers(p, e))
+    made = GeneratorModel.member(structure.name, whole, theta, structure.numbers(p, e, shaft))
     return _told(made, structure, None)
 
 
@@ -330,7 +370,7 @@ def equations(
 
     # load
     rates = dlam if grounded else dlam._replace(s0=p.L_ls * branch.zero_rate)
-    dibar, turn = wrsg.currents(p, rates).stator, speed_voltage(w_r, ibar.stator)
+    dibar, turn = wrsg.current_rates(p, lam, rates).stator, speed_voltage(w_r, ibar.stator)
     dbar = qd0_to_abc(theta_e, Qd0(*map(sum, zip(dibar, turn, strict=True))))
     di = Abc(*map(sum, zip(dbar, branch.rate, strict=True)))
     v_load = Abc(*(vk - v_n for vk in v))

@@ -7,7 +7,7 @@ Names follow the package's nomenclature where the paper's clash: ``r_fd`` is the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from apu_casadi.core.errors import ParameterError
@@ -74,6 +74,70 @@ class MachineParameters(Parameters):
 
 MACHINE = MachineParameters().signals("machine")
 """The machine's parameters by dotted name, as ``machine.r_s``."""
+_SAT = "assumed, of the size usual for salient poles; Table 1 tells a linear machine"
+
+
+@dataclass(frozen=True)
+class SaturatedMachine(MachineParameters):
+    """A machine whose d-axis magnetising path saturates; the q axis, mostly air, stays linear.
+
+    With lambda_md the flux linkage of the path and i_md = i_fd + i_kd - i_d its current,
+
+        L_md i_md = lambda_md (1 + S),    S = S_10 |lambda_md / lambda_rated|^X,
+
+    X = ln(S_12/S_10)/ln 1.2: the exponential form of the salient-pole machine in IEEE Std 1110,
+    section 5.3.2 (GENSAE), smooth and without a threshold.  Machines without it are
+    :class:`MachineParameters`.
+    """
+
+    S_10: float = par(0.1, unit="1", source=_SAT, doc="saturation S at rated flux linkage", lo=1e-9)
+    S_12: float = par(0.3, unit="1", source=_SAT, doc="saturation S at 1.2 times it", lo=1e-9)
+
+    def __post_init__(self) -> None:
+        """Check the ranges, and that S rises faster than the flux linkage."""
+        super().__post_init__()
+        if not self.S_12 > 1.2 * self.S_10:
+            raise ParameterError(
+                f"SaturatedMachine: S_12 = {self.S_12:g} must be > 1.2 S_10 = {1.2 * self.S_10:g}: "
+                "S rises faster than the flux linkage"
+            )
+
+    @property
+    def lam_rated(self) -> float:
+        """Flux linkage for rated voltage at no load and rated speed, Wb, peak."""
+        return math.sqrt(2.0) * self.V_rated_rms / self.w_rated
+
+
+def magnetics(p: MachineParameters, S_10: float | None, S_12: float | None) -> MachineParameters:
+    """Return the machine with saturation as asked for: None leaves it, S_10 = 0 is without.
+
+    Raises:
+        ParameterError: a value out of range, or S_12 alone for a linear machine.
+    """
+    if S_10 is None:
+        if S_12 and not isinstance(p, SaturatedMachine):
+            raise ParameterError(f"machine.S_12 = {S_12:g} needs machine.S_10 > 0 beside it")
+        return p if not S_12 else p.change(S_12=S_12)
+    own = {f.name: getattr(p, f.name) for f in fields(MachineParameters)}
+    if S_10 == 0:
+        return MachineParameters(**own)
+    given = {"S_10": S_10, "S_12": S_12}
+    if isinstance(p, SaturatedMachine):
+        own |= {"S_10": p.S_10, "S_12": p.S_12}
+    return SaturatedMachine(**own | {n: v for n, v in given.items() if v is not None})
+
+
+def require_linear(p: MachineParameters, what: str) -> None:
+    """Refuse a machine that saturates.
+
+    Raises:
+        ParameterError: it does; ``what`` needs the linear one.
+    """
+    if isinstance(p, SaturatedMachine):
+        raise ParameterError(
+            f"{what} needs the linear machine: this one saturates (machine.S_10 = {p.S_10:g}); "
+            "set machine.S_10 = 0"
+        )
 
 
 @dataclass(frozen=True)

@@ -507,7 +507,7 @@ class MeanStep(Rebuilt):
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
         if not ss.linear:
-            raise NotApplicable(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: {ss.nonlinear}")
         self.ss, self.dt, self.quad = ss, dt, tuple(quad)
         given = np.array(theta, dtype=float)
         self.theta = ss.full(given)

@@ -377,7 +377,7 @@ class Propagator(Rebuilt):
     ) -> None:
         """Compute or fetch the table, build or fetch the functions."""
         if not ss.linear:
-            raise NotApplicable(f"{ss.name}: its load is not linear")
+            raise NotApplicable(f"{ss.name}: {ss.nonlinear}")
         if n_out < 10:
             raise NotApplicable(f"{ss.name}: at least 10 samples are needed, got {n_out}")
         self.ss, self.n_out, self.dt = ss, n_out, dt

@@ -41,7 +41,7 @@ from apu_casadi.machine.faults import ttsc
 from apu_casadi.machine.generatormodel import ANGLE, DRIVES
 from apu_casadi.machine.generatormodel import FLUXES as _ALL_FLUXES
 from apu_casadi.machine.generatormodel import OUTPUTS as GENERATOR
-from apu_casadi.machine.machinedata import MACHINE, MachineParameters
+from apu_casadi.machine.machinedata import MACHINE, MachineParameters, require_linear
 from apu_casadi.machine.park import (
     PHASE_ANGLE,
     Abc,
@@ -354,10 +354,11 @@ def terminal_model(p: MachineParameters, fault: str = "shunts") -> StateSpace:
             theta = mu, k_rf, kappa, phase_angle).
 
     Raises:
-        ParameterError: unknown fault.
+        ParameterError: unknown fault, or a machine that saturates.
     """
     if fault not in FAULTS:
         raise ParameterError(f"fault {fault!r} {nearest(str(fault), FAULTS)}")
+    require_linear(p, "the terminal model")
     family = _family(fault)
     theta = LEAKY if fault == "leaky" else SHUNTS
     return StateSpace.member(family.name, family, theta, list(p.held("machine").values()))

@@ -8,11 +8,13 @@ fault ibar is the terminal current.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.machinedata import MachineParameters, SaturatedMachine
 from apu_casadi.machine.park import Qd0, speed_voltage
 
 
@@ -33,7 +35,7 @@ class Windings(NamedTuple):
 
 
 def inductance(p: MachineParameters) -> np.ndarray:
-    """Return L of (7), H, shape (6, 6), rows and columns ordered q, d, 0, fd, kd, kq.
+    """Return L of (7), unsaturated, H, shape (6, 6), rows and columns q, d, 0, fd, kd, kq.
 
     The last entry is L_mq + L_lkq; the paper prints L_md + L_lkq, with which the q axis would not
     be the derivative of an energy.  L_s of the zero sequence is the leakage L_ls.
@@ -51,11 +53,67 @@ def inductance(p: MachineParameters) -> np.ndarray:
 def flux_linkages(p: MachineParameters, i: Windings) -> Windings:
     """Return lambda = L ibar, (7), in Wb, from effective stator and rotor currents in A."""
     L = inductance(p)
-    return Windings(*(_combine(row, i) for row in L))
+    lam = Windings(*(_combine(row, i) for row in L))
+    if not isinstance(p, SaturatedMachine):
+        return lam
+    i_md = i.fd + i.kd - i.sd
+    less = saturated_flux(p, i_md, 0.0) - p.L_md * i_md  # in all windings of the axis
+    return lam._replace(sd=lam.sd + less, fd=lam.fd + less, kd=lam.kd + less)
+
+
+def saturation(p: SaturatedMachine, lam_md: Any) -> tuple[Any, Any]:
+    """Return S of a magnetising flux linkage, Wb, and lambda dS/dlambda; see the parameters."""
+    log = ca.log if isinstance(p.S_10, ca.SX | ca.MX) else np.log
+    X = log(p.S_12 / p.S_10) / np.log(1.2)
+    square = (lam_md / p.lam_rated) ** 2
+    S = p.S_10 * (square + _TINY) ** (X / 2.0)
+    return S, X * S * square / (square + _TINY)
+
+
+_TINY = 1e-18  # keeps derivatives finite without flux
+#: Newton's steps: each takes a share X/(X+1) off while far too high, and squares the error nearby.
+_STEPS = 16
+
+
+def saturated_flux(p: SaturatedMachine, J: Any, s: Any) -> Any:
+    """Return lambda_md, Wb, that solves lambda_md ((1 + S)/L_md + s) = J.
+
+    By Newton's method from the linear solution, which is never below it: the left side is convex,
+    so that the iterates fall to the root.  The steps are written out, for numbers and symbols.
+
+    Args:
+        J: current, A, that all windings of the axis would make together.
+        s: sum of 1/L of their leakages, 1/H; 0 where J is the magnetising current itself.
+    """
+    lam = J / (1.0 / p.L_md + s)
+    for _ in range(_STEPS):
+        S, slope = saturation(p, lam)
+        excess = lam * ((1.0 + S) / p.L_md + s) - J
+        lam = lam - excess / ((1.0 + S + slope) / p.L_md + s)
+    return lam
+
+
+def current_rates(p: MachineParameters, lam: Windings, rates: Windings) -> Windings:
+    """Return d ibar/dt, A/s, from the flux linkages and their rates."""
+    if not isinstance(p, SaturatedMachine):
+        return currents(p, rates)
+    S, slope = saturation(p, _d_axis_flux(p, lam))
+    return currents(_linear(p).symbolic(L_md=p.L_md / (1.0 + S + slope)), rates)
+
+
+def _linear(p: SaturatedMachine) -> MachineParameters:
+    return MachineParameters().symbolic(
+        **{f.name: getattr(p, f.name) for f in fields(MachineParameters)}
+    )
+
+
+def _d_axis_flux(p: SaturatedMachine, lam: Windings) -> Any:
+    leakages = ((lam.sd, p.L_ls), (lam.fd, p.L_lfd), (lam.kd, p.L_lkd))
+    return saturated_flux(p, sum(x / L for x, L in leakages), sum(1.0 / L for _, L in leakages))
 
 
 def currents(p: MachineParameters, lam: Windings) -> Windings:
-    """Return ibar = L^-1 lambda, (7) inverted, in A; linear, so it also maps rates to rates.
+    """Return ibar = L^-1 lambda, (7) inverted, in A; rates follow by :func:`current_rates`.
 
     By the mutual flux linkages (Krause): lambda_md = L_MD (lambda_sd/L_ls + lambda_fd/L_lfd +
     lambda_kd/L_lkd) with 1/L_MD = 1/L_md + 1/L_ls + 1/L_lfd + 1/L_lkd, and so in the q axis.
@@ -63,6 +121,8 @@ def currents(p: MachineParameters, lam: Windings) -> Windings:
     s, fd, kd, kq = (1.0 / L for L in (p.L_ls, p.L_lfd, p.L_lkd, p.L_lkq))
     L_MD, L_MQ = 1.0 / (1.0 / p.L_md + s + fd + kd), 1.0 / (1.0 / p.L_mq + s + kq)
     md = (L_MD * s) * lam.sd + (L_MD * fd) * lam.fd + (L_MD * kd) * lam.kd
+    if isinstance(p, SaturatedMachine):
+        md = _d_axis_flux(p, lam)
     mq = (L_MQ * s) * lam.sq + (L_MQ * kq) * lam.kq
     return Windings(
         sq=s * (mq - lam.sq),

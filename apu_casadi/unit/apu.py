@@ -27,12 +27,17 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.generator import Generator, GeneratorPoint
+from apu_casadi.machine.machinedata import magnetics
 from apu_casadi.unit.control import GOVERNORS, Governor, GovernorParameters, word_of
 from apu_casadi.unit.events import MOST, Ambient
 from apu_casadi.unit.exchange import Link
 
 if TYPE_CHECKING:
+    from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
+
+    #: Fault of all generators, a list of one for each, or a mapping by number from 1.
+    Faults = Fault | Sequence[Fault | None] | Mapping[int, Fault | None] | None
 
 RESIDUAL_JOINT = 1e-9
 T = TypeVar("T")
@@ -242,13 +247,13 @@ class Apu(Parametric):
         table: dict[str, float | str] = {}
         for s, p in self.parameter_sets().items():
             table |= _values(s, p)
-        table["generator.neutral"] = self.generator.neutral
+        table |= {f"generator.{n}": v for n, v in _words(self.generator).items()}
         table["generator.count"] = len(self.machines)
         table["governor.kind"] = word_of(self.governor)
         first = _of_each(self.machines[0])
         for k, machine in enumerate(self.machines[1:], 2):
             own = _of_each(machine)
-            table |= {f"generator{k}.{n}": v for n, v in own.items() if v != first[n]}
+            table |= {f"generator{k}.{n}": v for n, v in own.items() if v != first.get(n)}
         return table
 
     def change(self, values: Mapping[str, Any]) -> Apu:
@@ -273,7 +278,7 @@ class Apu(Parametric):
         machines = self._counted(values.get("generator.count"))
         by_set: dict[str, dict[str, Any]] = {}
         own: dict[int, dict[str, Any]] = {k: {} for k in range(1, len(machines) + 1)}
-        known = self.parameters()
+        known = {**_UNSATURATED, **self.parameters()}
         for key, value in values.items():
             if numbered := _NUMBERED.fullmatch(key):
                 k, name = _which(numbered, machines)
@@ -330,11 +335,22 @@ class Apu(Parametric):
             raise ScenarioError(f"{what}: {n} entries expected, one a generator, got {len(given)}")
         return tuple(given)
 
+    def each_fault(self, given: Any) -> tuple[Any, ...]:
+        """Return the fault of each generator; as :meth:`each`, or a mapping by number from 1."""
+        if not isinstance(given, Mapping):
+            return self.each("fault", given)
+        n = len(self.machines)
+        for k in given:
+            if k not in range(1, n + 1):
+                raise ScenarioError(f"fault: generator {k!r}, but the unit has 1 to {n}")
+        return tuple(given.get(k) for k in range(1, n + 1))
+
     # -- steady state -------------------------------------------------------------------------
 
     def steady_state(
         self,
         load: Load | Sequence[Load],
+        fault: Faults = None,
         *,
         ambient: Ambient | None = None,
         health: Mapping[str, float] | None = None,
@@ -342,25 +358,29 @@ class Apu(Parametric):
         limits: Limits | None = None,
         N_ref: float | None = None,
     ) -> JointPoint:
-        """Solve the steady unit at governed speed: healthy generators under balanced loads.
+        """Solve the steady unit at governed speed.
 
-        ``load`` is that of each generator, or a list with one for each.  ``ambient`` is the default
-        day if not given, ``N_ref`` another governed speed than the unit's, rad/s.  ``limits`` are
-        those of the trim; by default without one of temperature, which is no reason not to
-        simulate.
+        ``load`` and ``fault`` are those of each generator, or a list with one for each; for the
+        fault also a mapping by number of the generator, from 1.  With a fault or an unbalanced load
+        the generator's state is periodic, and the shaft carries the mean of its power over a turn.
+        ``ambient`` is the default day if not given, ``N_ref`` another governed speed than the
+        unit's, rad/s.  ``limits`` are those of the trim; by default without one of temperature,
+        which is no reason not to simulate.
 
         Raises:
+            ScenarioError: another number of loads or faults than there are generators.
             OperatingPointError: no such point, or it needs fuel beyond the governor's limits.
         """
         amb = dataclasses.asdict(Ambient() if ambient is None else ambient)
         N_ref = self.N_ref if N_ref is None else N_ref
-        alike = groups(zip(self.machines, self.each("load", load), strict=True))
+        loads, faults = self.each("load", load), self.each_fault(fault)
+        alike = groups(zip(self.machines, loads, faults, strict=True))
         points: dict[int, GeneratorPoint] = {}
         PW = 0.0
-        for numbers, ((gen, _), own) in alike.items():
+        for numbers, ((gen, _), own, broken) in alike.items():
             link = self.link_of(numbers)
-            point = gen.steady_state(own, w_r=link.w_r(N_ref), V_ref=V_ref)
-            PW += link.PW(point.y["P_total"])
+            point = gen.steady_state(own, broken, w_r=link.w_r(N_ref), V_ref=V_ref)
+            PW += link.PW(point.mean("P_total"))
             points |= dict.fromkeys(numbers, point)
         limits = Limits(T4_max=math.inf) if limits is None else limits
         gas = trim_gas_generator(
@@ -389,6 +409,13 @@ def groups(of_each: Iterable[T]) -> dict[tuple[int, ...], T]:
 
 
 _EACH = ("machine", "exciter", "coupling")
+#: What :meth:`Apu.change` takes of a linear machine, which has none.
+_UNSATURATED = {"machine.S_10": 0.0, "machine.S_12": 0.0}
+
+
+def _words(gen: Generator) -> dict[str, str]:
+    """Return what is chosen by a word."""
+    return {n: getattr(gen, n) for n in ("neutral", "excitation", "power")}
 
 
 def _values(prefix: str, p: Parameters) -> dict[str, Any]:
@@ -400,7 +427,7 @@ def _of_each(machine: OnShaft) -> dict[str, Any]:
     gen, gear = machine
     parts = zip(_EACH, (gen.machine, gen.exciter, gear), strict=True)
     own = {n: v for s, p in parts for n, v in _values(s, p).items()}
-    return own | {"neutral": gen.neutral}
+    return _UNSATURATED | own | _words(gen)
 
 
 def _which(key: re.Match[str], machines: Sequence[OnShaft]) -> tuple[int, str]:
@@ -420,13 +447,15 @@ def _changed(on_shaft: OnShaft, values: Mapping[str, Any]) -> OnShaft:
     if not values:
         return on_shaft
     gen, gear = on_shaft
+    rest = {n: v for n, v in values.items() if n not in _UNSATURATED}
+    magnetic = magnetics(gen.machine, *map(values.get, _UNSATURATED))
     sets: list[Any] = [
-        p.change(**{n.partition(".")[2]: v for n, v in values.items() if n.startswith(f"{s}.")})
-        for s, p in zip(_EACH, (gen.machine, gen.exciter, gear), strict=True)
+        p.change(**{n.partition(".")[2]: v for n, v in rest.items() if n.startswith(f"{s}.")})
+        for s, p in zip(_EACH, (magnetic, gen.exciter, gear), strict=True)
     ]
     m, e, c = sets
-    neutral = values.get("neutral", gen.neutral)
-    return OnShaft(dataclasses.replace(gen, machine=m, exciter=e, neutral=neutral), c)
+    words = {n: values.get(n, v) for n, v in _words(gen).items()}
+    return OnShaft(dataclasses.replace(gen, machine=m, exciter=e, **words), c)
 
 
 def trim(
@@ -442,11 +471,12 @@ def trim(
         model: what is to be trimmed.
         fixed: of a gas generator, two outputs by name with their values, SI; see
             :func:`apu_casadi.gaspath.steady.trimming.trim_gas_generator`.
-        load: of a generator, or of each generator of a unit: a balanced load; for a unit also a
-            list with one for each generator.
+        load: of a generator, or of each generator of a unit; for a unit also a list with one for
+            each generator.
         conditions: of a gas generator ``theta``, ``limits``, altitude (m), Mach, dT_isa (K), war;
-            of a generator ``w_r`` (rad/s, electrical) and ``V_t`` (V rms) or ``V_ref``; of a unit
-            ``ambient``, ``health``, ``V_ref``, ``limits``.
+            of a generator ``fault``, ``w_r`` (rad/s, electrical), ``theta_e`` (rad) and ``V_t`` (V
+            rms), ``V_ref`` or ``V_fd`` (V); of a unit ``fault``, ``ambient``, ``health``,
+            ``V_ref``, ``limits``.
 
     Raises:
         SignalError: arguments that this model does not take, or too few.

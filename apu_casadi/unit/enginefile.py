@@ -8,9 +8,10 @@
     [gas_generator]              # and the maps: see apu_casadi.gaspath.engines
     W2 = { value = 3.49, source = "data sheet" }
 
-    [generator]
+    [generator]                  # all of them alike, 1 to 4; or one table [[generator]] for each
+    count = 2
     neutral = "isolated"
-    [generator.machine]          # apu_casadi.machine.machinedata
+    [generator.machine]          # apu_casadi.machine.machinedata; with S_10 or S_12 it saturates
     r_s = { value = 5.1, unit = "mohm", source = "measured" }
     [generator.exciter]
     K_A = 200.0
@@ -19,7 +20,7 @@
     Kp = 0.3
     Wf_max = { value = 240, unit = "kg/h", source = "data sheet" }
 
-    [coupling]                   # the gear
+    [coupling]                   # the gear; of one generator, [generator.coupling]
     gear = 3.4775
 
     [limits]                     # beyond which a steady point is refused
@@ -53,11 +54,15 @@ from apu_casadi.gaspath.engines import (
 from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS, Limits
 from apu_casadi.gaspath.unitnumbers import MAPS
 from apu_casadi.machine.generator import NEUTRALS, Generator
-from apu_casadi.unit.apu import Apu
+from apu_casadi.machine.machinedata import MachineParameters, SaturatedMachine, magnetics
+from apu_casadi.unit.apu import Apu, OnShaft
 from apu_casadi.unit.control import GOVERNORS, Governor, word_of
+from apu_casadi.unit.events import MOST
 from apu_casadi.unit.shippedunits import unit_path
 
-_INNER = ("machine", "exciter")
+_INNER = ("machine", "exciter", "coupling")
+SATURATION = ("S_10", "S_12")
+"""Of a machine that saturates; S_10 = 0 is one that does not, after one that does."""
 GAS = (*TABLES, "limits")
 """Parts of a unit that a gas generator alone is made of."""
 
@@ -119,49 +124,70 @@ def _read(path: Path, data: Mapping[str, Any]) -> Engine:
         if not isinstance(data.get(k, ""), str):
             raise ParameterError(f"{path}: {k} must be a text, got {data[k]!r}")
     gg, given = gas_generator_of(path, data)
-    generator = _generator(path, data, default.generator, given)
-    governor = _governor(path, data, given)
     where = f"{path}, [coupling]"
     gear = read_set(where, table(f"{path}", data, "coupling"), default.coupling, given, "coupling")
+    first, *others = _machines(path, data, gear, given)
+    governor = _governor(path, data, given)
     limits = _limits(path, data, given)
-    unit = Apu(gg, generator, governor, gear)
+    unit = Apu(gg, first.generator, governor, first.coupling, tuple(others))
     head = {k: data.get(k, "") for k in HEAD}
     head["name"] = head["name"] or path.stem
     assumed = tuple(_assumed(unit, limits, given, data))
     return Engine(**head, unit=unit, limits=limits, sources=given.sources, assumed=assumed)
 
 
-def _generator(path: Path, data: Mapping[str, Any], default: Generator, given: Numbers) -> Any:
-    """Return the generator; several tables must describe equal ones."""
+def _machines(path: Path, data: Mapping[str, Any], gear: Any, given: Numbers) -> list[OnShaft]:
+    """Return the generators with their gears; what a further table leaves out is the first's."""
     tables = data.get("generator", {})
     several = tables if isinstance(tables, list) else [tables]
-    made = []
+    made: list[OnShaft] = []
     for i, own in enumerate(several, 1):
         where = f"{path}, [generator]" if own is tables else f"{path}, [[generator]] {i}"
         if not isinstance(own, dict):
             raise ParameterError(f"{where}: a table is expected, got {own!r}")
-        known(where, own, (*_INNER, "neutral"))
-        parts = {
-            name: read_set(
-                where.replace("generator]", f"generator.{name}]", 1),
-                table(where, own, name),
-                getattr(default, name),
-                given,
-                name,
-            )
-            for name in _INNER
-        }
-        neutral = own.get("neutral", default.neutral)
-        if neutral not in NEUTRALS:
-            raise ParameterError(
-                f"{where}: neutral = {neutral!r} {nearest(str(neutral), NEUTRALS)}"
-            )
-        if "neutral" in own:
-            given.values["generator.neutral"] = neutral
-        made.append(Generator(**parts, neutral=neutral))
-    if any(g != made[0] for g in made):
-        raise ParameterError(f"{path}: the [[generator]] tables differ; this unit has equal ones")
-    return made[0] if made else default
+        known(where, own, (*_INNER, "neutral", "count"))
+        first = made[0] if made else OnShaft(Generator(), gear)
+        if "count" in own or own is not tables:
+            given.values["generator.count"] = True
+        count = own.get("count", len(Apu().machines) if own is tables else 1)
+        if type(count) is not int or not 1 <= count <= MOST - len(made):
+            raise ParameterError(f"{where}: count = {count!r}; a unit has 1 to {MOST} generators")
+        made += [_machine(where, own, first, given, len(made) + 1)] * count
+    if not made:
+        raise ParameterError(f"{path}: no [[generator]]; a unit has 1 to {MOST}")
+    return made
+
+
+def _machine(
+    where: str, own: Mapping[str, Any], first: OnShaft, given: Numbers, number: int
+) -> OnShaft:
+    prefix = "" if number == 1 else f"generator{number}."
+    tables = {name: table(where, own, name) for name in _INNER}
+    tables["machine"], base = _magnetics(tables["machine"], first.generator.machine, given, prefix)
+    parts: dict[str, Any] = {}
+    for name, p in zip(_INNER, (base, first.generator.exciter, first.coupling), strict=True):
+        place = where.replace("generator]", f"generator.{name}]")
+        parts[name] = read_set(place, tables[name], p, given, f"{prefix}{name}")
+    neutral = own.get("neutral", first.generator.neutral)
+    if neutral not in NEUTRALS:
+        raise ParameterError(f"{where}: neutral = {neutral!r} {nearest(str(neutral), NEUTRALS)}")
+    if "neutral" in own:
+        given.values[f"{prefix or 'generator.'}neutral"] = neutral
+    return OnShaft(Generator(parts["machine"], parts["exciter"], neutral), parts["coupling"])
+
+
+def _magnetics(
+    own: dict[str, Any], p: MachineParameters, given: Numbers, prefix: str
+) -> tuple[dict[str, Any], MachineParameters]:
+    """Return the table of a machine and what it leaves out, with saturation if it tells of it."""
+    S_10 = own.get("S_10")
+    value = S_10.get("value") if isinstance(S_10, dict) else S_10
+    if type(value) in (int, float) and value == 0:
+        given.values[f"{prefix}machine.S_10"] = 0.0
+        return {n: v for n, v in own.items() if n not in SATURATION}, magnetics(p, 0.0, None)
+    if own.keys() & set(SATURATION) and not isinstance(p, SaturatedMachine):
+        return own, magnetics(p, SaturatedMachine().S_10, None)
+    return own, p
 
 
 def _governor(path: Path, data: Mapping[str, Any], given: Numbers) -> Governor:
@@ -207,8 +233,12 @@ def _assumed(
         if part == "gas_generator" and "gas_generator.gas_data" not in given.values:
             data_set = unit.gas_generator.parameters.gas_data
             yield Assumed("gas_generator.gas_data", data_set, "1", "default unit")
-    for name, word in (("generator.neutral", unit.generator.neutral),
-                       ("governor.kind", word_of(unit.governor))):  # fmt: skip
+    words: dict[str, str | float] = {
+        "generator.neutral": unit.generator.neutral,
+        "generator.count": len(unit.machines),
+        "governor.kind": word_of(unit.governor),
+    }
+    for name, word in words.items():
         if name not in given.values:
             yield Assumed(name, word, "1", "default unit")
     for f in dataclasses.fields(limits):
@@ -243,13 +273,9 @@ def write_unit(engine: Engine | Apu, path: str | Path) -> None:
     e = Engine(unit=engine) if isinstance(engine, Apu) else engine
     lines = [f"{k} = {text(getattr(e, k))}" for k in HEAD if getattr(e, k)]
     lines += ["", *gas_lines(e.unit.gas_generator, path, e.sources)]
-    gen = e.unit.generator
-    lines += ["", "[generator]", f"neutral = {text(gen.neutral)}"]
-    for name in _INNER:
-        lines += [f"[generator.{name}]", *set_lines(getattr(gen, name), name, e.sources)]
+    lines += _machine_lines(e)
     lines += ["", "[governor]", f"kind = {text(word_of(e.unit.governor))}"]
     lines += set_lines(e.unit.governor, "governor", e.sources)
-    lines += ["", "[coupling]", *set_lines(e.unit.coupling, "coupling", e.sources)]
     lines += ["", "[limits]"]
     for f in dataclasses.fields(e.limits):
         value, source = getattr(e.limits, f.name), e.sources.get(f"limits.{f.name}", "")
@@ -257,3 +283,18 @@ def write_unit(engine: Engine | Apu, path: str | Path) -> None:
             unit = LIMIT_UNITS.get(f.name, "1")
             lines += rows([(f.name, value, unit, "limit of a steady point", source)])
     files.write_text(path, "\n".join(lines).lstrip("\n") + "\n")
+
+
+def _machine_lines(e: Engine) -> list[str]:
+    """Return the lines of the generators: one table for equal ones, else one for each."""
+    machines, lines = e.unit.machines, []
+    head = ["[generator]", f"count = {len(machines)}"] if e.unit.alike else ["[[generator]]"]
+    saturates = isinstance(machines[0].generator.machine, SaturatedMachine)
+    for k, (gen, gear) in enumerate(machines[:1] if e.unit.alike else machines, 1):
+        prefix = "" if k == 1 else f"generator{k}."
+        lines += ["", *head, f"neutral = {text(gen.neutral)}"]
+        for name, p in zip(_INNER, (gen.machine, gen.exciter, gear), strict=True):
+            lines += [f"[generator.{name}]", *set_lines(p, f"{prefix}{name}", e.sources)]
+            if name == "machine" and saturates and not isinstance(p, SaturatedMachine):
+                lines.append("S_10 = 0.0")
+    return lines

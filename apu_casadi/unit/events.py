@@ -25,6 +25,9 @@ HEALTH_FACTORS: Mapping[str, str] = MappingProxyType(
 )
 """The health factors of the gas path, one when healthy, with their meaning."""
 
+STARTS = ("balanced", "settled")
+"""What a run may start from: the healthy unit with balanced loads, or what is there from the start.
+"""
 MOST = 4
 """Generators that a unit may have; it has at least one."""
 

@@ -77,6 +77,7 @@ class Machines:
         start: what holds then.
         settings: how they are integrated.
         phasors: whether phasors are wanted too.
+        settled: whether loads and faults have been there for long, and ``point`` is of them.
         end: of the run, s.
     """
 
@@ -90,27 +91,25 @@ class Machines:
         settings: Settings,
         phasors: bool,
         *,
+        settled: bool = False,
         end: float = 0.0,
     ) -> None:
         self.apu, self.settings, self._end = apu, settings, end
         self.means = StepMeans(apu.generator, phasors)
-        self.groups = [
-            MachineStep(
-                apu,
-                numbers,
-                point.of(numbers[0]),
-                start.loads[numbers[0] - 1].balanced_part,
-                settings,
-                self.means,
-            )
-            for numbers in kinds(apu, start)
-        ]
+        self.groups = []
+        for numbers in kinds(apu, start):
+            at = numbers[0] - 1
+            load, fault = start.loads[at], start.faults[at]
+            if not settled:
+                load, fault = load.balanced_part, None
+            own, how = point.of(numbers[0]), (settings, self.means)
+            self.groups.append(MachineStep(apu, numbers, own, load, fault, *how))
         self._forget()
 
     def _forget(self) -> None:
         self._block: JointBlock | None = None
         self._no_block = ""
-        self._wide: tuple[tuple[Any, ...], JointBlock] | None = None
+        self._wide: tuple[list[Any], JointBlock] | None = None
 
     def samples(self, grid: np.ndarray) -> int:
         """Waveform samples of a whole run, the start included; 0 where none are stored."""
@@ -124,7 +123,7 @@ class Machines:
         for group in self.groups:
             at = point.of(group.numbers[0])
             w = np.array([[at.y[n]] for n in WAVEFORMS])
-            found.append(Of(group.numbers, self.means.at_rest(at), None, w))
+            found.append(Of(group.numbers, self.means.at_rest(at), group.phase.fault, w))
         return found
 
     def switch(self, now: Holding, here: Holding, t: float, *, switched: bool = True) -> bool:
@@ -236,13 +235,14 @@ class Machines:
         self._check_block(grid)
         middles = (grid[1:] + grid[:-1]) / 2
         given = [g.columns(middles, before) for g in self.groups]
-        fast, links = [one for one, _ in given], [g.link for g in self.groups]
-        layouts = tuple(one.layout for one in fast)
+        fast = [one for one, _ in given]
+        layouts = [one.layout for one in fast]
         if self._wide is None or self._wide[0] != layouts:
+            links = [g.link for g in self.groups]
             self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
         held: list[Any] = [unit.u, unit.theta]
-        for link, (one, own) in zip(links, given, strict=True):
-            numbers = np.repeat(link.numbers[:, None], middles.size, axis=1)
+        for g, (one, own) in zip(self.groups, given, strict=True):
+            numbers = g.numbers_of_link
             numbers[0] = unit.N_ref
             held += [own.u, own.theta, numbers, own.vector, one.dt]
         done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held)

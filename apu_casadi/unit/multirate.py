@@ -44,6 +44,7 @@ from apu_casadi.core.runloop import SAME_INSTANT, run
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import (
+    STARTS,
     Ambient,
     Event,
     Holding,
@@ -77,6 +78,7 @@ __all__ = [
     "MEANS",
     "RMS",
     "SOLVERS",
+    "STARTS",
     "WAVEFORMS",
     "Noise",
     "exchange_grid",
@@ -117,6 +119,7 @@ def simulate_joint(
     seed: int | None = None,
     hook: Callable[[int, np.ndarray], np.ndarray] | None = None,
     solver: str = "auto",
+    start_from: str = "balanced",
     rtol: float = 1e-8,
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
@@ -129,7 +132,9 @@ def simulate_joint(
     Nothing moves before the first event.  Factors, speed, and the numbers of loads, faults and the
     day may be profiles (:func:`apu_casadi.core.profiles.profile.varying`), held over each step at
     their value in its middle; where one jumps, a step begins.  A fault or an unbalanced load given
-    for the start acts from t = 0 on the steady healthy, balanced unit.
+    for the start acts from t = 0 on the steady healthy, balanced unit; or, with
+    ``start_from="settled"``, it has been there for long, and the run starts in the periodic state
+    of all generators.
 
     Args:
         apu, load, fault: the unit; load and fault from the start, of all generators, or a list with
@@ -144,6 +149,7 @@ def simulate_joint(
         phasors: store fundamental phasors of voltages and currents of each exchange step, too.
         noise, seed: uncertainty and the seed of its random numbers.
         hook: processes the rotor speed between state update and output (Algorithm 2).
+        start_from: one of ``STARTS``, as above.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
         progress: called with (done, total) seconds.
         attrs: more attributes for the dataset.
@@ -170,7 +176,7 @@ def simulate_joint(
     events = in_order(events, duration, generators=len(apu.machines))
     start = Holding(
         apu.each("load", load),
-        apu.each("fault", _by_number(apu, fault)),
+        apu.each_fault(fault),
         all_factors(health),
         Ambient() if ambient is None else ambient,
         None if N_ref is None else SpeedChange(0.0, N_ref).N_ref,
@@ -183,6 +189,7 @@ def simulate_joint(
         noise=noise,
         seed=seed,
         hook=hook,
+        settled=_settled(start_from),
     )
     rng = np.random.default_rng(seed)
     system = JointRun(apu, asked, settings, rng)
@@ -195,15 +202,10 @@ def simulate_joint(
     return _concluded(system, record, rng, exchange, events, warn_exchange, attrs or {})
 
 
-def _by_number(apu: Apu, fault: Any) -> Any:
-    """Return a mapping of faults by number as a list."""
-    if not isinstance(fault, Mapping):
-        return fault
-    n = len(apu.machines)
-    for k in fault:
-        if k not in range(1, n + 1):
-            raise ScenarioError(f"fault: generator {k!r}, but the unit has 1 to {n}")
-    return [fault.get(k) for k in range(1, n + 1)]
+def _settled(start_from: str) -> bool:
+    if start_from not in STARTS:
+        raise ScenarioError(f"start_from {start_from!r} {nearest(str(start_from), STARTS)}")
+    return start_from == "settled"
 
 
 def _settings(

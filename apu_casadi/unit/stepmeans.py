@@ -88,10 +88,10 @@ class StepMeans:
         return (*MEANS, *means, "T_e")
 
     def at_rest(self, point: GeneratorPoint) -> np.ndarray:
-        """What a step's means would be in the steady state of a balanced load."""
+        """What a step's means would be in the steady state."""
         parts = phasors_at_rest(point)
-        means = [*(point.y[n] for n in MEANS), *rms_at_rest(point).values()]
-        means += [*sequences(parts, symmetric=True), *(parts if self.phasors else ())]
+        means = [*(point.mean(n) for n in MEANS), *rms_at_rest(point).values()]
+        means += [*sequences(parts, symmetric=point.balanced), *(parts if self.phasors else ())]
         return np.array(means)
 
     def settle(self, raw: Sequence[RawMeans]) -> np.ndarray:
@@ -134,13 +134,18 @@ class StepMeans:
 
 
 def rms_at_rest(point: GeneratorPoint) -> dict[str, float]:
-    """Rms values in the steady state of a balanced load, by name."""
+    """Rms values in the steady state, by name."""
+    if not point.balanced:
+        return {name: point.turn.rms(name.removesuffix("_rms").lower()) for name in RMS}
     I = math.sqrt(sum(point.y[f"i_{p}"] ** 2 for p in PHASES) / 3)
     return {name: point.y["V_t"] if name[0] == "V" else I for name in RMS}
 
 
 def phasors_at_rest(point: GeneratorPoint) -> np.ndarray:
-    """Phasors in the steady state of a balanced load, in the order of ``PARTS``."""
+    """Phasors in the steady state, in the order of ``PARTS``."""
+    if not point.balanced:
+        each = [point.turn.phasor(name) for name in PHASORS.values()]
+        return np.array([part for V in each for part in (V.real, V.imag)])
     means = []
     for q in "vi":
         for p, ahead, behind in ("acb", "bac", "cba"):

@@ -27,6 +27,7 @@ from scenarios.shell import jsontext, progress
 if TYPE_CHECKING:
     from apu_casadi.gaspath.calibration import CalibrationPoint, CalibrationResult
     from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.unit.enginefile import Engine
 
 NAME = "calibrate"
 HELP = "fit map numbers to table or test-bench points"
@@ -34,6 +35,7 @@ OPTIONS = f"""
 file FILE ?        | CSV of points (see above)
 --free A,B         | numbers to fit (default: the six of the code)
 --write-points CSV | write the points, as a template
+--write-engine TOML | write the unit with the fitted numbers, each with FILE as its source
 {given.UNIT}
 --json             | print JSON
 """
@@ -117,11 +119,26 @@ def run(args: argparse.Namespace) -> int:
     progress.tell(f"fitting {len(free)} numbers to {len(points)} points", quiet=args.json)
     result = calibrate(gg if args.file else uncalibrated(gg), points, free)
     now = in_use(gg, result.names)
+    if args.write_engine:
+        engine = given.engine_file(args, given.TABLES)
+        _write_engine(args.write_engine, engine, result, args.file or "Tables 4 and 5")
     if args.json:
         jsontext.show(report(result, now) | given.own(args) | given.assumed(args))
     else:
         print(text(result, now, "in the file" if args.engine else "in the code"))
     return 0
+
+
+def _write_engine(path: str, engine: Engine, result: CalibrationResult, points: str) -> None:
+    """Write the unit with the fitted numbers."""
+    import dataclasses
+
+    from apu_casadi.unit.enginefile import write_unit
+
+    sources = dict.fromkeys(result.names, f"fitted to {points} (apu calibrate)")
+    unit = engine.unit.change(result.values)
+    engine = dataclasses.replace(engine, unit=unit, sources={**engine.sources, **sources})
+    write_unit(engine, path)
 
 
 def _plausible(path: str, points: Sequence[CalibrationPoint], gg: GasGenerator) -> None:

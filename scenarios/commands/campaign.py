@@ -77,12 +77,13 @@ def run(args: argparse.Namespace) -> int:
         raise
     t = time.perf_counter() - t
     report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": campaigns.counts(ds)}
+    report |= {k: v for k, v in (("engine", base.engine), ("governor", base.governor)) if v}
     report |= {"base": base.name, "ambient": dataclasses.asdict(base.ambient)}
     report |= {"solver": ds.attrs["solver"], "exchange": base.exchange}
     report |= {"apu_casadi_version": ds.attrs["apu_casadi_version"], "reasons": _told(ds, "reason")}
     report |= {"warnings": _told(ds, "warnings"), "file": str(Path(args.out) / campaigns.DATASET)}
     if args.json:
-        jsontext.show(report | given.own(args) | given.assumed(args))
+        jsontext.show(report | given.assumed(args))
     else:
         _print(report)
     return 0
@@ -107,8 +108,9 @@ def _print(r: dict[str, Any]) -> None:
     notices.tell(f"{name}: {words}" for name, words in list(r["warnings"].items())[:10])
     if r["warnings"]:
         print(f"{len(r['warnings'])} runs come with warnings, in the file")
+    unit = f"unit {r['engine']}, " if "engine" in r else ""
     print(
-        f"base {r['base']}, seed {r['seed']}, {day_words(r['ambient'])}, solver {r['solver']}, "
-        f"exchange {r['exchange']}, apu-casadi {r['apu_casadi_version']}"
+        f"{unit}base {r['base']}, seed {r['seed']}, {day_words(r['ambient'])}, "
+        f"solver {r['solver']}, exchange {r['exchange']}, apu-casadi {r['apu_casadi_version']}"
     )
     print(f"written: {r['file']}")

@@ -103,7 +103,7 @@ def _joint(args: argparse.Namespace) -> int:
     if show:
         print("estimating ...", file=sys.stderr)
     e = jointrun.estimate(truth, args.seed)
-    report = jointrun.report(e) | given.own(args) | given.assumed(args)
+    report = jointrun.report(e) | given.assumed(args)
     notices.tell(report["warnings"] or [])
     made = [results.save(e, folder / f"estimate_{s.name}.nc")]
     text = jsontext.dumps(report)

@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         figures = _draw(fit, args.figure, steady, ambients, given.program(args))
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
-    found["read_as"] = [*notes, *_unheeded(tables, times, args)]
+    found["read_as"] = [*notes, *_unheeded(tables, times, args), *_other_unit(args)]
     days = {t.source: _recorded(t, day, args) for t, day in zip(tables, said, strict=True)}
     found["recorded_ambient"] = {source: taken for source, taken in days.items() if taken}
     found |= {"apu_casadi_version": installed(), **given.own(args)}
@@ -335,6 +335,14 @@ def _unheeded(tables: Sequence[Table], times: Sequence[Any], args: argparse.Name
             f"{f'{hint} is the time' if hint else 'they are samples of a transient'}, give {remedy}"
         )
     return flags
+
+
+def _other_unit(args: argparse.Namespace) -> list[str]:
+    """Say it where a run is of another unit than the one that is fitted."""
+    from estimators.apu.recordings.runfiles import recorded_engine
+
+    runs = [] if args.engine else [(f, recorded_engine(f)) for f in args.files]
+    return [f"{f} is a run of {unit}: give --engine {unit}" for f, unit in runs if unit]
 
 
 def _ignored(

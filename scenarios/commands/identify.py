@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.machine.generator import Generator
     from estimators.apu.severity import Severity
     from estimators.apu.trials import Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
@@ -70,7 +71,8 @@ def run(args: argparse.Namespace) -> int:
     sets, added = _sets(args, sensors)
     f = _found(args)
     if args.figure is not None:
-        files.save_figure(_figure(f.point, args.samples, _engine(args)), args.figure)
+        figure = _figure(f.point, args.samples, _engine(args), given.program(args))
+        files.save_figure(figure, args.figure)
     if args.json:
         jsontext.show(_report(args, sensors, sets, added, f))
         return 0
@@ -102,6 +104,10 @@ def _sets(
 
 def _engine(args: argparse.Namespace) -> dict[str, GasGenerator]:
     return {} if args.engine is None else {"gas_generator": given.engine(args, _PARTS)}
+
+
+def _machine(args: argparse.Namespace) -> Generator | None:
+    return None if args.engine is None else given.engine_file(args, _PARTS).unit.generator
 
 
 @dataclass(frozen=True)
@@ -162,7 +168,7 @@ def _found(args: argparse.Namespace) -> Found:
         study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
         study.limiting_noises(first, **how),
         aims,
-        severity_study(generator=given.engine_file(args, _PARTS).unit.generator),
+        severity_study(generator=_machine(args)),
         trials,
         ramp,
     )
@@ -420,7 +426,7 @@ def _electrical(rows: list[Severity]) -> list[str]:
     return [*lines, *_say("severity")]
 
 
-def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
+def _figure(point: str, samples: int, engine: Mapping[str, Any], program: str) -> Any:
     from estimators.apu import identify as study
     from estimators.apu.sensors import GAS_PATH
     from scenarios.figures.estimationplot import plot_gain_of_a_sensor
@@ -435,4 +441,5 @@ def _figure(point: str, samples: int, engine: Mapping[str, Any]) -> Any:
         curves[label] = {k: [r[k] for r in rows] for k in keys}
     aims = {label: (study.PRIOR, aim) for label, aim in study.AIMS.items()}
     told = {"point": point, "power": noise, "samples": samples, "eta": study.ETA_BIAS}
-    return plot_gain_of_a_sensor(priors, curves, aims=aims, note=_template().text("figure", **told))
+    note = f"{_template().text('figure', **told)} {program[0].upper()}{program[1:]}."
+    return plot_gain_of_a_sensor(priors, curves, aims=aims, note=note)

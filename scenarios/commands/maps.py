@@ -6,13 +6,14 @@ With --trajectory, the file that ``apu run`` wrote, a run is drawn on both.
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from scenarios.commands import given
 
 NAME = "maps"
 HELP = "draw the component maps with operating lines and a run"
 OPTIONS = f"""
---trajectory FILE.nc    | a run, as 'apu run' writes it
+--trajectory FILE.nc    | a run, as 'apu run' writes it, on the maps of its own unit
 {given.UNIT}
 --out DIR =results/maps | folder (default %(default)s)
 --no-lines              | draw no operating lines
@@ -25,17 +26,21 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.core.errors import DataError
     from scenarios import registry
     from scenarios.figures.mapplots import default_lines, plot_compressor_map, plot_turbine_map
+    from scenarios.figures.runwords import scenario_of
     from scenarios.shell import progress
 
     ds = None if args.trajectory is None else results.load(args.trajectory)
     folder = registry.prepare(args.out)
     progress.tell("drawing both maps")
+    if ds is not None and args.engine is None:
+        args.engine = scenario_of(ds).get("engine")  # a run is drawn on the maps of its own unit
     gg = given.engine(args, given.LIMITED)
+    note = f"Unit {Path(args.engine).stem}." if args.engine else ""
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
         path = folder / f"{name}.png"
         try:
-            figure = draw(gg, lines=lines, trajectory=ds)
+            figure = draw(gg, lines=lines, trajectory=ds, note=note)
         except DataError as e:
             said = str(e)
             if str(args.trajectory) not in said:

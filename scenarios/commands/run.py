@@ -30,6 +30,8 @@ scenario SCENARIO      | a name, a .toml or a .py file
                        | cvodes, idas, or propagator, another name of auto
 --exchange NAME        | of speed and fuel between the parts: paper, predicted (errs less at the
                        | same price), or corrected; default: the scenario's
+--start-from WORD      | balanced: a fault of the start acts from t = 0; settled: it has been there
+                       | for long; default: the scenario's
 --quiet                | no progress bar, no list of files
 """
 
@@ -44,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
         s = s.change(waveform_dt=None)
     if args.exchange is not None:
         s = s.change(exchange=args.exchange)
+    if args.start_from is not None:
+        s = s.change(start_from=args.start_from)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(s.name, s.duration, show=show) as progress:
@@ -117,6 +121,7 @@ def made_with(report: dict[str, Any]) -> list[str]:
     lines = []
     if report["ambient"]:
         lines.append(f"ambient: {day_words(report['ambient'])}")
+    lines += [f"profile of {words}" for words in report.get("profiles", ())]
     if solver:
         lines.append(
             f"solver {solver['solver']}, rtol {solver['rtol']:g}, atol {solver['atol']:g}; seed "

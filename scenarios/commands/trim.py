@@ -13,6 +13,11 @@ The whole unit under an electrical load of each generator, or one generator at a
 
   apu trim --load 225e3
   apu trim --load 225e3 --voltage 230
+
+With a fault or an unbalanced load the state is periodic; means and rms values over a turn are told:
+
+  apu trim --load 225e3 --fault 'mu = 0.05, k_rf = 20'
+  apu trim --load 'kind = "open_phase", power_kW = 100, phase = "b"'
 """
 
 from __future__ import annotations
@@ -32,9 +37,9 @@ from scenarios.shell import jsontext
 if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
+    from apu_casadi.machine.atrest import GeneratorPoint
     from apu_casadi.machine.loads.load import Load
     from apu_casadi.unit.apu import Apu
-    from apu_casadi.unit.enginefile import Engine
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -45,7 +50,10 @@ OPTIONS = f"""
 --load W part        | electrical load per generator, W; or by the keys of a scenario:
                      | 'kind = "series", R_ohm = 1, L_mH = 1'
 --power-factor float PF =1.0 | of --load (default 1)
+--fault KEYS part    | with --load: fault of each generator, by the keys of a scenario:
+                     | 'mu = 0.05, k_rf = 20, phase = "b"'
 --voltage float V    | with --load: one generator alone, V rms
+--field-voltage float V | with --load: one generator alone at a field voltage, V
 --fix NAME=VALUE ... | fix an output, twice; PW=cube is a load like speed cubed through the design
                      | point
 --max-power T4=K     | highest shaft power at a temperature (T4 or T5)
@@ -67,7 +75,8 @@ RPM = math.pi / 30.0  # rad/s
 def run(args: argparse.Namespace) -> int:
     """Solve and print; an OperatingPointError gives the reason of a refusal."""
     mode = _mode(args)
-    return _generator(args) if args.voltage is not None else _gas(args, mode)
+    alone = args.voltage is not None or args.field_voltage is not None
+    return _generator(args) if alone else _gas(args, mode)
 
 
 def _mode(args: argparse.Namespace) -> str:
@@ -78,9 +87,11 @@ def _mode(args: argparse.Namespace) -> str:
         raise SignalError(
             f"give one of --power, --load, --fix and --max-power, got {', '.join(modes) or 'none'}"
         )
-    if args.voltage is not None and args.load is None:
-        raise SignalError("--voltage is that of a generator and needs --load")
-    for option, value in (("--voltage", args.voltage), ("--speed", args.speed)):
+    voltages = (("--voltage", args.voltage), ("--field-voltage", args.field_voltage))
+    for option, value in (*voltages, ("--fault", args.fault)):
+        if value is not None and args.load is None:
+            raise SignalError(f"{option} is that of a generator and needs --load")
+    for option, value in (*voltages, ("--speed", args.speed)):
         if value is not None and not value > 0:
             raise SignalError(f"{option} must be > 0, got {value:g}")
     if args.speed is not None and modes[0] == "--fix":
@@ -88,14 +99,15 @@ def _mode(args: argparse.Namespace) -> str:
     return modes[0]
 
 
-def _limits(texts: list[str], engine: Engine) -> Limits:
+def _limits(args: argparse.Namespace, mode: str) -> Limits:
     """Return the engine's limits, changed by ``--limit``."""
-    known = [f.name for f in dataclasses.fields(engine.limits)]
-    values = given.numbers(texts, "--limit")
+    own = given.limits(args, None if mode == "--load" else given.LIMITED)
+    known = [f.name for f in dataclasses.fields(own)]
+    values = given.numbers(args.limit, "--limit")
     for name in values:
         if name not in known:
             raise SignalError(f"--limit: unknown {name!r} {nearest(name, known)}")
-    return dataclasses.replace(engine.limits, **values)
+    return dataclasses.replace(own, **values)
 
 
 def _fixed(texts: list[str], gg: GasGenerator) -> dict[str, Any]:
@@ -114,17 +126,20 @@ def _fixed(texts: list[str], gg: GasGenerator) -> dict[str, Any]:
     return out
 
 
-def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, dict[str, float]]:
-    """Solve the whole unit; return the gas generator's point, and values of each generator."""
+def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, list[dict[str, float]]]:
+    """Solve the whole unit; return the gas generator's point, and values of the generators.
+
+    Those of one where all are equal.
+    """
     from apu_casadi.unit.events import Ambient
 
     if args.speed is not None:
         raise SignalError("--load is solved at governed speed; leave --speed out")
     ambient = Ambient(**given.ambient_of(args))
     unit = given.unit(args)
-    joint = unit.steady_state(_load(args, unit), ambient=ambient, **how)
-    g = joint.generator
-    return joint.gas, {"V_t": g.V_t, "V_ref": g.V_ref, **_scalars(g.y)}
+    joint = unit.steady_state(_load(args, unit), given.fault(args), ambient=ambient, **how)
+    each = (joint.generator, *joint.others)
+    return joint.gas, [_values(g) for g in each]
 
 
 def _alone(
@@ -149,21 +164,23 @@ def _alone(
 
 def _gas(args: argparse.Namespace, mode: str) -> int:
     health = given.numbers(args.health, "--health")
-    used = None if mode == "--load" else given.LIMITED
-    limits = _limits(args.limit, given.engine_file(args, used))
-    extra: dict[str, float] = {}
+    limits = _limits(args, mode)
+    extra: list[dict[str, float]] = []
     if mode == "--load":
         point, extra = _joint(args, health=health, limits=limits)
     else:
         point = _alone(args, mode, health, limits)
     values = {"N_rpm": point["N"] / RPM, **point.values}
     if args.json:
-        report = {"outputs": values, "generator": extra, "residual": point.residual}
+        report: dict[str, Any] = {"outputs": values, "generator": extra[0] if extra else {}}
+        report |= {"generators": extra} if len(extra) > 1 else {}
+        report["residual"] = point.residual
         report |= {
             "iterations": point.iterations,
             "inputs": {**given.ambient_of(args), "health": health},
             "assumed": given.ambient_assumed(args),
             "load": _asked(args),
+            **({"fault": args.fault} if args.fault else {}),
             "limits": dataclasses.asdict(limits),
             "apu_casadi_version": installed(),
             **given.own(args),
@@ -174,8 +191,9 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
         jsontext.show(report)
         return 0
     print(_table(values, list(values) if args.all else ["N_rpm", *SHOWN]))
-    if extra:
-        print("\neach generator\n" + _table(extra, list(extra)))
+    for k, own in enumerate(extra, 1):
+        head = "each generator" if len(extra) == 1 else f"generator {k}"
+        print(f"\n{head}\n{_table(own, list(own))}")
     print(f"\nresidual {point.residual:.1e}, {point.iterations} Newton steps")
     if point.second is not None:
         print(_second(point.second))
@@ -199,15 +217,18 @@ def _second(point: OperatingPoint) -> str:
 def _generator(args: argparse.Namespace) -> int:
     unit = given.unit(args, given.MACHINE)
     w_r = None if args.speed is None else unit.w_r(args.speed * RPM)
-    point = unit.generator.steady_state(_load(args, unit), w_r=w_r, V_t=args.voltage)
-    values = {"V_t": point.V_t, "V_ref": point.V_ref, **_scalars(point.y)}
+    how = {"w_r": w_r, "V_t": args.voltage, "V_fd": args.field_voltage}
+    point = unit.generator.steady_state(_load(args, unit), given.fault(args), **how)
+    values = _values(point)
     if args.json:
         report = {"generator": values, "residual": point.residual, "load": _asked(args)}
+        report |= {"fault": args.fault} if args.fault else {}
+        report |= {"note": point.note} if point.note else {}
         report |= {"apu_casadi_version": installed(), **given.own(args), **given.assumed(args)}
         jsontext.show(report)
         return 0
     print(_table(values, list(values)))
-    print(f"\nresidual {point.residual:.1e} 1/s")
+    print(f"\nresidual {point.residual:.1e} 1/s" + (f"; {point.note}" if point.note else ""))
     print(f"{_load_words(args)}{given.program(args)}")
     return 0
 
@@ -228,6 +249,11 @@ def _asked(args: argparse.Namespace) -> Mapping[str, Any] | None:
 def _load_words(args: argparse.Namespace) -> str:
     if args.load is None:
         return ""
+    fault = given.fault(args)
+    return _load_alone(args) + ("" if fault is None else f"fault of each: {fault.label}; ")
+
+
+def _load_alone(args: argparse.Namespace) -> str:
     if isinstance(args.load, Mapping):
         return f"load of each generator: {given.load_words(given.load(args))}; "
     rated = given.unit(args).generator.machine.V_rated_rms
@@ -235,8 +261,9 @@ def _load_words(args: argparse.Namespace) -> str:
     return f"load of each generator: {kilowatts}, power factor {args.power_factor:g}; "
 
 
-def _scalars(y: Mapping[str, Any]) -> dict[str, float]:
-    return {k: float(v) for k, v in y.items()}
+def _values(point: GeneratorPoint) -> dict[str, float]:
+    """Outputs of a generator; where they ripple means and rms values over a turn."""
+    return {"V_t": point.V_t, "V_ref": point.V_ref, **point.summary}
 
 
 def _table(values: Mapping[str, float], names: list[str]) -> str:

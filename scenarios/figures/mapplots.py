@@ -123,7 +123,11 @@ def surge_line(cmap: ScaledMap, samples: int = 60) -> tuple[np.ndarray, np.ndarr
 
 
 def plot_compressor_map(
-    gg: GasGenerator, *, lines: Lines | None = None, trajectory: xr.Dataset | None = None
+    gg: GasGenerator,
+    *,
+    lines: Lines | None = None,
+    trajectory: xr.Dataset | None = None,
+    note: str = "",
 ) -> Figure:
     """Draw the compressor map: pressure ratio over corrected flow, standard day.
 
@@ -151,6 +155,7 @@ def plot_compressor_map(
         design=place(d),
         lines=lines,
         trajectory=trajectory,
+        note=note,
         surge=(surge[0] * to_standard, surge[1]),
         published=(published[0] * to_standard, published[1]),
         labels=(
@@ -163,7 +168,11 @@ def plot_compressor_map(
 
 
 def plot_turbine_map(
-    gg: GasGenerator, *, lines: Lines | None = None, trajectory: xr.Dataset | None = None
+    gg: GasGenerator,
+    *,
+    lines: Lines | None = None,
+    trajectory: xr.Dataset | None = None,
+    note: str = "",
 ) -> Figure:
     """Draw the turbine map: pressure ratio over corrected flow times corrected speed.
 
@@ -185,6 +194,7 @@ def plot_turbine_map(
         design=place({**d.values, "n_t": 1.0}),
         lines=lines,
         trajectory=trajectory,
+        note=note,
         surge=None,
         published=None,
         labels=(
@@ -206,6 +216,7 @@ def _draw(
     design: tuple[float, float],
     lines: Lines | None,
     trajectory: xr.Dataset | None,
+    note: str,
     surge: Curve | None,
     published: Curve | None,
     labels: tuple[str, str],
@@ -250,7 +261,8 @@ def _draw(
             ax.plot(*design, "*", label="design point", **star)
             ax.set_xlabel(labels[0] if not zoomed else labels[0].split(",")[0])
         whole.set_ylabel(labels[1])
-        fs.title(whole, f"{what}: {m.table.name}, scaled and calibrated")
+        how = "scaled" if m.cal == type(m.cal)() else "scaled and calibrated"
+        fs.title(whole, f"{what}: {m.table.name}, {how}")
         fs.title(near, "Enlarged")
         (x0, x1), (y0, y1) = box
         frame = [x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0]
@@ -264,7 +276,7 @@ def _draw(
             words.append("Surge line: zero stability margin.")
         if run is not None:
             words.append(f"Trajectory{_name(trajectory)}: circle start, square end.")
-        fs.caption(fig, " ".join(words))
+        fs.caption(fig, " ".join([*words, *([note] if note else [])]))
         return fig
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,8 +56,10 @@ def _loads_of(ds: xr.Dataset, number: int) -> list[str]:
 
 
 def made_with(ds: xr.Dataset) -> str:
-    """Tell loads, ambient conditions, solver, exchange, seed and version of a run, if recorded."""
+    """Tell unit, loads, day, solver, exchange, seed and version of a run, if recorded."""
     words = []
+    engine = scenario_of(ds).get("engine")
+    words += [f"Unit {Path(str(engine)).stem}"] if engine else []
     numbers = generators_of(ds)
     by_number = {k: _loads_of(ds, k) for k in numbers}
     alike = all(loads == by_number[numbers[0]] for loads in by_number.values())

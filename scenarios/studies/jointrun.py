@@ -12,6 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,8 +32,6 @@ from scenarios.shell.template import Template
 from scenarios.studies.registration import series
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import xarray as xr
 
 __all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
@@ -152,9 +151,9 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
     given: dict[str, Any] = {**s.start(), "ambient": s.ambient, "events": s.events()}
     fine: dict[str, Any] = {"dt": FINE, "exchange": "corrected", "waveform_dt": WAVEFORM}
     fine["solver"] = "cvodes"
-    ds = simulate_joint(
-        registry.unit_for(s), duration=s.duration, progress=progress, **given, **fine
-    )
+    unit = registry.unit_for(s)
+    unit.refuse_different("the joint estimation")
+    ds = simulate_joint(unit, duration=s.duration, progress=progress, **given, **fine)
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     return ds
@@ -242,6 +241,7 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         phase = PHASES[found - 1] if found else None
         rows.append({**place, "values": values, "faulty_phase": phase})
     about = {"scenario": scenario["name"], "title": scenario.get("title", "")}
+    about |= {k: scenario[k] for k in ("engine", "governor") if k in scenario}
     found_out = {"short_circuit": _short_circuit(e), "health": _health(e)}
     out = {**about, "seed": e.attrs["seed"], **made_with(e), "phases": rows, **found_out}
     return {**out, "cross_talk": _cross_talk(e)}
@@ -264,7 +264,9 @@ def made_words(r: Mapping[str, Any]) -> str:
     by = {"solver": None, "exchange": None, "dt": 0.0} | (r.get("truth_solver") or {})
     version = r["apu_casadi_version"]
     values = {"solver": str(by["solver"]), "exchange": str(by["exchange"]), "ms": 1e3 * by["dt"]}
-    return TEXT.text("made", day=day_words(r["ambient"]), loads=loads, version=version, **values)
+    unit = f" Unit {Path(r['engine']).stem}." if "engine" in r else ""
+    day = day_words(r["ambient"])
+    return TEXT.text("made", day=day, loads=loads, version=version, **values) + unit
 
 
 def _onsets(e: xr.Dataset, names: tuple[str, ...]) -> list[int]:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
-from apu_casadi.core.sharing import Parametric, last
-from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.core.sharing import Parametric, last, of_family, remade
+from apu_casadi.machine.machinedata import MachineParameters, require_linear
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
@@ -372,6 +372,7 @@ def electrical_filter(
         SignalError: unknown parameter in ``free``.
     """
     machine = MachineParameters() if machine is None else machine
+    require_linear(machine, "the electrical filter")
     if gains not in GAINS:
         raise ParameterError(f"gains {gains!r} {nearest(str(gains), GAINS)}")
     wrong = [k for k in (*phases, *([] if phase is None else [phase])) if k not in PHASES]
@@ -389,6 +390,15 @@ def electrical_filter(
     return _filter(
         machine, sensors, h_walk, flux_walk, gains, power, phases, kappa, phase, unknowns
     )
+
+
+@remade
+@of_family
+def _estimating(
+    model: FilterModel, unknown: Mapping[str, Unknown], walks: Mapping[str, float]
+) -> FilterModel:
+    """Return the model with what is estimated as states."""
+    return augment(model, unknown).with_walk(walks).expanded()
 
 
 @last(32)
@@ -422,5 +432,5 @@ def _filter(
         walks["theta_e"] = ANGLE_WALK_CONSIDERED
     if gains != "none":
         unknown |= {f"gain_{n}": Unknown(consider=gains == "consider") for n in GAIN_SENSORS}
-    model = augment(model, unknown | dict(free)).with_walk(walks).expanded()
+    model = _estimating(model, unknown | dict(free), walks)
     return ElectricalFilter(model, machine, sensors, gains, kappa, phase, power)

@@ -16,7 +16,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError
 
 __all__ = ["Column", "Tell", "cut", "is_gap", "is_word", "like_number", "parsed"]
-__all__ += ["COMMA", "EITHER", "GROUPS", "GROUPS_COMMA", "PLAIN", "POINT", "comma", "point"]
+__all__ += ["COMMA", "EITHER", "GROUPS", "GROUPS_COMMA", "ODD", "POINT", "comma", "point"]
 
 Tell = Callable[[str], None]
 
@@ -39,7 +39,8 @@ EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}", re.ASCII)  # 1,234: a thousand, 
 GROUPS = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d*|[+-]?\d{1,3}(,\d{3}){2,}", re.ASCII)
 GROUPS_COMMA = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d*|[+-]?\d{1,3}(\.\d{3}){2,}", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?", re.ASCII)
-PLAIN = frozenset("0123456789+-.eE")
+#: Anything but plain numbers with a decimal point, between the lines of a column.
+ODD = re.compile(r"[^0-9+\-.eE\n]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ def parsed(
     A column in which numbers prevail must hold nothing else; one without is text, and is refused
     only by who needs it.
     """
-    fast = _fast(cells) if number is point else None
+    fast = _fast(cells, number)
     if fast is not None:
         return Column(name, unit, fast, fast)
     values = np.full(len(cells), np.nan)
@@ -153,10 +154,16 @@ def parsed(
     return Column(name, unit, values, values)
 
 
-def _fast(cells: Sequence[Any]) -> np.ndarray | None:
+def _fast(cells: Sequence[Any], number: Callable[[str], float | None]) -> np.ndarray | None:
     """Plain numbers and empty cells, all at once; None where any cell is anything else."""
     try:
-        if not PLAIN.issuperset("".join(cells)):
+        text = "\n".join(cells)
+        if number is comma and "." not in text:
+            text = text.replace(",", ".")
+            cells = text.split("\n") if cells else cells
+        elif number is not point:
+            return None
+        if ODD.search(text):
             return None
         values = np.array([c or "nan" for c in cells], dtype=float)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""What a run file tells of itself besides its columns: the ambient conditions it was simulated in.
+"""What a run file tells of itself besides its columns: ambient conditions, and the unit.
 
 A netCDF file that ``apu run`` or :func:`apu_casadi.core.results.save` wrote carries them in its
 attributes; a fit takes them from there rather than from the default day.
@@ -14,7 +14,7 @@ from typing import Any
 from apu_casadi.core.errors import DataError
 from apu_casadi.gaspath.conditions import CONDITIONS
 
-__all__ = ["recorded_ambient"]
+__all__ = ["recorded_ambient", "recorded_engine"]
 
 
 def recorded_ambient(path: str | Path) -> dict[str, float]:
@@ -36,6 +36,15 @@ def recorded_ambient(path: str | Path) -> dict[str, float]:
             continue
         return _checked(str(path), name, found)
     return {}
+
+
+def recorded_engine(path: str | Path) -> str | None:
+    """Return the unit that a run file names in its scenario; None where it names none."""
+    try:
+        found = json.loads(_attributes(Path(path))["scenario"]).get("engine")
+    except (TypeError, ValueError, KeyError, AttributeError):
+        return None
+    return found if isinstance(found, str) else None
 
 
 def _checked(source: str, attribute: str, found: Any) -> dict[str, float]:
