@@ -103,11 +103,21 @@ class MyFieldShort(Fault):
         return {"my_field": cls(0.1)}
 
 
-# -- (c) a sensor: T41 by a thermocouple with a first-order lag ----
+# -- (c) sensors: T41 by a thermocouple with a first-order lag; a difference of pressures ----
 
 T41_MINE = register(
     Sensor("T41_mine", 0.005, True, 0.005, "K", "my thermocouple", (400.0, 1900.0),
            reads=("T41",), tau=0.8)
+)  # fmt: skip
+
+
+def difference(P3, P5):
+    return P3 - P5
+
+
+DP_MINE = register(
+    Sensor("dP_mine", 0.005, True, 0.005, "Pa", "my transducer", (1e4, 2e6),
+           reads=("P3", "P5"), value=difference)
 )  # fmt: skip
 
 # -- (e) a governor with derivative action ----

@@ -22,22 +22,26 @@ W = 2 * math.pi * 400.0
 
 
 def krause_inductance(theta):
-    """Phase-domain inductances, motor signs, rows a b c fd kd kq; Krause eqs. 5.2-8 to 5.3-18."""
+    """Phase-domain inductances, motor signs, rows a b c fd kd kq; Krause eqs. 5.2-8 to 5.3-18.
+
+    One matrix for each angle.
+    """
+    theta = np.asarray(theta)
     A, B = (P.L_md + P.L_mq) / 3, (P.L_md - P.L_mq) / 3
     s = 2 * np.pi / 3
-    L = np.zeros((6, 6), dtype=np.result_type(theta, float))
+    L = np.zeros((*theta.shape, 6, 6), dtype=np.result_type(theta, float))
     for j, k in ((0, 0), (1, 1), (2, 2)):
-        L[j, k] = P.L_ls + A - B * np.cos(2 * (theta - j * s))
+        L[..., j, k] = P.L_ls + A - B * np.cos(2 * (theta - j * s))
     for j, k, shift in ((0, 1, np.pi / 3), (0, 2, -np.pi / 3), (1, 2, np.pi)):
-        L[j, k] = L[k, j] = -A / 2 - B * np.cos(2 * (theta - shift))
+        L[..., j, k] = L[..., k, j] = -A / 2 - B * np.cos(2 * (theta - shift))
     for j in range(3):
-        L[j, 3] = L[j, 4] = P.L_md * np.sin(theta - j * s)
-        L[j, 5] = P.L_mq * np.cos(theta - j * s)
-    L[3:, :3] = 2 / 3 * L[:3, 3:].T
-    L[3:5, 3:5] = P.L_md
-    L[3, 3] += P.L_lfd
-    L[4, 4] += P.L_lkd
-    L[5, 5] = P.L_mq + P.L_lkq
+        L[..., j, 3] = L[..., j, 4] = P.L_md * np.sin(theta - j * s)
+        L[..., j, 5] = P.L_mq * np.cos(theta - j * s)
+    L[..., 3:, :3] = 2 / 3 * L[..., :3, 3:].swapaxes(-1, -2)
+    L[..., 3:5, 3:5] = P.L_md
+    L[..., 3, 3] += P.L_lfd
+    L[..., 4, 4] += P.L_lkd
+    L[..., 5, 5] = P.L_mq + P.L_lkq
     return L
 
 
@@ -130,7 +134,7 @@ RADAU_A = np.array(
 
 
 def split_phase(theta, fault):
-    """Inductances of a b c, the shorted turns, fd kd kq; motor signs, shape (7, 7).
+    """Inductances of a b c, the shorted turns, fd kd kq; motor signs, shape (..., 7, 7).
 
     The phase of ``fault`` is cut in two: 1 - mu of its turns stay in its row, mu are in row 3.
     Magnetising inductances go with the turns.  The leakage L_ls of the whole phase is that of two
@@ -141,16 +145,16 @@ def split_phase(theta, fault):
     mu, kappa = fault.mu, fault.kappa
     magnetising = krause_inductance(theta)
     for j in range(3):
-        magnetising[j, j] -= P.L_ls
+        magnetising[..., j, j] -= P.L_ls
     turns = np.zeros((7, 6))
     turns[:3, :3], turns[4:, 3:] = np.eye(3), np.eye(3)
     turns[k, k], turns[3, k] = 1 - mu, mu
     L = turns @ magnetising @ turns.T
     for j in range(3):
-        L[j, j] += P.L_ls * (1 - 2 * mu + mu * kappa if j == k else 1.0)
-    L[3, 3] += P.L_ls * mu * kappa
-    L[3, k] += P.L_ls * mu * (1 - kappa)
-    L[k, 3] += P.L_ls * mu * (1 - kappa)
+        L[..., j, j] += P.L_ls * (1 - 2 * mu + mu * kappa if j == k else 1.0)
+    L[..., 3, 3] += P.L_ls * mu * kappa
+    L[..., 3, k] += P.L_ls * mu * (1 - kappa)
+    L[..., k, 3] += P.L_ls * mu * (1 - kappa)
     return L
 
 
@@ -205,15 +209,15 @@ def coupled_windings(start, V_fd, theta0, load, fault, t_end, n_out, *, isolated
     j = np.array([-start["i_a"], -start["i_b"], -start["i_c"], 0.0, start["i_fd"], 0.0, 0.0])
     flux = free.T @ loops(theta0) @ j
     ones = np.repeat(h * RADAU_A.sum(axis=1), n) * np.tile(u_free, 3)
+    stages = theta0 + W * h * (np.arange(n_out * steps)[:, None] + RADAU_C)
+    L = free.T @ loops(stages) @ free
+    M = np.tile(np.kron(h * RADAU_A, R_free), (len(L), 1, 1))
+    for s in range(3):
+        M[:, s * n : (s + 1) * n, s * n : (s + 1) * n] += L[:, s]
     out = []
     for step in range(n_out * steps):
-        L = [free.T @ loops(theta0 + W * h * (step + c)) @ free for c in RADAU_C]
-        M = np.kron(h * RADAU_A, R_free)
-        for s in range(3):
-            M[s * n : (s + 1) * n, s * n : (s + 1) * n] += L[s]
-        stages = np.linalg.solve(M, np.tile(flux, 3) + ones)
-        last = stages[2 * n :]
-        flux = L[2] @ last
+        last = np.linalg.solve(M[step], np.tile(flux, 3) + ones)[2 * n :]
+        flux = L[step, 2] @ last
         if (step + 1) % steps == 0:
             out.append(free @ last)
     J = np.array(out).T
@@ -221,12 +225,10 @@ def coupled_windings(start, V_fd, theta0, load, fault, t_end, n_out, *, isolated
     symmetric = np.diag([1, 1, 1, 1, 1.5, 1.5, 1.5])  # rotor rows are referred by 2/3
     torque, v = [], []
     regular = np.linalg.cond(free.T @ loops(theta0) @ free) < 1e9
-    for ti, ji in zip(t, J.T, strict=True):
-        theta = theta0 + W * ti
-        dL = slope(theta)
+    angles = theta0 + W * t
+    for L, dL, ji in zip(loops(angles), slope(angles), J.T, strict=True):
         torque.append(-0.5 * P.n_pp * ji @ symmetric @ dL @ ji)
         if regular:
-            L = loops(theta)
             drop = free.T @ (R + W * dL) @ ji
             dj = free @ np.linalg.solve(free.T @ L @ free, u_free - drop)
             own = (L - L_load) @ dj + W * dL @ ji + R_machine @ ji

@@ -1,15 +1,11 @@
 """The PI governor, and another one in its place."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 
-from apu_casadi import Apu, LoadChange, SeriesLoad, Signal, Signals, simulate_joint
+from apu_casadi import Apu, LoadChange, SeriesLoad, simulate_joint
 from apu_casadi.core.errors import ParameterError
-from apu_casadi.core.parameters import par
-from apu_casadi.unit.control import Governor, GovernorParameters, governor
+from apu_casadi.unit.control import GovernorParameters, governor
 from apu_casadi.unit.linearisation import linearise_joint
 from estimators.apu.gaspath import gas_path_filter
 
@@ -67,31 +63,6 @@ def test_the_fuel_limit_limits_fuel_and_says_what_T4_is_there():
 # --------------------------------------------------------------------------- another governor
 
 
-@dataclass(frozen=True)
-class WithDerivative(Governor):
-    """A PI law with a filtered derivative: one class, nothing of the package changed."""
-
-    X: ClassVar[Signals] = Signals(
-        [
-            Signal("Wf_I", "kg/s", "integrator", nominal=0.05),
-            Signal("e_slow", "1", "filtered speed error", nominal=1e-2),
-        ]
-    )
-    Kp: float = par(0.38, unit="kg/s", source="test", doc="proportional gain")
-    Ki: float = par(0.76, unit="kg/s^2", source="test", doc="integral gain")
-    Kd: float = par(0.01, unit="kg", source="test", doc="derivative gain")
-    T_d: float = par(0.05, unit="s", source="test", doc="filter of the derivative", lo=1e-3)
-    T_aw: float = par(0.1, unit="s", source="test", doc="anti-windup", lo=1e-4)
-    Wf_min: float = par(0.010, unit="kg/s", source="test", doc="lower fuel limit", lo=1e-5)
-    Wf_max: float = par(0.060, unit="kg/s", source="test", doc="upper fuel limit", lo=1e-5)
-
-    def demand(self, e, x):
-        return self.Kp * e + x[0] + self.Kd * (e - x[1]) / self.T_d
-
-    def rates(self, e, x, cut):
-        return self.Ki * e + cut / self.T_aw, (e - x[1]) / self.T_d
-
-
 KW225, KW100 = SeriesLoad.from_power(225e3), SeriesLoad.from_power(100e3)
 STEP = {"duration": 1.0, "load": KW225, "events": [LoadChange(0.1, KW100)], "waveform_dt": None}
 
@@ -104,21 +75,22 @@ def speed(governor, **options):
     "options",
     [{"solver": "auto"}, {"solver": "cvodes"}, {"solver": "cvodes", "exchange": "predicted"}],
 )
-def test_another_governor_without_its_derivative_is_the_shipped_one(options):
+def test_another_governor_without_its_derivative_is_the_shipped_one(options, mine):
     """In blocks and single steps; the arithmetic differs by what is added as zero."""
-    assert speed(WithDerivative(Kd=0.0), **options) == pytest.approx(speed(P, **options), rel=1e-12)
+    other = mine["MyGovernor"](Kd=0.0)
+    assert speed(other, **options) == pytest.approx(speed(P, **options), rel=1e-12)
 
 
-def test_derivative_action_damps_and_all_integrators_agree():
+def test_derivative_action_damps_and_all_integrators_agree(mine):
     """The overspeed of a load drop falls; auto and CVODES see the same, 1e-7 of the speed."""
-    auto, cvodes = (speed(WithDerivative(), solver=s) for s in ("auto", "cvodes"))
+    auto, cvodes = (speed(mine["MyGovernor"](), solver=s) for s in ("auto", "cvodes"))
     assert auto == pytest.approx(cvodes, rel=1e-7)
     assert auto.max() < speed(P).max() - 1.0
 
 
-def test_another_governor_in_linear_models():
+def test_another_governor_in_linear_models(mine):
     """Its state is one of the unit's; eigenvalues decay; the run's return fits the slowest ones."""
-    apu = Apu(governor=WithDerivative())
+    apu = Apu(governor=mine["MyGovernor"]())
     model = linearise_joint(apu, apu.steady_state(KW100))
     assert "e_slow" in model.x and model.derivative("e_slow_dot", "e_slow") == pytest.approx(-20.0)
     p = apu.governor
@@ -130,9 +102,9 @@ def test_another_governor_in_linear_models():
     assert all(e.value.real < 0 for e in model.eigenvalues())
 
 
-def test_the_slope_of_the_fuel_is_that_of_the_law():
+def test_the_slope_of_the_fuel_is_that_of_the_law(mine):
     """For filters: against a central difference along the states' own rates; exact, rounding."""
-    for law, x in ((P, (0.04,)), (WithDerivative(), (0.03, 1e-3))):
+    for law, x in ((P, (0.04,)), (mine["MyGovernor"](), (0.03, 1e-3))):
         N, N_dot, N_ref, h = 3770.0, 12.0, 3775.0, 1e-5
         rates = law.law(N, N_ref, x).rates
         fuel = [
@@ -143,9 +115,9 @@ def test_the_slope_of_the_fuel_is_that_of_the_law():
         assert slope == pytest.approx((fuel[1] - fuel[0]) / (2 * h), rel=1e-7)
 
 
-def test_a_filter_follows_another_law():
+def test_a_filter_follows_another_law(mine):
     """Along a load drop the speed errs less with the governor's own law than with a held fuel."""
-    apu = Apu(governor=WithDerivative(Kd=0.002))
+    apu = Apu(governor=mine["MyGovernor"](Kd=0.002))
     ds, worst = simulate_joint(apu, **STEP), []
     for law in (apu.governor, None):
         own = gas_path_filter(apu.gas_generator, gains=False, inertia=None, governed=law)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from apu_casadi.core import backend, results
-from apu_casadi.core.errors import ApuError, DataError
+from apu_casadi.core.errors import ApuError, DataError, ParameterError
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.gaspath.steady.trimbatch import performance_deck
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.machine.machinedata import magnetics
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import GAS, Engine, read_unit, write_unit
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
@@ -95,6 +96,23 @@ def test_any_unit_comes_back_from_its_file(tmp_path, tpe):
         assert (back.name, back.title, back.doc) == (made.name, made.title, made.doc)
         assert dict(made.sources).items() <= dict(back.sources).items()
     assert (tmp_path / "mine-compressor.csv").exists()
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_saturating_generator_is_kept(tmp_path, first):
+    """Beside one that is linear, in either place; what is not given of it is assumed."""
+    gen = Apu().generator
+    other = dataclasses.replace(gen, machine=magnetics(gen.machine, 0.08, 0.25))
+    unit = Apu().with_generators(*((other, gen) if first else (gen, other)))
+    write_unit(unit, tmp_path / "s.toml")
+    assert read_unit(tmp_path / "s.toml").unit == unit
+    (tmp_path / "t.toml").write_text("[generator.machine]\nS_10 = 0.15")
+    back = read_unit(tmp_path / "t.toml")
+    assert back.unit.generator.machine == magnetics(gen.machine, 0.15, None)
+    assert "machine.S_12" in {a.name for a in back.assumed}
+    (tmp_path / "t.toml").write_text("[generator.machine]\nS_10 = 0.3")
+    with pytest.raises(ParameterError, match=r"t\.toml.*S_12 = 0\.3 must be > 1\.2 S_10"):
+        read_unit(tmp_path / "t.toml")
 
 
 def test_units_are_converted_and_the_rest_is_assumed(tmp_path):
@@ -248,6 +266,7 @@ def test_figures_that_were_not_put_in_are_predicted(tpe):
     assert {a.name.split(".")[0] for a in tpe.assumed} >= {"machine", "exciter", "limits"}
 
 
+@pytest.mark.compiled
 def test_the_second_unit_compiles_nothing(tpe, monkeypatch):
     """Trim, deck and a joint run with load step and both faults, on what the default unit made."""
 
@@ -317,6 +336,8 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
         "run short.toml --no-figures --json": None,
         "campaign --base short.toml --runs 1 --workers 1 --json": None,
         "maps --no-lines": "stderr",
+        "export c gas_generator.step --out c --json": None,
+        "export fmu gas_generator --no-library --out g.fmu --json": None,
     }
     for command, where in commands.items():
         assert main([*command.split(), "--engine", "tpe331"]) == 0, command

@@ -10,28 +10,32 @@ import ast
 import json
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from apu_casadi import Apu, FaultChange, HealthChange, SeriesLoad, simulate_joint
+from apu_casadi.core.errors import SignalError
 from apu_casadi.core.results import load
 from apu_casadi.gaspath.engines import read_engine
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.fieldshort import FieldShort
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.capacitor import CapacitorLoad
 from apu_casadi.unit.linearisation import linearise, linearise_joint
 from estimators.apu.gaspath import gas_path_filter
+from estimators.apu.identify import gas_path
 from estimators.apu.joint import estimate_joint
+from estimators.apu.recordings.recorded import read_table
 from estimators.apu.sensors import GAS_PATH, gas_path_table
 from estimators.detection.signatures import linearised
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
-from estimators.filters.filtering import run
+from estimators.filters.filtering import FilterStep, run
 from estimators.models.filtermodel import Unknown, augment, discretise, measure
 from estimators.models.recording import record
-from scenarios import extensions
 from scenarios.cli import main
 
 PARTS = Path(__file__).with_name("extension_parts.py")
@@ -70,19 +74,10 @@ governor.Kd = 0.02
 
 
 @pytest.fixture(scope="module")
-def mine():
-    """What the user's file defines, loaded as a command loads it."""
-    from apu_casadi.machine.faults.fault import FAULTS
-    from apu_casadi.machine.loads.load import LOADS
-    from apu_casadi.unit.control import GOVERNORS
-    from estimators.apu.sensors import register, unregister
-
-    extensions.load([PARTS])
-    names = vars(__import__("sys").modules[LOADS["my_RC"].__module__])
-    assert (names["MyFieldShort"], names["MyGovernor"]) == (FAULTS["my_field"], GOVERNORS["my_PID"])
-    register(names["T41_MINE"])  # again: a file is run once, tests of other files come between
-    yield names
-    unregister("T41_mine")
+def ds(mine):
+    """A joint run whose compressor gets worse at 0.5 s."""
+    events = [HealthChange(0.5, {"f_eta_c": 0.98})]
+    return simulate_joint(Apu(), duration=1.0, load=KW, waveform_dt=1e-4, events=events)
 
 
 @pytest.fixture
@@ -164,17 +159,25 @@ def test_a_fault_is_found_by_a_filter(mine):
     assert abs(mean[-1] - 0.1) < 4 * sigma[-1] < 0.02
 
 
-def test_a_sensor_in_filter_and_joint_estimation(mine):
-    """Its lag is a state; it narrows what is known of the compressor."""
-    ds = simulate_joint(
-        Apu(), duration=0.5, load=KW, waveform_dt=1e-4,
-        events=[HealthChange(0.2, {"f_eta_c": 0.98})],
-    )  # fmt: skip
+def test_sensors_in_filter_and_joint_estimation(ds, mine, tmp_path):
+    """The lag is a state; they narrow what is known of the compressor; files have their columns."""
+    own = ("T41_mine", "dP_mine")
     table = gas_path_table()
-    assert table.outputs == (*GAS_PATH.outputs, "T41_mine")
-    assert gas_path_filter(sensors=table).model.x.names[-1] == "T41_mine"
+    assert table.outputs == (*GAS_PATH.outputs, *own)
+    filt = gas_path_filter(sensors=table)
+    assert filt.model.x.names[-1] == "T41_mine"
+    assert {"gain_dP_mine", "gain_T41_mine"} < set(filt.model.x.names)
+    data = filt.recording(ds, None)
+    i = filt.model.y.index("dP_mine")
+    assert data.y[i, 3] == pytest.approx(float((ds["P3"] - ds["P5"])[3]), rel=1e-12)
     with_it, without = (estimate_joint(ds, 1, **o) for o in ({"gas_sensors": table}, {}))
     assert with_it["f_eta_c_sigma"][-1] < without["f_eta_c_sigma"][-1]
+    # at a steady point the lag is over
+    g = gas_path(sensors=GAS_PATH.add(*own[::-1]))
+    assert g.only(["N", "dP_mine"]).sensors == ("N", "dP_mine")
+    (tmp_path / "run.csv").write_text("time,T41_mine [degC],dP_mine\n0,900,7e5\n1,905,7.1e5\n")
+    table = read_table(tmp_path / "run.csv")
+    assert table.get("T41_mine", "K") == pytest.approx([1173.15, 1178.15])
 
 
 def test_an_engine_in_run_linearisation_and_estimator(folder):
@@ -204,18 +207,28 @@ def test_a_governor_in_run_linearisation_and_estimator(mine):
     assert np.isfinite(filt.run(filt.recording(ds, 1)).mean).all()
 
 
-def test_a_filter_step_in_run_and_joint_estimation(mine):
-    """A steady gain of the package's filter serves almost as well as that."""
-    ds = simulate_joint(Apu(), duration=0.5, load=KW, waveform_dt=1e-4)
+def test_a_filter_step_in_run_and_joint_estimation(ds, mine):
+    """A steady gain, found by the package's filter, serves almost as well as that."""
     filt = gas_path_filter(gains=False)
     data = filt.recording(ds, 1)
     usual = filt.run(data)
     H, S = linearised(filt.model, usual, data).H[-1], usual.innovation_cov[-1]
     own = mine["constant_gain"](usual.cov_pred[-1] @ H.T @ np.linalg.inv(S), S)
     r = run(own(filt.model), filt.prior(), data)
-    assert abs(r["N"][0][-1] - float(ds["N"][-1])) < 3 * usual["N"][1][0]
+    assert np.allclose(r.mean, filt.run(data, step=own, full=False).mean)
+    k = int(0.45 / 0.02)  # before the fault
+    assert abs(r["N"][0][k] - float(ds["N"][k])) < 3 * usual["N"][1][0]
     e = estimate_joint(ds, 1, gain_errors=False, eta=0.0, speed=False, step=own)
-    assert e["N"].values[-1] == pytest.approx(float(ds["N"][-1]), rel=0.01)
+    assert np.isfinite(e["f_eta_c"]).all()
+    assert e["N"].values[k] == pytest.approx(float(ds["N"][k]), rel=0.01)
+
+
+def test_a_filter_step_of_other_sizes_is_refused():
+    """With what is expected, and what was got."""
+    model = gas_path_filter(gains=False, inertia=None).model
+    f = ca.Function("mine", [ca.MX.sym("m", 2)], [ca.MX(1)])
+    with pytest.raises(SignalError, match="step mine of gas_path_measured: inputs m"):
+        FilterStep(model, f)
 
 
 # -- from files and on the command line -----------------------------------------------------------
@@ -247,6 +260,24 @@ def test_commands_take_the_parts(folder, argv, capsys):
     """``--with`` names the file where the command needs a part of it."""
     assert main([*argv, "--with", str(PARTS), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)
+
+
+def test_sensors_in_commands(folder, capsys):
+    """``apu fit`` reads their columns and a sigma; ``apu identify`` takes them by name."""
+    gg = GasGenerator()
+    points = [trim_gas_generator(gg, {"N": gg.parameters.N, "PW": P}) for P in (2e5, 3e5, 4e5)]
+    names = ("N", "P3", "T3", "T5", "Wf", "PW")
+    rows = [[p[n] for n in names] + [p["T41"] - 273.15, p["P3"] - p["P5"]] for p in points]
+    head = ",".join((*names, "T41_mine [degC]", "dP_mine"))
+    text = "\n".join([head, *(",".join(f"{v:.9g}" for v in row) for row in rows)])
+    (folder / "points.csv").write_text(text + "\n")
+    argv = ["fit", "points.csv", "--steady", "--json", "--sigma", "dP_mine=1kPa"]
+    assert main([*argv, "--with", str(PARTS)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert {"T41_mine", "dP_mine"} <= set(json.dumps(report).replace('"', " ").split())
+    given = ["--with", str(PARTS), "--sensors", "N,dP_mine,Wf,T41_mine"]
+    assert main(["identify", *given, "--json", "--trials", "0"]) == 0
+    assert "T41_mine" in capsys.readouterr().out
 
 
 def test_a_mistake_in_a_part_is_told_with_its_place(folder, capsys):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pickle
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,7 @@ from scenarios import campaigns, extensions, registry
 from scenarios.cli import main
 from scenarios.schema import Scenario
 
+PARTS_FILE = Path(__file__).with_name("extension_parts.py")
 PARTS = '''
 """A load that is a resistance with a name of its own, and a fault with a word of its own."""
 from __future__ import annotations
@@ -208,44 +210,15 @@ def test_names_of_files_are_checked():
         Scenario.from_dict({**table, "engine": 3})
 
 
-GOVERNOR = """
-from dataclasses import dataclass
-from typing import ClassVar
-
-from apu_casadi.core.parameters import par
-from apu_casadi.core.signals import Signal, Signals
-from apu_casadi.unit.control import GOVERNORS, Governor
-
-
-@GOVERNORS.add("PID")
-@dataclass(frozen=True)
-class Derivative(Governor):
-    X: ClassVar[Signals] = Signals([Signal("Wf_I", "kg/s", "integrator", nominal=0.05),
-                                    Signal("e_f", "1", "filtered error", nominal=0.01)])
-    Kp: float = par(0.38, unit="kg/s", source="test", doc="gain", lo=0.0)
-    Ki: float = par(0.76, unit="kg/s^2", source="test", doc="integral gain", lo=0.0)
-    Kd: float = par(0.0, unit="kg", source="test", doc="derivative gain", lo=0.0)
-    T_f: float = par(0.02, unit="s", source="test", doc="filter", lo=1e-3)
-    Wf_min: float = par(0.01, unit="kg/s", source="test", doc="limit", lo=1e-5)
-    Wf_max: float = par(0.06, unit="kg/s", source="test", doc="limit", lo=1e-5)
-
-    def demand(self, e, x):
-        return self.Kp * e + x[0] + self.Kd * (e - x[1]) / self.T_f
-
-    def rates(self, e, x, cut):
-        return (self.Ki * e + cut / 0.1, (e - x[1]) / self.T_f)
-"""
-
-
-def test_a_governor_of_ones_own(files, capsys):
+def test_a_governor_of_ones_own(mine, files, capsys):
     """By its name in a scenario and on the command line; its numbers are parameters."""
-    parts, path = files
-    parts.write_text(GOVERNOR)
-    text = RUN.partition("[[phase]]")[0] + '[[phase]]\nname = "a"\nstart = 0.0\n'
+    _, path = files
+    text = f'name = "mine"\nduration = 0.3\nwaveform_dt = 0\nextensions = ["{PARTS_FILE}"]\n'
+    text += '[[phase]]\nname = "a"\nstart = 0.0\n'
     text += 'load = { kind = "R", power_kW = 100 }\n[[event]]\ntime = 0.1\n'
     text += 'load = { kind = "R", power_kW = 150 }\n'
     own = text.replace(
-        "[[phase]]", 'governor = "PID"\nparameters.governor.Kd = 0.004\n[[phase]]', 1
+        "[[phase]]", 'governor = "my_PID"\nparameters.governor.Kd = 0.004\n[[phase]]', 1
     )
     lowest = {}
     for name, toml in {"PI": text, "PID": own}.items():
@@ -256,16 +229,18 @@ def test_a_governor_of_ones_own(files, capsys):
     assert lowest["PID"] > lowest["PI"] + 1.0  # the derivative catches the drop
     both = own.replace("parameters.governor.Kd", "parameters.governor.kind = 'PI'\n# ")
     path.write_text(both)
-    with pytest.raises(ScenarioError, match=r"governor: 'PID', but parameters.governor.kind is"):
+    with pytest.raises(ScenarioError, match=r"governor: 'my_PID', but parameters.governor.kind is"):
         registry.get(path)
-    path.write_text(own.replace('"PID"', '"PIDD"'))
-    with pytest.raises(ScenarioError, match=r"governor: unknown 'PIDD' \(did you mean 'PID'\?\)"):
+    path.write_text(own.replace('"my_PID"', '"my_PIDD"'))
+    with pytest.raises(
+        ScenarioError, match=r"governor: unknown 'my_PIDD' \(did you mean 'my_PID'\?\)"
+    ):
         registry.get(path)
-    argv = ["linearise", "--no-figures", "--json", "--with", str(parts), "--governor"]
-    assert main([*argv, "PID"]) == 0
-    assert "e_f" in json.loads(capsys.readouterr().out)["names"]["x"]
-    assert main([*argv, "PIDD"]) == 2
-    assert "unknown governor 'PIDD' (did you mean 'PID'?)" in capsys.readouterr().err
+    argv = ["linearise", "--no-figures", "--json", "--with", str(PARTS_FILE), "--governor"]
+    assert main([*argv, "my_PID"]) == 0
+    assert "e_slow" in json.loads(capsys.readouterr().out)["names"]["x"]
+    assert main([*argv, "my_PIDD"]) == 2
+    assert "unknown governor 'my_PIDD' (did you mean 'my_PID'?)" in capsys.readouterr().err
 
 
 # ------------------------------------------------------------------------------ another engine

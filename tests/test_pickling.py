@@ -40,6 +40,7 @@ from estimators.batch.mhe import HorizonEstimator
 from estimators.filters.ekf import ekf_step, extended_kalman_filter
 from estimators.filters.ukf import ukf_step
 
+pytestmark = pytest.mark.compiled
 SMALL = 100_000  # bytes; what a message between processes does not notice
 SOURCE = SeriesLoad.from_power(1e5)
 

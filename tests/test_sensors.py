@@ -1,20 +1,16 @@
 """Sensors: tables, readings, a lag against its step response, and the filter that carries it."""
 
-import ast
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import estimators
 from apu_casadi import Apu, LoadChange, SeriesLoad, simulate_joint
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.measuring import measure
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.machine.park import PHASES
 from estimators.apu.fitting import EngineData, fit_engine
 from estimators.apu.gaspath import gas_path_filter, samples
 from estimators.apu.recordings.plausible import PLAUSIBLE
@@ -207,16 +203,3 @@ def test_one_table_feeds_all():
     for s in KNOWN.values():
         assert PLAUSIBLE[s.name] == s.plausible
     assert gas_path_table().names[:6] == GAS_PATH.names
-
-
-@pytest.mark.parametrize("names", [GAS_PATH.names, ELECTRICAL.names, GG.THETA.names, PHASES])
-def test_no_list_of_sensors_or_factors_is_written_again(names):
-    """The estimators take their lists from the tables: nowhere stand three of the names."""
-    wrong = []
-    for path in Path(estimators.__file__).parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            parts = node.keys if isinstance(node, ast.Dict) else getattr(node, "elts", None) or []
-            found = {p.value for p in parts if isinstance(p, ast.Constant)}
-            if len(found & set(names)) >= 3:
-                wrong.append(f"{path.name}:{node.lineno}: {sorted(found & set(names))}")
-    assert not wrong, "\n".join(wrong)

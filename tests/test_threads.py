@@ -33,6 +33,7 @@ from apu_casadi.core.errors import BackendError
 from apu_casadi.core.results import load, save
 from apu_casadi.core.simulation import stepper
 
+pytestmark = pytest.mark.compiled
 THREADS = 4
 
 
@@ -98,6 +99,22 @@ def test_the_virtual_machine_in_four_threads_gives_the_serial_bits():
         assert got == [digest(run(apu, k, **options)) for k in range(THREADS)]
     finally:
         backend.use_backend(None)
+
+
+@pytest.mark.skipif(backend.find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize(("duration", "waveform_dt"), [(0.5, 1e-3), (0.24, None)])
+def test_a_compiled_run_is_that_of_the_virtual_machine(duration, waveform_dt):
+    """Single steps, and in the longer run blocks of steps; 1e-9 of each value's largest."""
+    how = {"duration": duration, "waveform_dt": waveform_dt, "solver": "propagator"}
+    at, load = (0.6 * duration, 0.8 * duration), SeriesLoad.from_power(1e5)
+    events = [HealthChange(at[0], {"f_eta_c": 0.99}), FaultChange(at[1], Ttsc(0.05, 20.0))]
+    found = []
+    for name in ("c", "vm"):
+        with backend.use_backend(name):
+            found.append(simulate_joint(Apu(), load=load, events=events, **how))
+    for name, one in found[0].data_vars.items():
+        other = found[1][name]
+        assert float(abs(one - other).max()) <= 1e-9 * float(abs(other).max()), name
 
 
 def test_trims_of_one_engine_in_four_threads_give_the_serial_bits():

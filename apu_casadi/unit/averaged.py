@@ -203,14 +203,15 @@ def _joint_signals(parts: JointFamily) -> tuple[Signals, Signals, Signals, Signa
 
 def _joint(parts: JointFamily, load_kind: str) -> tuple[ca.Function, StateSpace]:
     """Return the equations (x, z, u, theta) -> (ode, alg, y) of all units, and their model."""
-    engines, gen = parts.engines, parts.gen
+    engines, gen = parts.engines, parts.machine
     X, U, TH, Y = _joint_signals(parts)
     names = ["x", "z", "u", "theta"]
     x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in zip(names, (X, parts.z, U, TH), strict=True))
     N, x_gov, x_gen = ca.vertsplit(x, [0, 1, 1 + len(parts.governor.X), len(X)])
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
     of_engine, of_gen, link = parts.parts(theta, inputs["N_ref"])
-    u_gg, rates, y_gen = coupled(link, gen, N=N, x=x_gov, x_gen=x_gen, inputs=inputs, fault=of_gen)
+    state = {"N": N, "x": x_gov, "x_gen": x_gen}
+    u_gg, rates, y_gen = coupled(link, gen, **state, inputs=inputs, fault=of_gen)
     N_dot, alg, y_gg = engines.equations(N, z, u_gg, of_engine)
     name, out = f"joint_averaged_{load_kind}", [ca.vertcat(N_dot, rates), alg]
     args, out = [x, z, u, theta], [*out, ca.vertcat(y_gg, y_gen)]

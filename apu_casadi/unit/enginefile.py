@@ -11,7 +11,7 @@
     [generator]                  # all of them alike, 1 to 4; or one table [[generator]] for each
     count = 2
     neutral = "isolated"
-    [generator.machine]          # apu_casadi.machine.machinedata
+    [generator.machine]          # apu_casadi.machine.machinedata; with S_10 or S_12 it saturates
     r_s = { value = 5.1, unit = "mohm", source = "measured" }
     [generator.exciter]
     K_A = 200.0
@@ -54,12 +54,15 @@ from apu_casadi.gaspath.engines import (
 from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS, Limits
 from apu_casadi.gaspath.unitnumbers import MAPS
 from apu_casadi.machine.generator import NEUTRALS, Generator
+from apu_casadi.machine.machinedata import MachineParameters, SaturatedMachine, magnetics
 from apu_casadi.unit.apu import Apu, OnShaft
 from apu_casadi.unit.control import GOVERNORS, Governor, word_of
 from apu_casadi.unit.events import MOST
 from apu_casadi.unit.shippedunits import unit_path
 
 _INNER = ("machine", "exciter", "coupling")
+SATURATION = ("S_10", "S_12")
+"""Of a machine that saturates; S_10 = 0 is one that does not, after one that does."""
 GAS = (*TABLES, "limits")
 """Parts of a unit that a gas generator alone is made of."""
 
@@ -159,18 +162,32 @@ def _machine(
     where: str, own: Mapping[str, Any], first: OnShaft, given: Numbers, number: int
 ) -> OnShaft:
     prefix = "" if number == 1 else f"generator{number}."
-    defaults = {"machine": first.generator.machine, "exciter": first.generator.exciter}
-    defaults["coupling"] = first.coupling
+    tables = {name: table(where, own, name) for name in _INNER}
+    tables["machine"], base = _magnetics(tables["machine"], first.generator.machine, given, prefix)
     parts: dict[str, Any] = {}
-    for name in _INNER:
-        inner, place = table(where, own, name), where.replace("generator]", f"generator.{name}]")
-        parts[name] = read_set(place, inner, defaults[name], given, f"{prefix}{name}")
+    for name, p in zip(_INNER, (base, first.generator.exciter, first.coupling), strict=True):
+        place = where.replace("generator]", f"generator.{name}]")
+        parts[name] = read_set(place, tables[name], p, given, f"{prefix}{name}")
     neutral = own.get("neutral", first.generator.neutral)
     if neutral not in NEUTRALS:
         raise ParameterError(f"{where}: neutral = {neutral!r} {nearest(str(neutral), NEUTRALS)}")
     if "neutral" in own:
         given.values[f"{prefix or 'generator.'}neutral"] = neutral
     return OnShaft(Generator(parts["machine"], parts["exciter"], neutral), parts["coupling"])
+
+
+def _magnetics(
+    own: dict[str, Any], p: MachineParameters, given: Numbers, prefix: str
+) -> tuple[dict[str, Any], MachineParameters]:
+    """Return the table of a machine and what it leaves out, with saturation if it tells of it."""
+    S_10 = own.get("S_10")
+    value = S_10.get("value") if isinstance(S_10, dict) else S_10
+    if type(value) in (int, float) and value == 0:
+        given.values[f"{prefix}machine.S_10"] = 0.0
+        return {n: v for n, v in own.items() if n not in SATURATION}, magnetics(p, 0.0, None)
+    if own.keys() & set(SATURATION) and not isinstance(p, SaturatedMachine):
+        return own, magnetics(p, SaturatedMachine().S_10, None)
+    return own, p
 
 
 def _governor(path: Path, data: Mapping[str, Any], given: Numbers) -> Governor:
@@ -272,9 +289,12 @@ def _machine_lines(e: Engine) -> list[str]:
     """Return the lines of the generators: one table for equal ones, else one for each."""
     machines, lines = e.unit.machines, []
     head = ["[generator]", f"count = {len(machines)}"] if e.unit.alike else ["[[generator]]"]
+    saturates = isinstance(machines[0].generator.machine, SaturatedMachine)
     for k, (gen, gear) in enumerate(machines[:1] if e.unit.alike else machines, 1):
         prefix = "" if k == 1 else f"generator{k}."
         lines += ["", *head, f"neutral = {text(gen.neutral)}"]
         for name, p in zip(_INNER, (gen.machine, gen.exciter, gear), strict=True):
             lines += [f"[generator.{name}]", *set_lines(p, f"{prefix}{name}", e.sources)]
+            if name == "machine" and saturates and not isinstance(p, SaturatedMachine):
+                lines.append("S_10 = 0.0")
     return lines

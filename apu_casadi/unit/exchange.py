@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.unit.control import Governed, Governor
@@ -153,6 +154,15 @@ def governed_step(
     return GovernedStep(made, given, moved(x, h, rates), slope)
 
 
+class Machine(NamedTuple):
+    """The generator as :func:`coupled` needs it: names, and f and g of (x, u, theta)."""
+
+    u: Signals
+    y: Signals
+    f: Callable[[Any, Any, Any], Any]
+    g: Callable[[Any, Any, Any], Any]
+
+
 class Coupled(NamedTuple):
     """The continuous unit at an instant, without the gas generator's own equations.
 
@@ -169,7 +179,7 @@ class Coupled(NamedTuple):
 
 def coupled(
     link: Link,
-    gen: StateSpace,
+    gen: StateSpace | Machine,
     *,
     N: Any,
     x: Any,

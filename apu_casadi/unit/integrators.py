@@ -476,20 +476,22 @@ def _wrapped(ss: StateSpace, x: np.ndarray) -> np.ndarray:
 
 
 @kept
-def ramped(ss: StateSpace) -> StateSpace:
-    """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input."""
+def ramped(ss: GeneratorModel) -> GeneratorModel:
+    """Return a generator variant whose speed w_r is a state and its slope w_r_dot the input.
+
+    It is one of a family as the variant is: that of the ramped models of all machines.
+    """
     X = Signals([*ss.x, dataclasses.replace(ss.u["w_r"], name="w_r", default=None)])
     slope = Signal("w_r_dot", "rad/s^2", "slope of the electrical speed", nominal=1e3)
     U = Signals([slope if s.name == "w_r" else s for s in ss.u])
     at = ss.u.index("w_r")
-    x, z, u, theta = (
-        ca.SX.sym(label, len(s))
-        for label, s in (("x", X), ("z", ss.z), ("u", U), ("theta", ss.theta))
-    )
+    kind = ca.SX if ss.f.is_a("SXFunction") else ca.MX
+    sizes = (("x", X), ("z", ss.z), ("u", U), ("theta", ss.theta))
+    x, z, u, theta = (kind.sym(label, len(s)) for label, s in sizes)
     x_sg, rate = x[: len(ss.x)], u[at]
     u_sg = ca.vertcat(u[:at], x[len(ss.x)], u[at + 1 :])
     ode, alg = ss.residual(x_sg, z, u_sg, theta)
-    return StateSpace.of(
+    made = GeneratorModel.of(
         f"{ss.name}_ramped",
         (X, ss.z, U, ss.theta, ss.y),
         (x, z, u, theta),
@@ -498,3 +500,9 @@ def ramped(ss: StateSpace) -> StateSpace:
         g=ss.g(x_sg, u_sg, theta),
         z=ss.z_of(x_sg, u_sg, theta),
     )
+    if ss.reduced is not None:  # a family
+        inner, follow = ss.reduced
+        return dataclasses.replace(made, reduced=(ramped(inner), follow))
+    if isinstance(ss.family, GeneratorModel):
+        return dataclasses.replace(made, family=ramped(ss.family), numbers=ss.numbers)
+    return made

@@ -21,7 +21,7 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.unitnumbers import GIVEN
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import Governor
-from apu_casadi.unit.exchange import Link
+from apu_casadi.unit.exchange import Link, Machine
 
 T = TypeVar("T")
 _HEALTH = GasGenerator.THETA
@@ -35,7 +35,9 @@ class JointFamily(NamedTuple):
         gen: the model of all generators.
         severity: its parameters beside numbers.
         governor, coupling: of one of the units; their numbers do not matter.
-        structure: what of the two does.
+        pairs: number of generators over two.
+        structure: what of these does matter.
+        free: whether there are derivatives by the numbers.
     """
 
     engines: CycleFunctions
@@ -43,14 +45,19 @@ class JointFamily(NamedTuple):
     severity: Signals
     governor: Governor
     coupling: Signals
+    pairs: float
     structure: tuple[Any, ...]
+    free: bool
 
     @classmethod
     def of(cls, apu: Apu, gen: StateSpace, free: Sequence[str] = ()) -> JointFamily:
         """Return that of a unit and its generator's model; ``free`` are to have derivatives."""
-        gg, coupling = apu.gas_generator, apu.coupling.signals("coupling")
+        gg, coupling, link = apu.gas_generator, apu.coupling.signals("coupling"), apu.link
         engines = gg.by_parameters if any(n in GIVEN for n in free) else gg.family
-        return cls(engines, gen.shared, gen.theta, apu.governor, coupling, apu.link.structure)
+        law, structure = apu.governor, (*link.structure, link.pairs, bool(free))
+        assert gen.family is not None
+        own = gen.family, gen.theta, law, coupling
+        return cls(engines, *own, link.pairs, structure, bool(free))
 
     def keep(self, what: tuple[Any, ...], make: Callable[[], T]) -> T:
         """Return what ``make`` makes of it, made once for all units of the structure."""
@@ -82,7 +89,27 @@ class JointFamily(NamedTuple):
         engine, gen = (
             theta[self.theta.indices(s.theta.names), :] for s in (self.engines, self.gen)
         )
-        return engine, gen, Link(law, N_ref, *gear)
+        return engine, gen, Link(law, N_ref, *gear, self.pairs)
+
+    @property
+    def machine(self) -> Machine:
+        """The generators' model for use in others; no derivatives by numbers that are not free."""
+        gen, n = self.gen, len(self.severity)
+        if self.free:
+            return Machine(gen.u, gen.y, gen.f, gen.g)
+        sizes = {"x": len(gen.x), "u": len(gen.u), "h": n, "c": len(gen.theta) - n}
+        x, u, h, c = args = [ca.SX.sym(k, m) for k, m in sizes.items()]
+        held = {"is_diff_in": [True, True, True, False], "cse": True}
+        f, g = (
+            ca.Function(name, args, [fun(x, u, ca.vertcat(h, c))], held)
+            for name, fun in (("rates", gen.f), ("outputs", gen.g))
+        )
+        return Machine(
+            gen.u,
+            gen.y,
+            lambda x, u, theta: f(x, u, theta[:n], theta[n:]),
+            lambda x, u, theta: g(x, u, theta[:n], theta[n:]),
+        )
 
     def member(
         self, apu: Apu, gen: StateSpace, family: StateSpace, free: Sequence[str] = ()

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import SimulationError
-from apu_casadi.core.profiles.profile import Varying, at, held
+from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Event, Holding, Jump
@@ -48,6 +49,41 @@ class Asked:
     seed: int | None
     hook: Callable[[int, np.ndarray], np.ndarray] | None
     settled: bool = False
+
+
+class Columns:
+    """Inputs of the unit in each step of a block, while the same profiles hold.
+
+    Args:
+        gg, now, here: gas generator, what holds, and its numbers at some instant.
+        shaft: the governor, with the governed speed.
+    """
+
+    def __init__(self, gg: GasGenerator, now: Holding, here: Holding, shaft: Link) -> None:
+        u = gg.U.pack(**{n: getattr(here.ambient, n) for n in AMBIENT}, Wf=0.0, PW=0.0)
+        full = gg.full(gg.THETA.pack(here.factors))
+        u, full = (np.repeat(a[:, None], BLOCK, axis=1) for a in (u, full))
+        self._given = Inputs(u, full, np.full(BLOCK, shaft.N_ref))
+        day = now.ambient.profiles if isinstance(now.ambient, Varying) else {}
+        self._day = [(gg.U.index(n), p) for n, p in day.items()]
+        health = {n: v for n, v in now.factors.items() if isinstance(v, Profile)}
+        self._health = [(gg.THETA.index(n), n, p) for n, p in health.items()]
+        self._speed, self._factors = now.N_ref, dict(here.factors)
+
+    def __call__(self, t: np.ndarray) -> tuple[Inputs, dict[str, Any]]:
+        """Return inputs and health factors of steps with these middles, s.
+
+        The next call overwrites the inputs.
+        """
+        given = self._given
+        factors = dict(self._factors) if self._health else self._factors
+        for i, profile in self._day:
+            given.u[i] = profile(t)
+        for i, name, profile in self._health:
+            given.theta[i] = factors[name] = profile(t)
+        if isinstance(self._speed, Profile):
+            given.N_ref[:] = self._speed(t)
+        return given, factors
 
 
 class JointRun:
@@ -87,7 +123,9 @@ class JointRun:
         own: dict[str, Any] = {"end": float(asked.grid[-1]), "settled": asked.settled}
         self.machines = Machines(apu, self.point, self.here, settings, asked.phasors, **own)
         self.shaft = self._shaft()
+        self._changing = self.now.changing
         self._middle = 0.0  # of the last step, s
+        self._columns: Columns | None = None
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)
@@ -108,15 +146,16 @@ class JointRun:
 
     def switch(self, events: Sequence[Event | Jump], t: float) -> None:
         """Take the events of an instant, s, which are one switch, whatever their order."""
-        if self.now.changing and t > 0:
+        if self._changing and t > 0:
             self._hold(self._middle, t)  # what the last step saw, which a block leaves open
-        self.now = self.now.after(events)
+        self.now, self._columns = self.now.after(events), None
+        self._changing = self.now.changing
         if self._hold(t + 2 * SAME_INSTANT, t, switched=True) or events:
             self.slope = None
 
     def _hold(self, instant: float, t: float, *, switched: bool = False) -> bool:
         """Hold the numbers of an instant, s, from t on; return whether a machine was switched."""
-        before, self.here = self.here, self.now.at(instant) if self.now.changing else self.now
+        before, self.here = self.here, self.now.at(instant) if self._changing else self.now
         here, gg = self.here, self.apu.gas_generator
         if here.factors is not before.factors:
             self.theta = gg.THETA.pack(here.factors)
@@ -135,32 +174,18 @@ class JointRun:
     def _block(self, k: int) -> tuple[int, Row]:
         grid, factors = self.asked.grid[k : k + BLOCK + 1], self.here.factors
         state = self.x, self.z, self.governor
-        if self.now.changing:
-            unit, factors = self._columns((grid[1:] + grid[:-1]) / 2)
+        if self._changing:
+            if self._columns is None:
+                self._columns = Columns(self.apu.gas_generator, self.now, self.here, self.shaft)
+            middles = (grid[1:] + grid[:-1]) / 2
+            unit, factors = self._columns(middles)
             done, made = self.machines.follow(*state, unit, grid, self._middle)
-            self._middle = float(grid[-2:].mean())
+            self._middle = float(middles[-1])
         else:
             done, made = self.machines.block(*state, self.u, self.theta, grid)
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
         return BLOCK, self._row(done.y, made, factors)
-
-    def _columns(self, t: np.ndarray) -> tuple[Inputs, dict[str, Any]]:
-        """Return inputs, theta in full and governed speed for each step, and the health factors."""
-        gg, now = self.apu.gas_generator, self.now
-        if isinstance(now.ambient, Varying):
-            fixed = dict(now.ambient.values)
-            u = held(gg.U, {n: fixed[n] for n in AMBIENT if n in fixed}, self.u, t)
-        else:
-            u = held(gg.U, {}, self.u, t)
-        factors = {n: at(v, t) for n, v in now.factors.items()}
-        theta = held(gg.THETA, factors, self.theta, t)
-        N_ref = np.broadcast_to(
-            at(self.shaft.N_ref if now.N_ref is None else now.N_ref, t), t.shape
-        )
-        numbers = np.repeat(gg.full(self.theta)[:, None], t.size, axis=1)
-        numbers[: len(gg.THETA)] = theta
-        return Inputs(u, numbers, np.broadcast_to(N_ref, t.shape)), factors
 
     def _row(
         self, y: np.ndarray, made: list[MachineMade], factors: Mapping[str, Any] | None = None
@@ -178,7 +203,7 @@ class JointRun:
             self.machines.disturb(self._rng.standard_normal, noise.w1, noise.w2)
         t0, N = float(self.asked.grid[k]), float(self.x[0])
         h = float(self.asked.grid[k + 1] - self.asked.grid[k])
-        if self.now.changing:
+        if self._changing:
             self._middle = t0 + h / 2
             self._hold(self._middle, t0)
         u, theta = self.u, self.theta

@@ -215,6 +215,21 @@ class LinearModel:
         dy = self.C @ dx + (self.D_u @ du + self.D_theta @ dtheta)[:, None]
         return self.x0[:, None] + dx, self.y0[:, None] + dy
 
+    @property
+    def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """A, B, C, D with u and theta one after the other as inputs."""
+        B, D = np.hstack([self.B_u, self.B_theta]), np.hstack([self.D_u, self.D_theta])
+        return self.A, B, self.C, D
+
+    def to_scipy(self) -> Any:
+        """Return ``scipy.signal.StateSpace``, in deviations from the operating point.
+
+        Its inputs are u and theta, one after the other; names are those of the signals here.
+        """
+        from scipy.signal import StateSpace as Linear
+
+        return Linear(*self.matrices)
+
     def to_control(self) -> Any:
         """Return ``control.StateSpace`` of python-control, in deviations from the operating point.
 
@@ -231,10 +246,7 @@ class LinearModel:
                 "'python -m pip install control'"
             ) from e
         return control.ss(
-            self.A,
-            np.hstack([self.B_u, self.B_theta]),
-            self.C,
-            np.hstack([self.D_u, self.D_theta]),
+            *self.matrices,
             states=list(self.x.names),
             inputs=[*self.u.names, *self.theta.names],
             outputs=list(self.y.names),

@@ -109,7 +109,7 @@ class Machines:
     def _forget(self) -> None:
         self._block: JointBlock | None = None
         self._no_block = ""
-        self._wide: tuple[tuple[Any, ...], JointBlock] | None = None
+        self._wide: tuple[list[Any], JointBlock] | None = None
 
     def samples(self, grid: np.ndarray) -> int:
         """Waveform samples of a whole run, the start included; 0 where none are stored."""
@@ -235,13 +235,14 @@ class Machines:
         self._check_block(grid)
         middles = (grid[1:] + grid[:-1]) / 2
         given = [g.columns(middles, before) for g in self.groups]
-        fast, links = [one for one, _ in given], [g.link for g in self.groups]
-        layouts = tuple(one.layout for one in fast)
+        fast = [one for one, _ in given]
+        layouts = [one.layout for one in fast]
         if self._wide is None or self._wide[0] != layouts:
+            links = [g.link for g in self.groups]
             self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
         held: list[Any] = [unit.u, unit.theta]
-        for link, (one, own) in zip(links, given, strict=True):
-            numbers = np.repeat(link.numbers[:, None], middles.size, axis=1)
+        for g, (one, own) in zip(self.groups, given, strict=True):
+            numbers = g.numbers_of_link
             numbers[0] = unit.N_ref
             held += [own.u, own.theta, numbers, own.vector, one.dt]
         done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held)

@@ -28,7 +28,7 @@ from apu_casadi.unit.integrators import (
     Way,
     integrators,
 )
-from apu_casadi.unit.jointstep import MachineBlock
+from apu_casadi.unit.jointstep import BLOCK, MachineBlock
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
 if TYPE_CHECKING:
@@ -112,13 +112,15 @@ class MachineStep:
         rest = tuple(k for k in self.numbers if k not in numbers)
         for part, its in ((self, rest), (other, numbers)):
             part.numbers, part._of_all = its, False
-            part.link = dataclasses.replace(self.link, pairs=len(its) / 2)
+            part.link, part._linked = dataclasses.replace(self.link, pairs=len(its) / 2), None
         return other
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
         self._integrators = integrators(phase, self.settings, self.means, self._way)
-        self._at = phase.ss.u.index("w_r")
+        self._at, self._V_ref_at = phase.ss.u.indices(["w_r", "V_ref"])
+        self._same: tuple[MeanStep | Propagator, Numbers] | None = None
+        self._linked: np.ndarray | None = None
 
     def follow(self, load: Any, fault: Any, end: float) -> None:
         """Take what load and fault are made of, until the end of the run, s."""
@@ -200,10 +202,22 @@ class MachineStep:
         Raises:
             NotApplicable: exact propagation does not hold, or numbers change too fast.
         """
+        if self._same is not None:
+            return self._same
         fast, now = self._integrators[0].columns(t, before)
         inputs = now.u.copy()
-        inputs[self.phase.ss.u.index("V_ref")] = self.V_ref
-        return fast, now._replace(u=inputs)
+        inputs[self._V_ref_at] = self.V_ref
+        made = fast, now._replace(u=inputs)
+        if self._way is None:
+            self._same = made
+        return made
+
+    @property
+    def numbers_of_link(self) -> np.ndarray:
+        """Numbers of the gearbox and the governor in a column for each step of a block."""
+        if self._linked is None:
+            self._linked = np.repeat(self.link.numbers[:, None], BLOCK, axis=1)
+        return self._linked
 
     def went_on(
         self, done: MachineBlock, N: float, grid: np.ndarray, severity: Any = ()

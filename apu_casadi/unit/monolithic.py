@@ -28,11 +28,12 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
-from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
+from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Ambient, Event, Holding, SpeedChange, all_factors, in_order
 from apu_casadi.unit.exchange import coupled
+from apu_casadi.unit.jointfamily import JointFamily
 from apu_casadi.unit.multirate import exchange_grid
 from apu_casadi.unit.stepmeans import MEANS, rms_at_rest
 
@@ -49,6 +50,7 @@ def joint_state_space(
     load: Load | str = "resistive",
     fault: Fault | str | None = None,
     integrals: tuple[str, ...] = (),
+    free: tuple[str, ...] = (),
 ) -> StateSpace:
     """Return the unit as one :class:`StateSpace`.
 
@@ -65,39 +67,47 @@ def joint_state_space(
             them the time ``t_step`` since the step's start; the step's length ``h_step`` is then an
             input.  As states they cost IDAS nothing; as quadratures every step would solve the gas
             path once more.
+        free: parameters of the unit by name (``machine.r_s``) that theta has, too, at its end.
     """
-    gg, gen = apu.gas_generator, apu.generator.state_space(load, fault)
+    gen = apu.generator.state_space(load, fault)
+    parts = JointFamily.of(apu, gen, free)
+    family = parts.keep((_all_units, integrals), lambda: _all_units(parts, integrals))
+    return parts.member(apu, gen, family, free)
+
+
+def _all_units(parts: JointFamily, integrals: tuple[str, ...]) -> StateSpace:
+    """The model of all units of a structure, theta with their numbers."""
+    gg, gen, engines = GasGenerator, parts.gen, parts.engines
     own_u = [s for s in gen.u if s.name != "w_r"]
     clock = [Signal("t_step", "s", "time since the step's start", nominal=0.02)]
     length = [Signal("h_step", "s", "length of the step", nominal=0.02)]
     if not integrals:
         clock, length = [], []
     sums = [_integral(gen, name) for name in integrals]
-    X = Signals([*gg.X, *apu.governor.X, *gen.x, *clock, *sums])
+    X = Signals([*gg.X, *parts.governor.X, *gen.x, *clock, *sums])
     U = Signals([*(gg.U[n] for n in AMBIENT), *own_u, *length])
-    TH, Y = Signals([*gg.THETA, *gen.theta]), Signals([*gg.Y, *gen.y])
+    TH, Y = parts.theta, Signals([*gg.Y, *gen.y])
 
-    x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(gg.z))
+    x, z = ca.MX.sym("x", len(X)), ca.MX.sym("z", len(parts.z))
     u, theta = ca.MX.sym("u", len(U)), ca.MX.sym("theta", len(TH))
-    ends = np.cumsum([0, 1, len(apu.governor.X), len(gen.x)]).tolist()
+    ends = np.cumsum([0, 1, len(parts.governor.X), len(gen.x)]).tolist()
     N, x_gov, x_sg = (x[i:j] for i, j in pairwise(ends))
-    health, severity = theta[: len(gg.THETA)], theta[len(gg.THETA) :]
+    of_engine, of_gen, link = parts.parts(theta)
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
-    u_gg, moves, y_sg = coupled(
-        apu.link, gen, N=N, x=x_gov, x_gen=x_sg, inputs=inputs, fault=severity
-    )
+    state = {"N": N, "x": x_gov, "x_gen": x_sg}
+    u_gg, moves, y_sg = coupled(link, parts.machine, **state, inputs=inputs, fault=of_gen)
     share = x[X.index("t_step")] / u[U.index("h_step")] if integrals else ca.MX(0)
 
     def model(z: Any) -> tuple[Any, Any, Any]:
-        N_dot, alg, y_gg = gg.equations(N, z, u_gg, health)
+        N_dot, alg, y_gg = engines.equations(N, z, u_gg, of_engine)
         rates = [Term.of(name).expression(gen, x_sg, y_sg, share) for name in integrals]
         ode = ca.vertcat(N_dot, moves, *(ca.MX(1.0) for _ in clock), *rates)
         return ode, alg, ca.vertcat(y_gg, y_sg)
 
-    z_sol = gg.solve(gg.similar(N, u_gg), N, u_gg, health)
+    z_sol = engines.solve(engines.start(N, u_gg, of_engine), N, u_gg, of_engine)
     ode, alg, _ = model(z)
     f, _, y = model(z_sol)
-    signals, symbols = (X, gg.z, U, TH, Y), (x, z, u, theta)
+    signals, symbols = (X, parts.z, U, TH, Y), (x, z, u, theta)
     return StateSpace.of(f"joint_{gen.name}", signals, symbols, dae=(ode, alg), f=f, g=y, z=z_sol)
 
 

@@ -89,7 +89,7 @@ class _Kept:
         given = fault if fault is None or isinstance(fault, Mapping) else fault.severity
         values = given or {}
         rows = [values.get(s.name, s.default or 0.0) for s in self.severities]
-        return np.array(np.broadcast_arrays(*rows)).reshape(len(rows), -1)
+        return _columns(rows)
 
     def _later(self, at: int, means: RawMeans) -> None:
         """Take means whose rms values are made together with those of their neighbours."""
@@ -186,8 +186,7 @@ class Recorder:
         self.Y[:, at] = row.y.reshape(-1, n)
         if row.factors is not self._factors:
             self._factors = row.factors
-            each = np.broadcast_arrays(*row.factors.values())
-            self._column = np.array(each).reshape(len(each), -1)
+            self._column = _columns([*row.factors.values()])
         self.held[:, at] = self._column
         parts = [next(of for of in row.of if kept.numbers[0] in of.numbers) for kept in self.of]
         for kept, of in zip(self.of, parts, strict=True):
@@ -366,6 +365,15 @@ class Recorder:
             values["time_w"] = w
         told = {"parameters": json.dumps(apu.parameters()), **attrs}
         return dataset(times, values, signals=signals, attrs=told, generators=size)
+
+
+def _columns(rows: Sequence[Any]) -> np.ndarray:
+    """Return numbers, or arrays with one for each step, as rows of a matrix."""
+    size = max(np.size(row) for row in rows)
+    made = np.empty((len(rows), size))
+    for i, row in enumerate(rows):
+        made[i] = row
+    return made
 
 
 def stored_severities(events: Iterable[Event], *others: Any) -> Signals:

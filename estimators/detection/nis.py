@@ -7,12 +7,12 @@ sum (:func:`upcrossing_rate`).
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from scipy import optimize
 
 from apu_casadi.core.errors import ParameterError, SignalError
+from apu_casadi.core.sharing import once
 from estimators.detection.alarms import HOUR, Alarms, allowed_per_sample, rising
 from estimators.information import consistency
 from estimators.models.recording import plain_numbers
@@ -51,7 +51,7 @@ def windowed_nis(
     return out[0], np.round(out[1])
 
 
-@lru_cache(maxsize=1)
+@once
 def _gauss() -> tuple[np.ndarray, np.ndarray]:
     """Nodes and weights of Gauss and Legendre on (-1, 1); to find them costs an eigenproblem."""
     return np.polynomial.legendre.leggauss(400)

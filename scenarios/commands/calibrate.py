@@ -110,8 +110,7 @@ def run(args: argparse.Namespace) -> int:
             "--engine needs FILE: the published points are those of the default unit"
         )
     points = read_points(args.file) if args.file else published_points()
-    engine = given.engine_file(args, given.TABLES)
-    gg = engine.unit.gas_generator
+    gg = given.engine(args)
     if args.file:
         _plausible(args.file, points, gg)
     if args.write_points:
@@ -121,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
     result = calibrate(gg if args.file else uncalibrated(gg), points, free)
     now = in_use(gg, result.names)
     if args.write_engine:
+        engine = given.engine_file(args, given.TABLES)
         _write_engine(args.write_engine, engine, result, args.file or "Tables 4 and 5")
     if args.json:
         jsontext.show(report(result, now) | given.own(args) | given.assumed(args))

@@ -46,8 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
     usage.count("--threads", args.threads, most=1024)
     options = {"altitude": "altitude", "Mach": "mach", "dT_isa": "disa", "PW": "power"}
-    engine = given.engine_file(args, given.LIMITED)
-    gg = engine.unit.gas_generator
+    gg = given.engine(args, given.LIMITED)
     if args.power is None:
         args.power = f"0:{gg.rated_power:g}:11"
     axes: dict[str, Any] = {n: _axis(f"--{o}", getattr(args, o)) for n, o in options.items()}
@@ -60,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     keep = None if args.outputs is None else given.names(args.outputs)
     progress.tell(f"solving {points} points", quiet=args.json)
     t = time.perf_counter()
-    how: dict[str, Any] = {"outputs": keep, "n_threads": args.threads, "limits": engine.limits}
+    how: dict[str, Any] = {"outputs": keep, "n_threads": args.threads, "limits": given.limits(args)}
     deck = performance_deck(gg, **axes, **how)
     t = time.perf_counter() - t
     deck.attrs |= {"apu_casadi_version": installed(), **given.own(args)}

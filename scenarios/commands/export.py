@@ -125,7 +125,7 @@ def _c(args: argparse.Namespace) -> int:
             if checked:
                 print(f"  compiled without a warning; {checked} steps equal to the last digit")
     if args.json:
-        jsontext.show(report)
+        jsontext.show({**report, **given.own(args), **given.assumed(args)})
     else:
         print(f"{given.ambient_line(given.ambient_given(args))}; {given.program(args)}")
         given.written(p for r in report.values() for p in r["files"])
@@ -144,7 +144,8 @@ def _fmu(args: argparse.Namespace) -> int:
     roles = ("input", "parameter", "state", "output")
     names = {r: [v.signal.name for v in model.of(r)] for r in roles}
     if args.json:
-        jsontext.show({"file": str(path), "fmi": args.fmi, "model": model.name, **names})
+        told = {"file": str(path), "fmi": args.fmi, "model": model.name, **names}
+        jsontext.show(told | given.own(args) | given.assumed(args))
         return 0
     print(f"{model.doc} FMI {args.fmi}.0, model exchange and co-simulation")
     for role, found in names.items():

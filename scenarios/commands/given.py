@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from argparse import Namespace
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.gaspath.steady.steadypoint import Limits
     from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
     from apu_casadi.unit.apu import Apu
@@ -134,7 +135,19 @@ def tell(args: Namespace, engine: str | None, rows: Sequence[Mapping[str, Any]])
 
 def engine(args: Namespace, parts_of_it: Sequence[str] = TABLES) -> GasGenerator:
     """Return the gas generator that a command is about: of ``--engine``, else the paper's."""
-    return engine_file(args, parts_of_it).unit.gas_generator
+    if args.engine is not None:
+        return engine_file(args, parts_of_it).unit.gas_generator
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
+
+    parts(args)
+    return GasGenerator()  # without what only a whole unit needs: imports take longer than a trim
+
+
+def limits(args: Namespace, parts_of_it: Sequence[str] | None = LIMITED) -> Limits:
+    """Return the limits of steady points: of ``--engine``, else the default ones."""
+    from apu_casadi.gaspath.steady.steadypoint import Limits
+
+    return Limits() if args.engine is None else engine_file(args, parts_of_it).limits
 
 
 def unit(args: Namespace, parts_of_it: Sequence[str] | None = None) -> Apu:

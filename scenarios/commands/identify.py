@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
+    from apu_casadi.machine.generator import Generator
     from estimators.apu.severity import Severity
     from estimators.apu.trials import Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
@@ -105,6 +106,10 @@ def _engine(args: argparse.Namespace) -> dict[str, GasGenerator]:
     return {} if args.engine is None else {"gas_generator": given.engine(args, _PARTS)}
 
 
+def _machine(args: argparse.Namespace) -> Generator | None:
+    return None if args.engine is None else given.engine_file(args, _PARTS).unit.generator
+
+
 @dataclass(frozen=True)
 class Found:
     """What shaft power and the electrical side tell, at the first point.
@@ -163,7 +168,7 @@ def _found(args: argparse.Namespace) -> Found:
         study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
         study.limiting_noises(first, **how),
         aims,
-        severity_study(generator=given.engine_file(args, _PARTS).unit.generator),
+        severity_study(generator=_machine(args)),
         trials,
         ramp,
     )

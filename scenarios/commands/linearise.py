@@ -2,7 +2,8 @@
 
 The point is given by the electrical load of each generator and the ambient conditions.  The
 generator is on its rotor's axes, averaged over an electrical period; the unit is continuous in
-time, with its governor.  The eigenvalues are printed slowest first, and drawn in the complex plane.
+time, with its governor.  The eigenvalues are printed slowest first, and drawn in the complex plane;
+--save keeps the matrices for other tools.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ OPTIONS = f"""
 --json               | print JSON, with all matrices
 --out DIR =results/linearise | default %(default)s
 --no-figures         | draw no figure
+--save FILE          | write the matrices with names and units, .nc or .mat
 """
 
 
@@ -58,6 +60,11 @@ def run(args: argparse.Namespace) -> int:
         path = registry.prepare(args.out) / "eigenvalues.png"
         note = f"Load {label}; healthy; {given.program(args)}."
         files.save_figure(plot_eigenvalues({label: model}, note), path)
+    if args.save is not None:
+        from scenarios.export import linear
+
+        words = {"load": _words(args, load, unit), "program": given.program(args)}
+        linear.save(model, args.save, words | given.ambient_of(args))
     if args.json:
         told = {
             "ambient": given.ambient_of(args),
@@ -73,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
     if args.model != "generator":
         print(f"\n{given.ambient_line(given.ambient_given(args))}")
     print(f"load of each generator: {_words(args, load, unit)}; healthy; {given.program(args)}")
-    if path is not None:
-        print(f"\n{path}")
+    if made := [str(p) for p in (args.save, path) if p is not None]:
+        print("", *made, sep="\n")
     return 0
 
 

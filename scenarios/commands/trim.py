@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from apu_casadi.machine.atrest import GeneratorPoint
     from apu_casadi.machine.loads.load import Load
     from apu_casadi.unit.apu import Apu
-    from apu_casadi.unit.enginefile import Engine
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -100,14 +99,15 @@ def _mode(args: argparse.Namespace) -> str:
     return modes[0]
 
 
-def _limits(texts: list[str], engine: Engine) -> Limits:
+def _limits(args: argparse.Namespace, mode: str) -> Limits:
     """Return the engine's limits, changed by ``--limit``."""
-    known = [f.name for f in dataclasses.fields(engine.limits)]
-    values = given.numbers(texts, "--limit")
+    own = given.limits(args, None if mode == "--load" else given.LIMITED)
+    known = [f.name for f in dataclasses.fields(own)]
+    values = given.numbers(args.limit, "--limit")
     for name in values:
         if name not in known:
             raise SignalError(f"--limit: unknown {name!r} {nearest(name, known)}")
-    return dataclasses.replace(engine.limits, **values)
+    return dataclasses.replace(own, **values)
 
 
 def _fixed(texts: list[str], gg: GasGenerator) -> dict[str, Any]:
@@ -164,8 +164,7 @@ def _alone(
 
 def _gas(args: argparse.Namespace, mode: str) -> int:
     health = given.numbers(args.health, "--health")
-    used = None if mode == "--load" else given.LIMITED
-    limits = _limits(args.limit, given.engine_file(args, used))
+    limits = _limits(args, mode)
     extra: list[dict[str, float]] = []
     if mode == "--load":
         point, extra = _joint(args, health=health, limits=limits)

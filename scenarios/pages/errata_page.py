@@ -16,7 +16,7 @@ import numpy as np
 
 from apu_casadi.core import simulation
 from apu_casadi.core.errors import OperatingPointError
-from apu_casadi.core.results import RPM
+from apu_casadi.core.results import RPM, phase_summary
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
@@ -27,6 +27,7 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
+from scenarios import registry
 from scenarios.shell.template import Template
 from scenarios.validation.comparison import reference
 from scenarios.validation.paper_figures import HEALTH
@@ -270,6 +271,30 @@ def severity() -> str:
         about = {"k_rf": f.k_rf, "kappa": kappa, "beyond": beyond}
         text.append(TEXT.text("severity", current=s["I_fault"] / rated, **about, **kW))
     return BREAK.join(["at 2 x 100 kW, rated speed:", *text])
+
+
+def one_machine() -> str:
+    """Compare the joint run with the fault in both machines and in one."""
+    text = []
+    for name, where in (("joint", "both machines"), ("joint_one_machine", "generator 2 only")):
+        ds = registry.run(name, waveform_dt=None)
+        before, then = phase_summary(ds)[-2:]
+        moved = {k: then[k] - before[k] for k in ("PW_kW", "T4", "SM_percent")}
+        I = [(row["generators"][0] if "generators" in row else row) for row in (before, then)]
+        steps = (I[1][f"I_{p}_rms"] - I[0][f"I_{p}_rms"] for p in "abc")
+        currents = ", ".join(f"{round(step, 2) + 0.0:+.2f}" for step in steps)
+        text.append(
+            TEXT.text(
+                "one_machine fault",
+                where=where,
+                power=moved["PW_kW"],
+                speed=then["N_rpm_min"] - before["N_rpm"],
+                T4=moved["T4"],
+                SM=moved["SM_percent"],
+                currents=f"{currents} A",
+            )
+        )
+    return BREAK.join([TEXT.text("one_machine"), *text])
 
 
 def efficiency_split() -> str:

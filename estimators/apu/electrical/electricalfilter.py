@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
-from apu_casadi.core.sharing import Parametric, last
+from apu_casadi.core.sharing import Parametric, last, of_family, remade
 from apu_casadi.machine.machinedata import MachineParameters, require_linear
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
@@ -392,6 +392,15 @@ def electrical_filter(
     )
 
 
+@remade
+@of_family
+def _estimating(
+    model: FilterModel, unknown: Mapping[str, Unknown], walks: Mapping[str, float]
+) -> FilterModel:
+    """Return the model with what is estimated as states."""
+    return augment(model, unknown).with_walk(walks).expanded()
+
+
 @last(32)
 def _filter(
     machine: MachineParameters,
@@ -423,5 +432,5 @@ def _filter(
         walks["theta_e"] = ANGLE_WALK_CONSIDERED
     if gains != "none":
         unknown |= {f"gain_{n}": Unknown(consider=gains == "consider") for n in GAIN_SENSORS}
-    model = augment(model, unknown | dict(free)).with_walk(walks).expanded()
+    model = _estimating(model, unknown | dict(free), walks)
     return ElectricalFilter(model, machine, sensors, gains, kappa, phase, power)

@@ -40,6 +40,7 @@ GROUPS = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d*|[+-]?\d{1,3}(,\d{3}){2,}", re.A
 GROUPS_COMMA = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d*|[+-]?\d{1,3}(\.\d{3}){2,}", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?", re.ASCII)
 PLAIN = frozenset("0123456789+-.eE")
+_LINES = PLAIN | {"\n"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ def parsed(
     A column in which numbers prevail must hold nothing else; one without is text, and is refused
     only by who needs it.
     """
-    fast = _fast(cells) if number is point else None
+    fast = _fast(cells, number)
     if fast is not None:
         return Column(name, unit, fast, fast)
     values = np.full(len(cells), np.nan)
@@ -153,10 +154,16 @@ def parsed(
     return Column(name, unit, values, values)
 
 
-def _fast(cells: Sequence[Any]) -> np.ndarray | None:
+def _fast(cells: Sequence[Any], number: Callable[[str], float | None]) -> np.ndarray | None:
     """Plain numbers and empty cells, all at once; None where any cell is anything else."""
     try:
-        if not PLAIN.issuperset("".join(cells)):
+        text = "\n".join(cells)
+        if number is comma and "." not in text:
+            text = text.replace(",", ".")
+            cells = text.split("\n") if cells else cells
+        elif number is not point:
+            return None
+        if not _LINES.issuperset(text):
             return None
         values = np.array([c or "nan" for c in cells], dtype=float)
     except (TypeError, ValueError):

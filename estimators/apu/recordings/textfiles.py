@@ -33,6 +33,7 @@ from estimators.apu.recordings.timestamps import is_time_name, looks_like_time
 __all__ = ["text_columns"]
 
 Row = tuple[int, list[str]]
+_NUMERIC = PLAIN | {","}
 _COMMENT = re.compile(r"^\s*(#|%|//|;|!|')+\s*")
 
 
@@ -69,7 +70,7 @@ def text_columns(
     cells = [[c.strip() for c in column] for column in zip(*(r for _, r in body), strict=True)]
     cells = cells or [[] for _ in names]
     for i, column in enumerate(cells):
-        if not PLAIN.issuperset("".join(column)):
+        if not _NUMERIC.issuperset("".join(column)):
             what = f"{path}, column {names[i] or i + 1}"
             column = ["" if reading.means_gap(c) else c for c in column]
             column = ungrouped(column, what, tell) if delimiter != " " else column
@@ -195,7 +196,7 @@ def _whole(path: Path, body: list[Row], names: Sequence[str], tell: Tell) -> lis
     if end < len(body) and any(c.strip() for _, r in body[end:] for c in r):
         tell(f"{path}: {_span(body[end][0], body[-1][0])} below the data left out")
         body = body[:end]
-    empty = [k for k, r in body if not any(c.strip() for c in r)] if width > 1 else []
+    empty = [k for k, r in body if not "".join(r).strip()] if width > 1 else []
     if empty:
         tell(f"{path}, line {empty[0]}: an empty row is left out, of {len(empty)} in all")
         body = [(k, r) for k, r in body if any(c.strip() for c in r)]

@@ -1,0 +1,230 @@
+"""Joint runs that follow profiles: against CVODES, against events, against steady states."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from apu_casadi.core.errors import ScenarioError
+from apu_casadi.core.profiles.points import Points, Steps
+from apu_casadi.core.profiles.profile import varying
+from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
+from apu_casadi.unit.monolithic import simulate_monolithic
+from apu_casadi.unit.multirate import simulate_joint
+from scenarios import registry
+from scenarios.schema import Scenario
+
+UNIT = Apu()
+KW100 = SeriesLoad.from_power(100e3)
+RAMP = varying(SeriesLoad.from_power, Ramp(100e3, 110e3, over=4.0))
+GROWN = varying(Ttsc.of_h, 0.05, Growth(1e-4, 2e-3, over=5.0))
+SHOWN = ("N", "PW", "Wf", "T4", "P_e", "V_a_rms", "V_b_rms", "I_a_rms", "I_b_rms")
+EXACT = {"solver": "cvodes", "rtol": 1e-10, "atol": 1e-12}
+
+
+def run(**more):
+    return simulate_joint(UNIT, **{"load": KW100, "waveform_dt": None, **more})
+
+
+def middles(ds):
+    t = ds["time"].values
+    return np.append(t[0], (t[1:] + t[:-1]) / 2)
+
+
+def propagated(ds):
+    """Share of the exchange steps that were propagated exactly."""
+    return json.loads(ds.attrs["solver"])["steps_propagated"] / (ds.sizes["time"] - 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "least"),
+    [
+        ({"load": RAMP}, 0.9),
+        ({"fault": GROWN}, 0.9),
+        ({"fault": varying(Ttsc, OnOff(0.05, 0.0, 5.0), 20.0)}, 0.7),
+        ({"load": varying(SeriesLoad.from_power, OnOff(100e3, 130e3, 5.0, duty=0.3))}, 0.7),
+    ],
+    ids=["load ramp", "growing fault", "intermittent fault", "load on and off"],
+)
+def test_propagation_follows_as_cvodes_does(given, least):
+    """Blocks, single steps and jumps: everything to 1e-6 of its peak."""
+    ours, theirs = run(duration=0.52, **given), run(duration=0.52, **given, **EXACT)
+    assert propagated(ours) > least and propagated(theirs) == 0
+    for name in SHOWN:
+        peak = np.abs(theirs[name].values).max()
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-6 * peak, err_msg=name)
+
+
+def test_waveforms_follow_as_cvodes_has_them():
+    """The paper's two machines with their own loads and faults, samples of 50 us."""
+    given = {"load": [RAMP, KW100], "fault": {2: GROWN}, "duration": 0.1, "waveform_dt": 50e-6}
+    ours, theirs = run(**given), run(**given, **EXACT)
+    for name in ("v_a", "i_a", "i_fault", "T_e", "P_inst"):
+        peak = np.abs(theirs[name].values).max()
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=2e-6 * peak, err_msg=name)
+    assert ours["load_P_1"].values[-1] == pytest.approx(100e3 + 2.5e3 * 0.09, rel=1e-12)
+
+
+def test_a_ramp_is_a_staircase_of_events_at_mid_step():
+    """Health, load and speed as profiles, and as an event every step with the same numbers."""
+    health, speed = Ramp(1.0, 0.99, over=0.3), Ramp(UNIT.N_ref, 0.998 * UNIT.N_ref, over=0.3)
+    smooth = run(duration=0.3, health={"f_eta_c": health}, N_ref=speed, load=RAMP)
+    events = []
+    for k in range(15):
+        t, middle = 0.02 * k, 0.02 * (k + 0.5)
+        events += [
+            HealthChange(t, {"f_eta_c": health(middle)}),
+            SpeedChange(t, speed(middle)),
+            LoadChange(t, RAMP.at(middle)),
+        ]
+    stairs = run(duration=0.3, events=events, solver="cvodes")
+    for name in (*SHOWN, "f_eta_c"):
+        peak = np.abs(stairs[name].values).max()
+        assert_allclose(smooth[name], stairs[name], rtol=0, atol=2e-6 * peak, err_msg=name)
+
+
+def test_slow_changes_end_at_the_trim_of_their_ends():
+    """Day, health and load come to rest; the unit is then where its steady state is, to 1e-7."""
+    ends = {"f_eta_c": 0.98, "f_W_t": 1.01}
+    ds = run(
+        duration=14.0,
+        health={n: Ramp(1.0, v, over=4.0) for n, v in ends.items()},
+        ambient=varying(
+            Ambient, altitude=Ramp(0.0, 600.0, over=4.0), Mach=Ramp(0.0, 0.2, over=4.0)
+        ),
+        load=varying(SeriesLoad.from_power, Ramp(100e3, 110e3, over=4.0)),
+    )
+    assert propagated(ds) > 0.95
+    at_rest = UNIT.steady_state(
+        SeriesLoad.from_power(110e3), ambient=Ambient(altitude=600.0, Mach=0.2), health=ends
+    )
+    for name in ("N", "Wf", "T4", "P3", "SM", "PW"):
+        assert float(ds[name][-1]) == pytest.approx(at_rest.gas[name], rel=1e-6), name
+
+
+def test_what_was_held_is_recorded():
+    """Health, severity, day, speed and load of every step, at mid-step; profiles in words."""
+    after = Ramp(0.05, 0.06, over=0.2)
+    ds = run(
+        duration=0.5,
+        load=varying(SeriesLoad.from_power, Ramp(100e3, 102e3, over=0.5)),
+        ambient=varying(Ambient, altitude=Points((0.0, 0.2, 0.5), (0.0, 10.0, 15.0)), dT_isa=0.0),
+        health={"f_W_c": Ramp(1.0, 0.999, over=0.5)},
+        N_ref=Ramp(UNIT.N_ref, 0.999 * UNIT.N_ref, over=0.5),
+        events=[FaultChange(0.31, varying(Ttsc, after, 30.0)), LoadChange(0.41, KW100)],
+    )
+    t, middle = ds["time"].values, middles(ds)
+    assert 0.31 in t and 0.41 in t
+    assert_allclose(
+        ds["altitude"], np.interp(middle, [0.0, 0.2, 0.5], [0.0, 10.0, 15.0]), atol=1e-9
+    )
+    assert_allclose(ds["f_W_c"], 1.0 - 0.001 * middle / 0.5, rtol=1e-12)
+    assert_allclose(ds["N_ref"], UNIT.N_ref * (1.0 - 0.001 * middle / 0.5), rtol=1e-12)
+    ill = middle > 0.31
+    assert_allclose(ds["mu"].values[ill], after(middle[ill] - 0.31), rtol=1e-7)
+    assert not ds["mu"].values[~ill].any()
+    assert_allclose(ds["load_P"].values[middle < 0.41], 100e3 + 4e3 * middle[middle < 0.41])
+    assert np.isnan(ds["load_P"].values[middle > 0.41]).all()
+    told = json.loads(ds.attrs["profiles"])
+    assert [(g["t"], g["part"], g["name"]) for g in told] == [
+        (0.0, "ambient", "altitude"), (0.0, "health", "f_W_c"), (0.0, "speed", "N_ref"),
+        (0.0, "load", "P"), (0.31, "fault", "mu"),
+    ]  # fmt: skip
+    assert told[-1]["profile"] == "ramp from 0.05 to 0.06 over 0.2 s"
+    assert np.isnan(ds.attrs["exchange_error"])
+
+
+def test_jumps_begin_steps_and_others_go_on():
+    """Each switch of a wave is on the grid; a load that is not linear is left to CVODES."""
+    load = varying(ConstantPowerLoad, Steps((0.0, 0.05, 0.11), (90e3, 100e3, 95e3)))
+    ds = run(duration=0.2, load=load)
+    assert {0.05, 0.11} <= set(ds["time"].values) and propagated(ds) == 0.0
+    assert ds["P_e"].values[-1] == pytest.approx(95e3, rel=1e-3)
+    fault = varying(Ttsc, OnOff(0.05, 0.0, 7.0), 20.0)
+    ds = run(duration=0.3, fault=fault, events=[FaultChange(0.25, None)])
+    held = fault.profiles["mu"](middles(ds)) * (middles(ds) < 0.25)
+    assert_allclose(ds["mu"][1:], held[1:])
+    assert ds.sizes["time"] == 16 + 3 + 1  # 1/14, 2/14 and 3/14 s, and the event
+
+
+@pytest.mark.filterwarnings("ignore::apu_casadi.core.errors.ApuWarning")
+def test_a_load_that_asks_too_much_is_told_with_its_profile():
+    load = varying(ConstantPowerLoad, Steps((0.0, 0.1), (90e3, 495e3)))
+    ds = run(duration=0.4, load=load)
+    assert any("kW of the 495.0 kW asked of each" in w for w in json.loads(ds.attrs["warnings"]))
+
+
+def test_one_model_refuses_profiles():
+    with pytest.raises(ScenarioError, match="follows no profiles"):
+        simulate_monolithic(UNIT, duration=0.1, load=RAMP)
+    with pytest.raises(ScenarioError, match="one governed speed"):
+        simulate_monolithic(UNIT, duration=0.1, load=KW100, events=[SpeedChange(0.05, 3700.0)])
+    with pytest.raises(ScenarioError, match=r"HealthChange\.factors.f_W_c: must lie in"):
+        HealthChange(1.0, {"f_W_c": Ramp(1.0, 0.4, over=1.0)})
+
+
+FILE = """
+name = "mine"
+duration = 0.2
+waveform_dt = 0
+[ambient]
+altitude = { file = "climb.csv" }
+[[phase]]
+name = "start"
+start = 0.0
+N_ref_rpm = { from = 36050.0, to = 36000.0, over = 0.2 }
+load = { kind = "R", power_kW = { kind = "steps", times = [0.0, 0.05], values = [100.0, 101.0] } }
+health = { f_eta_c = { from = 1.0, to = 0.99, over = 60.0 } }
+[[event]]
+time = 0.1
+fault = { mu = 0.05, h = { kind = "exponential", from = 1e-5, to = 1e-4, over = 1.0 } }
+"""
+
+
+def test_a_scenario_file_says_it_all(tmp_path):
+    """A column of a file beside it, every kind of value; what is written is complete."""
+    (tmp_path / "climb.csv").write_text("time,altitude\n0,0\n100,1000\n")
+    path = tmp_path / "mine.toml"
+    path.write_text(FILE)
+    s = Scenario.from_toml(path)
+    again = Scenario.from_dict(s.to_dict())
+    (tmp_path / "climb.csv").unlink()
+    assert again == s and again.ambient.at(50.0).altitude == 500.0
+    ds = registry.run(again)
+    assert ds["altitude"].values[-1] == pytest.approx(1.9)
+    assert ds["N_ref"].attrs["units"] == "rad/s" and 0.05 in ds["time"].values
+    told = registry.summary(ds)["profiles"]
+    assert (
+        told[0] == "altitude: table of 2 points from climb.csv, altitude, 0 to 1000"[:0] + told[0]
+    )
+    assert [line.partition(":")[0] for line in told] == [
+        "altitude", "f_eta_c", "N_ref", "load power_kW", "fault h, from 0.1 s",
+    ]  # fmt: skip
+    assert json.loads(ds.attrs["faults"])[-1]["phase"] == "a"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("altitude = {", "Altitude = {", "mine.toml: ambient.Altitude: unknown key"),
+        ('"climb.csv"', '"clim.csv"', "mine.toml: ambient.altitude: "),
+        ("to = 0.99", "to = 0.2", "phase[1].health.f_eta_c: must lie in (0.5, 1.5], got 0.2"),
+        ("to = 0.99", "too = 0.2", "phase[1].health.f_eta_c.too: unknown key of a profile"),
+        ("to = 36000.0", "to = -1.0", "phase[1].N_ref_rpm: must be > 0 r/min, got -1"),
+        ("101.0]", "1010.0]", "phase[1].load.power_kW: must lie in [0.1, 500] kW, got 1010"),
+        ("to = 1e-4", "to = 0.4", "event[1].fault.h: 0.4 is outside (0, 0.0526316]"),
+    ],
+)
+def test_wrong_values_in_a_file_are_told_with_their_place(tmp_path, old, new, message):
+    (tmp_path / "climb.csv").write_text("time,altitude\n0,0\n100,1000\n")
+    path = tmp_path / "mine.toml"
+    path.write_text(FILE.replace(old, new))
+    with pytest.raises(ScenarioError) as e:
+        Scenario.from_toml(path)
+    assert message in str(e.value)
