@@ -25,19 +25,22 @@ W = 2 * math.pi * 400.0
 def krause_inductance(theta, P=P):
     """Phase-domain inductances, motor signs, rows a b c fd kd kq; Krause eqs. 5.2-8 to 5.3-18.
 
-    One matrix for each angle.
+    One matrix for each angle; one matrix of objects for a symbol.
     """
-    theta = np.asarray(theta)
     A, B = (P.L_md + P.L_mq) / 3, (P.L_md - P.L_mq) / 3
     s = 2 * np.pi / 3
-    L = np.zeros((*theta.shape, 6, 6), dtype=np.result_type(theta, float))
+    cos, sin, shape, kind = ca.cos, ca.sin, (), object
+    if not isinstance(theta, ca.SX):
+        theta = np.asarray(theta)
+        cos, sin, shape, kind = np.cos, np.sin, theta.shape, np.result_type(theta, float)
+    L = np.zeros((*shape, 6, 6), dtype=kind)
     for j, k in ((0, 0), (1, 1), (2, 2)):
-        L[..., j, k] = P.L_ls + A - B * np.cos(2 * (theta - j * s))
+        L[..., j, k] = P.L_ls + A - B * cos(2 * (theta - j * s))
     for j, k, shift in ((0, 1, np.pi / 3), (0, 2, -np.pi / 3), (1, 2, np.pi)):
-        L[..., j, k] = L[..., k, j] = -A / 2 - B * np.cos(2 * (theta - shift))
+        L[..., j, k] = L[..., k, j] = -A / 2 - B * cos(2 * (theta - shift))
     for j in range(3):
-        L[..., j, 3] = L[..., j, 4] = P.L_md * np.sin(theta - j * s)
-        L[..., j, 5] = P.L_mq * np.cos(theta - j * s)
+        L[..., j, 3] = L[..., j, 4] = P.L_md * sin(theta - j * s)
+        L[..., j, 5] = P.L_mq * cos(theta - j * s)
     L[..., 3:, :3] = 2 / 3 * L[..., :3, 3:].swapaxes(-1, -2)
     L[..., 3:5, 3:5] = P.L_md
     L[..., 3, 3] += P.L_lfd
