@@ -84,6 +84,8 @@ def test_description(asked, name, version):
             assert v.get("variability") == "tunable"
         if own.role == "rate":
             assert f"{names[int(value.get('derivative')) - 1]}_dot" == v.get("name")
+    shown = {v.get("name") for v in variables if v.get("causality") == "output"}
+    assert ("N" if name != "generator" else "V_t") in shown
     assert token in text and description.described(model, version)[1] == token
     tunable = [v.signal.name for v in model.of("parameter")]
     if name != "generator":
@@ -222,6 +224,7 @@ def test_generator_by_model_exchange(built, generator_run, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("load", "fault"),
     [
@@ -319,8 +322,8 @@ def test_gas_generator_by_model_exchange(built, asked, tmp_path):
     u, start = np.array(at.u), {"f_W_c": 0.97}
     theta = gg.THETA.pack(start)
     ds = simulate(gg.state_space, at.x, t, u, theta=theta, rtol=1e-10, atol=1e-12)
-    v = exchanged(built("gas_generator"), tmp_path, instants=t, names=names, start=start,
-                  rtol=1e-9, atol=1e-9)  # fmt: skip
+    how = {"start": start, "rtol": 1e-9, "atol": 1e-9}
+    v = exchanged(built("gas_generator"), tmp_path, instants=t, names=names, **how)
     close(v, names, ds)
 
 
@@ -418,8 +421,28 @@ def test_fmpy_validates_and_runs(built, name, version):
     path = str(built(name, version))
     assert validate_fmu(path) == []
     for kind in ("CoSimulation", "ModelExchange"):
-        if name == "apu" and kind == "ModelExchange":
-            continue  # 400 Hz and the gas path in one: minutes by CVODE
         found = fmpy.simulate_fmu(path, fmi_type=kind, stop_time=0.04, output_interval=0.02)
         output = "T4" if name != "generator" else "V_t"
         assert found[output][-1] == pytest.approx(found[output][0], rel=1e-6)
+
+
+@needs_compiler
+@pytest.mark.ci
+@VERSIONS
+@pytest.mark.parametrize(
+    ("event", "values"),
+    [
+        (LoadChange(0.0, LESS), of_each(LESS_R)),
+        (HealthChange(0.0, {"f_eta_c": 0.98}), {"f_eta_c": 0.98}),
+        (FaultChange(0.0, DEFAULT_FAULT), of_each({"mu": 0.05})),
+    ],
+)
+def test_fmpy_s_runs_equal_ours(built, asked, event, values, version):
+    """Load step, health step and fault of the whole unit, from its first instant on."""
+    fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: extra 'fmu'")
+    how = {"stop_time": 0.4, "output_interval": 0.02, "fmi_type": "CoSimulation"}
+    found = fmpy.simulate_fmu(str(built("apu", version)), start_values=values, **how)
+    how = {"solver": "cvodes", "rtol": 1e-10, "atol": 1e-12, "waveform_dt": None}
+    ds = simulate_joint(asked.unit, duration=0.4, load=LOAD, events=[event], **how)
+    later = slice(1, None)  # of the first instant itself ours tell what was before
+    close([found[n][later] for n in JOINT], JOINT, ds, later)

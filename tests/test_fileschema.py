@@ -84,7 +84,7 @@ def test_it_is_made_of_the_classes_and_documented(validator, capsys):
     assert schema == json.loads(json.dumps(validator.schema))
     assert tuple(schema["properties"]) == FILE_KEYS
     assert all(p["description"] for p in schema["properties"].values())
-    power = schema["definitions"]["load"]["oneOf"][0]["properties"].get("power_kW")
+    power = schema["definitions"]["load"]["anyOf"][0]["oneOf"][0]["properties"].get("power_kW")
     assert power is None or power["description"].endswith("[kW]")
     start = schema["properties"]["phase"]["items"]["properties"]["start"]
     assert start["description"] == "instant at which it begins and its changes take effect [s]"

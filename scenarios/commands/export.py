@@ -31,8 +31,8 @@ _ASKED = f"""
 {given.WHOLE}
 """
 _C = f"""
-names NAME +            | gas_generator.step (short: step), .f, .g, .residual, .rates; generator.f,
-                        | .g, .z, .residual; ekf, the gas-path filter's step
+names NAME +            | gas_generator.step (short: step), .f, .g, .residual, .rates;
+                        | generator.step, .f, .g, .z, .residual; ekf, the gas-path filter's step
 {_ASKED.strip()}
 --out DIR =results/c    | folder (default %(default)s)
 --check                 | compile and run the examples: every digit as Python's

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -20,9 +20,12 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.machine.faults.fault import Fault
+from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import Load
+from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Ambient
+from apu_casadi.unit.stepmeans import MEANS
 from estimators.apu.gaspath import ITERATED, ITERATIONS, GasPathFilter, gas_path_filter
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import STATS, STEP_IN, STEP_OUT
@@ -188,30 +191,67 @@ def _rates(x: Signals) -> Signals:
 Outputs = Callable[[StateSpace], list[Vector]]
 
 
+class _AtStart(NamedTuple):
+    """The first generator at the start: equations of load and fault, inputs, parameters, state."""
+
+    ss: GeneratorModel
+    u: np.ndarray
+    theta: np.ndarray
+    x: np.ndarray
+
+    @property
+    def words(self) -> str:
+        """Its load and its fault."""
+        load, fault = self.ss.load, self.ss.fault
+        return f"Load: {load.kind if load else ''}, fault: {fault.kind if fault else 'none'}."
+
+
+def _at_start(asked: Asked) -> _AtStart:
+    gen, at = asked.unit.generator, asked.point.generator
+    load, fault = asked.loads[0], asked.faults[0]
+    ss, theta = gen.variant(load, fault), gen.fault_vector(load, fault)
+    u = gen.inputs(load, w_r=float(at.u[at.ss.u.index("w_r")]), V_ref=at.V_ref)
+    now: dict[str, Any] = {"u_target": u, "theta_target": theta}
+    return _AtStart(ss, u, theta, gen.transfer(at.x, at.ss, ss, u=at.u, theta=(), **now))
+
+
 def _of_generator(
     asked: Asked, name: str, doc: str, outputs: Outputs, which: str = "", **how: Any
 ) -> Exported:
-    gen, at = asked.unit.generator, asked.point.generator
-    load, fault = asked.loads[0], asked.faults[0]
-    ss = gen.variant(load, fault)
+    at = _at_start(asked)
+    ss, u, theta, x = at
     whole = ss.family or ss
-    theta = gen.fault_vector(load, fault)
-    u = gen.inputs(load, w_r=float(at.u[at.ss.u.index("w_r")]), V_ref=at.V_ref)
-    x = gen.transfer(at.x, at.ss, ss, u=at.u, theta=(), u_target=u, theta_target=theta)
-    numbers = Signals(list(whole.theta)[len(ss.theta) :])
-    known = {
-        "x": Vector("x", ss.x, _tuple(x)),
-        "z": Vector("z", ss.z, _tuple(ss.z_of(x, u, theta))),
-        "u": Vector("u", ss.u, _tuple(u)),
-    }
-    f = getattr(whole, which or name)
-    given = [known[k] for k in f.name_in() if k != "theta"]
+    f, numbers = getattr(whole, which or name), Signals(list(whole.theta)[len(ss.theta) :])
+    known = {"x": (ss.x, x), "z": (ss.z, ss.z_of(x, u, theta)), "u": (ss.u, u)}
+    given = [Vector(k, known[k][0], _tuple(known[k][1])) for k in f.name_in() if k != "theta"]
     given.append(Vector("theta", ss.theta, _tuple(theta)))
     given.append(Vector("numbers", numbers, _tuple(ss.numbers), constant=True))
     parted = _parted(f"generator_{name}", f, (len(ss.theta), len(ss.numbers)))
-    doc = f"{doc}  Load: {ss.load.kind if ss.load else ''}, fault: "
-    doc += f"{ss.fault.kind}." if ss.fault else "none."
+    doc = f"{doc}  {at.words}"
     return Exported(f"generator_{name}", doc, parted, tuple(given), tuple(outputs(ss)), **how)
+
+
+@_function("generator.step")
+def _gen_step(asked: Asked) -> Exported:
+    ss, u, theta, x = at = _at_start(asked)
+    dt = asked.unit.gas_generator.dt
+    means = MeanStep(asked.unit.generator, ss, u, theta, dt=dt, quad=MEANS)
+    table = [Signal(f"c{k}", "1", "of transition matrices") for k in range(means.parameters.size)]
+    limits = ", ".join(f"{v:g}" for v in means.limits)
+    miss = [Signal(f"miss{k}", "1", "error") for k in range(means.limits.size)]
+    given = (
+        Vector("x", ss.x, _tuple(x)),
+        Vector("series", Signals(table), _tuple(means.parameters), constant=True),
+        Vector("u", ss.u, _tuple(u)),
+        Vector("theta", ss.shared.theta, _tuple(means.theta), constant=True),
+        Vector("dt", _DT, (dt,)),
+    )
+    mean = Signals([ss.y[n] for n in MEANS])
+    made = Vector("x1", ss.x), Vector("mean", mean), Vector("miss", Signals(miss))
+    doc = "exact propagation over a step at constant speed, and means over it: right while miss is "
+    doc += f"at most {limits}, for this load and fault.  {at.words}"
+    function = _parted("generator_step", means.advance)
+    return Exported("generator_step", doc, function, given, made, hand=(("x1", "x"),))
 
 
 @_function("generator.f")
@@ -252,6 +292,8 @@ def _ekf(asked: Asked) -> Exported:
     gg, gas = asked.unit.gas_generator, asked.gas
     found = gas_path_filter(gg)
     model, prior = found.model, found.prior()
+    step = ekf_step(model, ITERATIONS, ITERATED)
+    numbers = step.full(np.zeros(0))
     x, y, u_gg = model.x, {n: gas[n] for n in model.y.names}, gg.U.unpack(gas.u)
     u = {n: v for n, v in u_gg.items() if n in model.u}
     u |= {f"sigma_{n}": _sigma(found, n, v) for n, v in u.items() if f"sigma_{n}" in model.u}
@@ -261,7 +303,7 @@ def _ekf(asked: Asked) -> Exported:
         "m": Vector("m", x, _tuple(prior.mean)),
         "P": Vector("P", P, _tuple(prior.cov), square=True),
         "u": Vector("u", model.u, _tuple(model.u.pack(u))),
-        "p": Vector("p", model.p),
+        "p": Vector("numbers", step.shared.model.p, _tuple(numbers), constant=True),
         "y": Vector("y", model.y, tuple(y.values())),
         "R": Vector("R", R, tuple(_sigma(found, n, v) ** 2 for n, v in y.items())),
         "dt": Vector("dt", _DT, (gg.dt,)),
@@ -273,7 +315,7 @@ def _ekf(asked: Asked) -> Exported:
     return Exported(
         "gas_path_ekf",
         "one step of the gas-path filter: correct the belief m, P, then predict m1, P1.",
-        _parted("gas_path_ekf", ekf_step(model, ITERATIONS, ITERATED).function),
+        _parted("gas_path_ekf", step.shared.function),
         tuple(known[k] for k in STEP_IN),
         tuple(made[k] for k in STEP_OUT),
         hand=(("m1", "m"), ("P1", "P")),

@@ -97,24 +97,37 @@ def figure_23(ds: xr.Dataset) -> Figure:
     return _trend(ds, "fig23_T4_surge_margin", [T4, SM])
 
 
+_SHORTEST = 1 / 200  # of a run: shorter stretches are one in which something changes
+
+
 def _segments(
     t: np.ndarray, table: np.ndarray, rows: Sequence[dict[str, Any]]
-) -> list[tuple[float, float, int]]:
-    """Return (start, end, index) of the stretches over which the rows of ``table`` are constant.
+) -> list[tuple[float, float, int, int]]:
+    """Return (start, end, first, last) of the stretches of ``table``, by its rows.
 
-    A change one sample off the beginning of a phase is drawn there.
+    Its rows are constant over a stretch, but for those in which they follow a profile.  A change
+    one sample off the beginning of a phase is drawn there.
     """
     same = np.all((table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1])), axis=1)
-    cuts = [0, *(np.flatnonzero(~same) + 1).tolist()]
-    ends = [*cuts[1:], t.size - 1]
+    cuts = np.array([0, *(np.flatnonzero(~same) + 1)])
     starts = np.array([p["start"] for p in rows])
     slack = 1.5 * float(np.median(np.diff(t)))
+    on_way = np.diff(t[cuts], append=t[-1]) < max(_SHORTEST * (t[-1] - t[0]), slack)
+    on_way[-1] &= cuts.size > 1 and on_way[-2]
+    inside = on_way[1:] & on_way[:-1]
+    inside &= np.abs(t[cuts[1:], None] - starts).min(axis=1) > slack  # a phase begins anew
+    cuts = cuts[np.concatenate([[True], ~inside])]
+    ends = [*cuts[1:].tolist(), t.size - 1]
 
     def instant(i: int) -> float:
         near = starts[int(np.argmin(np.abs(starts - t[i])))]
         return float(near if abs(near - t[i]) <= slack else t[i])
 
-    return [(instant(a), instant(b), a) for a, b in zip(cuts, ends, strict=True) if b > a]
+    return [
+        (instant(a), instant(b), a, max(b - 1, a) if b < t.size - 1 else b)
+        for a, b in zip(cuts.tolist(), ends, strict=True)
+        if b > a
+    ]
 
 
 def _load_lane(
@@ -153,44 +166,64 @@ def _load_words(x: dict[str, Any], n: int) -> str:
     kind = x.get("kind", "")
     words = {
         "R": "resistive",
-        "RL": f"R-L, pf {x.get('power_factor', 0.85):g}",
+        "RL": f"R-L, pf {x.get('power_factor', 0.85)}",
         "series": "series R-L",
         "constant_power": "constant power",
         "open": "open circuit",
     }.get(kind, str(kind))
     if x.get("unbalance") and len(set(x["unbalance"])) > 1:
         words += ", unbalanced"
+    if any(isinstance(v, dict) for v in x.values()):
+        words += ", changes"
+    if not isinstance(x.get("power_kW"), int | float):
+        return words
     times = f"{n}\u00a0×\u00a0" if n > 1 else ""
-    return f"{times}{x['power_kW']:g}\u00a0kW\n{words}" if "power_kW" in x else words
+    return f"{times}{x['power_kW']:g}\u00a0kW\n{words}"
 
 
 def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
-    """Return the stretches of constant gas-path health."""
+    """Return the stretches of gas-path health, with what it changes to where it does."""
     t, lane = ds["time"].values, []
     gas = np.column_stack([ds[f].values for f in HEALTH_FACTORS])
-    for a, b, i in _segments(t, gas, rows):
-        factors = zip(HEALTH_FACTORS.values(), gas[i], strict=True)
-        off = [f"{h.symbol} {100 * (v - 1):+.3g} %" for h, v in factors if v != 1.0]
+    for a, b, i, j in _segments(t, gas, rows):
+        factors = zip(HEALTH_FACTORS.values(), gas[i], gas[j], strict=True)
+        off = [f"{h.symbol} {_change(v, w)} %" for h, v, w in factors if (v, w) != (1.0, 1.0)]
         off = [x.replace(" -", " −").replace(" ", "\u00a0") for x in off]
         words = ", ".join(off[:2]) + "\n" + ", ".join(off[2:]) if off else "healthy"
         lane.append((a, b, words.strip(), HURT if off else HEALTHY))
     return lane
 
 
+def _change(first: float, last: float) -> str:
+    """Return a change of a factor in per cent, or two where it follows a profile."""
+    ends = [f"{100 * (v - 1):+.3g}" for v in (first, last)]
+    return ends[0] if first == last else " → ".join(ends)
+
+
 def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
-    """Return the stretches of a constant stator fault."""
+    """Return the stretches of a stator fault."""
     t, lane = ds["time"].values, []
     stator = np.column_stack([ds[f].values for f in SEVERITY])
-    for a, b, i in _segments(t, stator, rows):
-        m, r, c = stator[i]
+    for a, b, i, j in _segments(t, stator, rows):
+        worst = i + int(np.argmax(_h(stator[i : j + 1])))
+        m, r, c = stator[worst]
         kappa = "κ = µ" if abs(c - m) < 1e-12 else f"κ = {c:g}"
         words = "healthy"
         if m > 0:
             parts = f"µ = {100 * m:g} %", f"$k_{{rf}}$ = {r:g}", kappa
             first, second, third = (x.replace(" ", "\u00a0") for x in parts)
             words = f"TTSC {first}\n{second}, {third}"
+            if not np.array_equal(stator[i], stator[j], equal_nan=True) or j - i > 1 < worst - i:
+                second = f"$k_{{rf}}$\u00a0=\u00a0{r:.4g}"
+                words = f"TTSC changes, at most {first},\n{second}, {third}"
         lane.append((a, b, words, HURT if m > 0 else HEALTHY))
     return lane
+
+
+def _h(stator: np.ndarray) -> np.ndarray:
+    """Return the severity h = mu/(k_rf + 1 - mu) of rows mu, k_rf, kappa; 0 without a fault."""
+    mu, k_rf, _ = stator.T
+    return np.where(mu > 0, mu / (np.nan_to_num(k_rf) + 1.0 - mu), 0.0)
 
 
 def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError
 
 __all__ = ["Column", "Tell", "cut", "is_gap", "is_word", "like_number", "parsed"]
-__all__ += ["COMMA", "EITHER", "GROUPS", "GROUPS_COMMA", "PLAIN", "POINT", "comma", "point"]
+__all__ += ["COMMA", "EITHER", "GROUPS", "GROUPS_COMMA", "ODD", "POINT", "comma", "point"]
 
 Tell = Callable[[str], None]
 
@@ -39,8 +39,8 @@ EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}", re.ASCII)  # 1,234: a thousand, 
 GROUPS = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d*|[+-]?\d{1,3}(,\d{3}){2,}", re.ASCII)
 GROUPS_COMMA = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d*|[+-]?\d{1,3}(\.\d{3}){2,}", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?", re.ASCII)
-PLAIN = frozenset("0123456789+-.eE")
-_LINES = PLAIN | {"\n"}
+#: Anything but plain numbers with a decimal point, between the lines of a column.
+ODD = re.compile(r"[^0-9+\-.eE\n]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ def _fast(cells: Sequence[Any], number: Callable[[str], float | None]) -> np.nda
             cells = text.split("\n") if cells else cells
         elif number is not point:
             return None
-        if not _LINES.issuperset(text):
+        if ODD.search(text):
             return None
         values = np.array([c or "nan" for c in cells], dtype=float)
     except (TypeError, ValueError):

@@ -13,7 +13,7 @@ from estimators.apu.recordings.columns import (
     EITHER,
     GROUPS,
     GROUPS_COMMA,
-    PLAIN,
+    ODD,
     POINT,
     Tell,
     comma,
@@ -27,12 +27,13 @@ __all__ = ["DECIMALS", "numbers_as", "ungrouped", "without_unit"]
 DECIMALS = ("point", "comma")
 _BLANK = " \u00a0\u2009\u202f'’"
 _SPACED = re.compile(rf"[+-]?\d{{1,3}}(?:[{_BLANK}]\d{{3}})+(?:[.,]\d*)?", re.ASCII)
+_TWO_POINTS = re.compile(r"\.[^\n.]*\.")
 _WITH_UNIT = re.compile(r"([+-]?[\d.,]*\d[.,]?(?:[eE][+-]?\d+)?)\s*([^\d\s.,+\-:].*)", re.ASCII)
 
 
 def ungrouped(cells: list[str], what: str, tell: Tell) -> list[str]:
     """Return cells without blanks and apostrophes between thousands: ``36 050.5``, ``36'050.5``."""
-    found = next((c for c in cells if not PLAIN.issuperset(c) and _SPACED.fullmatch(c)), None)
+    found = next((c for c in cells if ODD.search(c) and _SPACED.fullmatch(c)), None)
     if found is None:
         return cells
     tell(f"{what}: blanks or apostrophes separate thousands, such as {found!r}")
@@ -76,12 +77,10 @@ def numbers_as(
     """Decide by the whole file what commas and points in numbers are."""
     commas = open_ = groups = groups_comma = points = None
     for i, column in enumerate(cells):
-        if PLAIN.issuperset("".join(column)):  # nothing but points
-            if points is None and not any(c.count(".") > 1 for c in column):
-                points = next(((i, c) for c in column if "." in c), None)
-                continue
-            if not any(c.count(".") > 1 for c in column):
-                continue
+        text = "\n".join(column)
+        if not (ODD.search(text) or _TWO_POINTS.search(text)):
+            points = points or next(((i, c) for c in column if "." in c), None)
+            continue
         for c in column:
             if "," in c or c.count(".") > 1:
                 if GROUPS.fullmatch(c):

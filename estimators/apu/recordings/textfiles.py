@@ -17,7 +17,6 @@ from pathlib import Path
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.units import gauge_of, header, unit_of
 from estimators.apu.recordings.columns import (
-    PLAIN,
     Column,
     Tell,
     cut,
@@ -33,7 +32,8 @@ from estimators.apu.recordings.timestamps import is_time_name, looks_like_time
 __all__ = ["text_columns"]
 
 Row = tuple[int, list[str]]
-_NUMERIC = PLAIN | {","}
+#: Anything but numbers with a point or a comma.
+_ODD = re.compile(r"[^0-9+\-.,eE\n]")
 _COMMENT = re.compile(r"^\s*(#|%|//|;|!|')+\s*")
 
 
@@ -70,7 +70,7 @@ def text_columns(
     cells = [[c.strip() for c in column] for column in zip(*(r for _, r in body), strict=True)]
     cells = cells or [[] for _ in names]
     for i, column in enumerate(cells):
-        if not _NUMERIC.issuperset("".join(column)):
+        if _ODD.search("\n".join(column)):
             what = f"{path}, column {names[i] or i + 1}"
             column = ["" if reading.means_gap(c) else c for c in column]
             column = ungrouped(column, what, tell) if delimiter != " " else column
