@@ -274,5 +274,5 @@ def test_netcdf_4_is_read_where_its_package_is(tmp_path):
     with pytest.raises(DataError, match="damaged netCDF file"):
         read_recording(path)
     ds.to_netcdf(tmp_path / "g.nc", group="flight", engine="h5netcdf")
-    with pytest.raises(DataError, match="in groups .*/flight"):
+    with pytest.raises(DataError, match=r"in groups .*/flight"):
         read_recording(tmp_path / "g.nc")
