@@ -21,8 +21,9 @@ from apu_casadi.machine.faults.fault import FAULTS, Fault
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST, STARTS
+from scenarios.phases import CHANGES, Change, Phase
 from scenarios.reading import DEFAULT_FAULT, names_of
-from scenarios.schema import CHANGES, EXCHANGES, FILE_KEYS, Change, Phase, Scenario
+from scenarios.schema import EXCHANGES, FILE_KEYS, Scenario
 
 Table = dict[str, Any]
 _GENERATOR = {"$ref": "#/definitions/generator"}
