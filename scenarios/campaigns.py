@@ -38,7 +38,8 @@ from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, registry
 from scenarios.campaign_records import COLUMNS, OF_EACH, RUNS, STATUS, each
 from scenarios.extensions import digest
-from scenarios.schema import Phase, Scenario
+from scenarios.phases import Phase
+from scenarios.schema import Scenario
 from scenarios.shell.locking import locked
 from scenarios.shell.workers import pool, stoppable
 
