@@ -285,9 +285,12 @@ def joint_vectors(
 
     Raises:
         SignalError: the point's load is not balanced.
+        ParameterError, OperatingPointError: the generators differ, or their loads.
     """
-    gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, point.generator)
-    ss = joint_averaged(apu, load_kind(point.generator), free)
+    apu.refuse_different("the averaged unit")
+    at = point.common("the averaged unit")
+    gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, at)
+    ss = joint_averaged(apu, load_kind(at), free)
     gas = GasGenerator.U.unpack(point.gas.u)
     values: Mapping[str, float] = {
         **{n: gas[n] for n in AMBIENT},
