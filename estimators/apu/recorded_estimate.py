@@ -63,6 +63,7 @@ NEEDED = ("w_r", *VOLTAGES, *MEASURED)
 PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
+STEP = 1.5 * DT  # longest of the gas-path filter
 FEWEST = 20  # innovations that a verdict takes
 STEEP = 0.1  # change of a factor beyond which no filter was tried
 
@@ -95,6 +96,11 @@ class RecordedEstimate:
     def believable(self) -> bool:
         """Whether nothing speaks against the estimates."""
         return not self.doubts
+
+    def datasets(self) -> dict[str, xr.Dataset]:
+        """Return the estimates over time by what they are of."""
+        out = {} if self.gaspath is None else {"gaspath": self.gaspath}
+        return out | {f"electrical_{k}": e for k, e in self.machines.items()}
 
     def report(self) -> dict[str, Any]:
         """Return the estimates at the end, alarms and verdicts, ready for JSON."""
@@ -173,6 +179,8 @@ def estimate(
         filt, tracked = path.run(fusable, electrical_sensors)
         e = gas_dataset(filt, tracked)
         _judge_gas(filt, tracked, list(sides.values()), doubts)
+        if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
+            notes.append("so few readings hardly show whether the model holds")
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
@@ -291,7 +299,8 @@ class _Waves:
             lacking[what] = str(e)
             return None
         # gain errors are taken for noise, so that they are there as offsets
-        odd = _unexplained(side.result, side.resets, DT, offset=3.0)
+        found = [(v - DT, v + DT) for v in (side.t[0], *side.resets)]
+        odd = _unexplained(side.result, found, offset=3.0)
         doubts += (f"machine {self.number}, {text}" for text in odd)
         return side
 
@@ -321,12 +330,13 @@ class _GasPath:
         inputs = self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
-        gg, options = self.apu.gas_generator, {"max_dt": 1.5 * DT}
+        gg = self.apu.gas_generator
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
             own = self.m.machine(_machines(self.m)[0]).streams("w_r")["w_r"]
-            own = tuple(v[(own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)] for v in own)
+            inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
+            own = own[0][inside], own[1][inside]
             return fused(
                 self.apu,
                 sides,
@@ -337,7 +347,7 @@ class _GasPath:
                 prior=self._start(readings, sensors),
                 inputs=inputs,
                 backend=self.backend,
-                **options,
+                max_dt=STEP,
             )
         filt = gas_path_filter(
             gg,
@@ -346,7 +356,7 @@ class _GasPath:
             eta=ETA_SIGMA if power else None,
             consider_eta=False,
         )
-        data = filt.of_readings(readings, inputs=inputs, **options)
+        data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
         start = filt.prior(**self._start(readings, sensors))
         return filt, track_jumps(filt, data, prior=start, backend=self.backend)
 
@@ -433,19 +443,18 @@ class _GasPath:
 
 
 def _unexplained(
-    r: FilterResult, alarms: Sequence[float], settle: float, *, offset: float = 0.0
+    r: FilterResult, explained: Sequence[tuple[float, float]], *, offset: float = 0.0
 ) -> Iterator[str]:
     """Say which sensors the model and the stated noise do not explain, by their innovations.
 
     Args:
         r: of the filter.
-        alarms: instants that explain what was before them.
-        settle: what is not judged after the start and after alarms, s.
+        explained: intervals that a report explains, s.
         offset: constant offsets of the sensors that must be allowed for, sigmas.
     """
-    quiet = r.t > r.t[0] + settle
-    for a in alarms:
-        quiet &= (r.t > a + settle) | (r.t < a - 1.0)
+    quiet = np.ones(r.t.size, bool)
+    for begin, end in explained:
+        quiet &= (r.t <= begin + 1e-9) | (r.t > end + 1e-9)
     for name, e, s in zip(r.y.names, r.innovation, r.innovation_variance, strict=True):
         z = (e / np.sqrt(s))[quiet & np.isfinite(e)]
         if z.size < FEWEST:
@@ -465,7 +474,8 @@ def _judge_gas(
 ) -> None:
     """Say why the gas-path estimate is not to be believed."""
     r = tracked.result
-    doubts += _unexplained(r, [float(r.t[k]) for k in tracked.alarms], 0.5)
+    each = zip(tracked.onsets, tracked.alarms, strict=True)
+    doubts += _unexplained(r, [(float(r.t[i]), float(r.t[k]) + 0.1) for i, k in each])
     if len(tracked.alarms) >= 8:
         doubts.append("8 changes of health were reported, and further ones were not looked for")
     x, s = (np.array([r[n][k][-1] for n in HEALTH]) for k in (0, 1))

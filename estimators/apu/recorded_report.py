@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
-from estimators.apu.joint import ElectricalSide
+from estimators.apu.joint import GAIN_SHARE, ElectricalSide
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,8 +50,8 @@ def gas_dataset(filt: GasPathFilter, tracked: Tracked) -> xr.Dataset:
         signals += [Signal(n, x.unit, x.doc)]
         signals += [Signal(f"{n}_sigma", x.unit, f"standard deviation of {n}")]
     e = dataset({"time": r.t}, {"time": values}, signals=signals)
-    e.attrs["alarms"] = [float(r.t[k]) for k in tracked.alarms]
-    e.attrs["onsets"] = [float(r.t[k]) for k in tracked.onsets]
+    e.attrs["alarms"] = json.dumps([float(r.t[k]) for k in tracked.alarms])
+    e.attrs["onsets"] = json.dumps([float(r.t[k]) for k in tracked.onsets])
     return e
 
 
@@ -59,9 +60,9 @@ def side_dataset(side: ElectricalSide) -> xr.Dataset:
     values: dict[str, Any] = {"faulty_phase": side.phase}
     signals = [Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c")]
     rows = {f"h_{p}": side.severities[:, i] for i, p in enumerate(PHASES)}
-    rows["P_total"] = np.array(
-        [np.append(np.nan, v) for v in (side.P, np.sqrt(side.variance))], float
-    )
+    # the gain errors of the sensors are common to all windows
+    sigma = np.hypot(np.sqrt(side.variance), GAIN_SHARE * side.P)
+    rows["P_total"] = np.array([np.append(np.nan, v) for v in (side.P, sigma)])
     for n, pair in rows.items():
         unit = "W" if n == "P_total" else "1"
         doc = f"severity of a short circuit in phase {n[2:]}"
@@ -69,7 +70,7 @@ def side_dataset(side: ElectricalSide) -> xr.Dataset:
         values[n], values[f"{n}_sigma"] = pair
         signals += [Signal(n, unit, doc), Signal(f"{n}_sigma", unit, f"standard deviation of {n}")]
     e = dataset({"time": side.t}, {"time": values}, signals=signals)
-    e.attrs["resets"] = [float(v) for v in side.resets]
+    e.attrs["resets"] = json.dumps([float(v) for v in side.resets])
     return e
 
 
@@ -86,9 +87,14 @@ def gas_report(e: xr.Dataset, *, joint: bool) -> dict[str, Any]:
     ]
     little = [n for n in HEALTH if values[n]["half_width"] > TOLD * Z95 * HEALTH_SIGMA]
     t = e["time"].values
-    out = {"joint": joint, "samples": int(t.size), "from": float(t[0]), "to": float(t[-1])}
+    out: dict[str, Any] = {
+        "joint": joint,
+        "samples": int(t.size),
+        "from": float(t[0]),
+        "to": float(t[-1]),
+    }
     out |= {"values": values, "changed": off, "hardly_told": little}
-    out |= {"alarms": list(e.attrs["alarms"]), "onsets": list(e.attrs["onsets"])}
+    out |= {"alarms": json.loads(e.attrs["alarms"]), "onsets": json.loads(e.attrs["onsets"])}
     return out | {"false_alarms_per_hour": JumpTest().rate}
 
 
@@ -100,7 +106,7 @@ def machine_report(e: xr.Dataset) -> dict[str, Any]:
     now = PHASES[phase[-1] - 1] if phase[-1] else None
     values = {n: _last(e, n) for n in (*(f"h_{p}" for p in PHASES), "P_total")}
     out = {"from": float(t[0]), "to": float(t[-1]), "values": values}
-    return out | {"faulty_phase": now, "alarms": alarms, "resets": list(e.attrs["resets"])}
+    return out | {"faulty_phase": now, "alarms": alarms, "resets": json.loads(e.attrs["resets"])}
 
 
 def sequence_report(s: Sequences) -> dict[str, Any]:
