@@ -33,6 +33,10 @@ I_b_rms I_c_rms P_e P_loss_fault N_rpm_min N_rpm_max T4_max SM_percent_min
 """
 COLUMNS = tuple(_COLUMNS.split())
 """Numbers of :func:`apu_casadi.core.results.phase_summary` that are kept of each phase."""
+OF_EACH = tuple(
+    c for c in COLUMNS if c[:2] in ("V_", "I_", "P_") or c in ("mu", "k_rf", "kappa", "h")
+)
+"""Those of a generator."""
 _MAY_BE_NONE = {"k_rf", "kappa"}  # healthy
 _log = logging.getLogger("apu_casadi")
 
@@ -74,10 +78,25 @@ def wrong(record: Mapping[str, Any], name: str, phases: int) -> str:
         if not isinstance(row, dict) or not isinstance(row.get("name"), str):
             return f"phase {k}: no row with a name"
         for c in COLUMNS:
-            value = row.get(c, math.nan)
-            if not (_number(value) or (value is None and c in _MAY_BE_NONE)):
-                return f"phase {k}: {c} {row.get(c)!r}"
+            for own in each(row) if c in OF_EACH else [row]:
+                value = own.get(c, math.nan)
+                if not (_number(value) or (value is None and c in _MAY_BE_NONE)):
+                    return f"phase {k}: {c} {own.get(c)!r}"
     return ""
+
+
+def kept(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is kept of a phase's summary."""
+    made = {k: row[k] for k in ("name", *COLUMNS) if k in row}
+    if "generators" in row:
+        made["generators"] = [{k: one[k] for k in OF_EACH} for one in row["generators"]]
+    return made
+
+
+def each(row: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the numbers of each generator that differs, or once those of all."""
+    rows = row.get("generators", [row])
+    return rows if isinstance(rows, list) and all(isinstance(r, dict) for r in rows) else [{}]
 
 
 def _number(x: object) -> bool:

@@ -36,9 +36,9 @@ from apu_casadi.core.errors import ApuError, DataError, ScenarioError, Simulatio
 from apu_casadi.core.version import installed
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, registry
-from scenarios.campaign_records import COLUMNS, RUNS, STATUS
+from scenarios.campaign_records import COLUMNS, OF_EACH, RUNS, STATUS, each
 from scenarios.extensions import digest
-from scenarios.schema import Scenario
+from scenarios.schema import Phase, Scenario
 from scenarios.shell.locking import locked
 from scenarios.shell.workers import pool, stoppable
 
@@ -87,11 +87,17 @@ def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> l
     if n < 1 or seed < 0:
         raise ScenarioError(f"a campaign needs n >= 1 runs and a seed >= 0, got {n} and {seed}")
     sick = next((i for i, p in enumerate(s.phases) if isinstance(p.health, Mapping)), None)
-    short = next((i for i, p in enumerate(s.phases) if isinstance(p.fault, Ttsc)), None)
+    short = next((i for i, p in enumerate(s.phases) if _short(p) is not None), None)
     if sick is None or short is None:
         what = "a phase with health factors" if sick is None else "a phase with a fault"
         raise ScenarioError(f"scenario {s.name!r} lacks {what} to draw at random")
     return [_drawn(s, sick, short, seed, i) for i in range(n)]
+
+
+def _short(p: Phase) -> tuple[Ttsc, int | None] | None:
+    """Return the short circuit that a phase begins with, and the generator that has it or None."""
+    faults = p.fault if isinstance(p.fault, tuple) else [(None, p.fault)]
+    return next(((f, k) for k, f in faults if isinstance(f, Ttsc)), None)
 
 
 def _drawn(s: Scenario, sick: int, short: int, seed: int, i: int) -> Scenario:
@@ -103,7 +109,9 @@ def _drawn(s: Scenario, sick: int, short: int, seed: int, i: int) -> Scenario:
     k_rf = _digits(math.exp(rng.uniform(*np.log(K_RF_RANGE))))
     kappa = mu if rng.random() < 0.5 else max(mu, _digits(rng.uniform(mu, 1.0)))
     phase = "abc"[int(rng.integers(3))]
-    phases[short]["fault"] = {"mu": mu, "k_rf": k_rf, "kappa": kappa, "phase": phase}
+    _, number = _short(s.phases[short]) or (None, None)
+    of = {} if number is None else {"generator": number}
+    phases[short]["fault"] = {**of, "mu": mu, "k_rf": k_rf, "kappa": kappa, "phase": phase}
     if short > 0:
         before = phases[short - 1]["start"]
         after = phases[short + 1]["start"] if short + 1 < len(phases) else s.duration
@@ -149,7 +157,7 @@ def _run_one(task: _Task) -> dict[str, Any]:
         with warnings.catch_warnings():  # they are kept in the record, one list for each run
             warnings.simplefilter("ignore", ApuWarning)
             ds = registry.run(s, solver=task.solver)
-        record["phases"] = [{k: row[k] for k in ("name", *COLUMNS)} for row in phase_summary(ds)]
+        record["phases"] = [campaign_records.kept(row) for row in phase_summary(ds)]
         solver = json.loads(ds.attrs["solver"])
         record["residual"] = float(solver["residual_max"])
         record["warnings"] = found_in(ds)
@@ -419,27 +427,40 @@ def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Da
 
     n, m = len(records), max(len(s.phases) for s in scenarios)
     rows = [r.get("phases", ()) for r in records]
-    keys = dict.fromkeys(k for r in rows for row in r for k in row if k != "name")
+    numbers = max((len(each(row)) for r in rows for row in r), default=1)
+    keys = [c for c in COLUMNS if any(r for r in rows)]
     data: dict[str, Any] = {}
+    phases, runs = ("run", "phase"), "run"
+    of_each = (*phases, "generator") if numbers > 1 else phases
     for k in keys:
-        a = np.full((n, m), np.nan)
+        a = np.full((n, m, numbers), np.nan)
         for i, r in enumerate(rows):
             for j, row in enumerate(r):
-                a[i, j] = np.nan if row[k] is None else row[k]
+                # what all generators have is that of each of them
+                values = [own[k] for own in (each(row) if k in OF_EACH else [row])]
+                a[i, j, : len(values) if len(values) > 1 else None] = [
+                    np.nan if v is None else v for v in values
+                ]
         unit, doc = _UNITS.get(k) or CHANNELS[k]
-        data[k] = (("run", "phase"), a, {"units": unit, "long_name": doc})
+        told = {"units": unit, "long_name": doc}
+        own = k in OF_EACH and numbers > 1
+        data[k] = (of_each, a, told) if own else (phases, a[:, :, 0], told)
     label = np.full((n, m), "-", dtype="U64")
-    fault = np.full((n, m), "-", dtype="U1")
+    fault = np.full((n, m, numbers), "-", dtype="U1")
     for i, s in enumerate(scenarios):
-        now = "-"
         for j, p in enumerate(s.phases):
-            if p.fault is not None:
-                now = str(getattr(p.fault, "phase", "-"))
-            label[i, j], fault[i, j] = p.name[:64], now
-    phases, runs = ("run", "phase"), "run"
+            label[i, j] = p.name[:64]
+            fault[i, j] = fault[i, j - 1] if j else "-"
+            if isinstance(p.fault, tuple):
+                for of in p.fault:
+                    if of.generator <= numbers:
+                        fault[i, j, of.generator - 1] = str(getattr(of.fault, "phase", "-"))
+            elif p.fault is not None:
+                fault[i, j] = str(getattr(p.fault, "phase", "-"))
     words = "phase a, b or c with the short circuit; - healthy"
     data["phase_name"] = (phases, label, {"long_name": "name of the phase"})
-    data["fault_phase"] = (phases, fault, {"long_name": words})
+    faulty = fault if numbers > 1 else fault[:, :, 0]
+    data["fault_phase"] = (of_each, faulty, {"long_name": words})
     status = np.array([STATUS.index(r["status"]) for r in records], dtype=np.int8)
     flags = {"flag_values": list(range(len(STATUS))), "flag_meanings": " ".join(STATUS)}
     data["status"] = (runs, status, {"long_name": "what became of the run", **flags})
@@ -457,6 +478,8 @@ def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Da
     made = {"solver": solver, "runs": n, "apu_casadi_version": installed()}
     made["ambient"] = days.pop() if len(days) == 1 else "differs from run to run"
     coords = {"run": [s.name for s in scenarios], "phase": np.arange(m, dtype=np.int32)}
+    if numbers > 1:
+        coords["generator"] = np.arange(1, numbers + 1, dtype=np.int32)
     return xr.Dataset(data, coords=coords, attrs=made)
 
 

@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.core.errors import ScenarioError, ValidityError, nearest
 from apu_casadi.core.sharing import last, once
 from scenarios.extensions import digest
 from scenarios.schema import Scenario
@@ -80,6 +80,7 @@ def run(
     progress: Progress | None = None,
     solver: str = "auto",
     phasors: bool = False,
+    strict: bool = False,
     **overrides: Any,
 ) -> xr.Dataset:
     """Run a scenario and return the joint dataset.
@@ -91,6 +92,7 @@ def run(
         solver: ``"auto"``, ``"cvodes"``, ``"idas"`` or ``"propagator"``: see
             :func:`apu_casadi.unit.multirate.simulate_joint`.
         phasors: keep the fundamental phasors of voltages and currents of each exchange step.
+        strict: stop with an error, at its instant and in its phase, where there would be a warning.
         overrides: attributes of the scenario to change (``waveform_dt=None``, ``seed=3``,
             ``parameters={"machine.r_s": 0.01}``).
 
@@ -103,7 +105,11 @@ def run(
         s = s.change(**overrides)
     if out is not None:
         prepare(out)
-    ds = _simulate(s, progress, solver, phasors)
+    try:
+        ds = _simulate(s, progress, solver, phasors, **({"strict": True} if strict else {}))
+    except ValidityError as error:
+        inside = [p["name"] for p in s.phase_table() if p["start"] < error.t + 1e-9]
+        raise ValidityError(f"in phase {inside[-1]!r}: {error.words}", error.t) from None
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     if s.engine:
@@ -173,7 +179,9 @@ def assumed(s: Scenario) -> list[dict[str, Any]]:
     return [a._asdict() for a in rows if a.name not in s.parameters]
 
 
-def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool) -> xr.Dataset:
+def _simulate(
+    s: Scenario, progress: Progress | None, solver: str, phasors: bool, *, strict: bool = False
+) -> xr.Dataset:
     from apu_casadi.unit.multirate import simulate_joint
 
     return simulate_joint(
@@ -189,6 +197,7 @@ def _simulate(s: Scenario, progress: Progress | None, solver: str, phasors: bool
         seed=s.seed,
         solver=solver,
         phasors=phasors,
+        strict=strict,
         progress=progress,
     )
 
@@ -211,9 +220,9 @@ def name_of(ds: xr.Dataset) -> str:
 def summary(ds: xr.Dataset) -> dict[str, Any]:
     """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
     from apu_casadi.core.results import phase_summary
-    from apu_casadi.unit.validity import found_in
+    from apu_casadi.unit.validity import by_phase, found_in
 
-    scenario = _table(ds, "scenario")
+    scenario, rows = _table(ds, "scenario"), phase_summary(ds)
     return {
         "scenario": name_of(ds),
         "title": str(scenario.get("title", "")),
@@ -222,7 +231,7 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
         **({"assumed_engine": json.loads(ds.attrs["assumed"])} if "assumed" in ds.attrs else {}),
         **conditions(ds),
         "profiles": profiles(ds),
-        "phases": phase_summary(ds),
+        "phases": [r | {"beyond": b} for r, b in zip(rows, by_phase(ds), strict=True)],
         "validity": json.loads(ds.attrs.get("validity", "[]")),
         "warnings": found_in(ds),
     }

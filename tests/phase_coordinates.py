@@ -12,6 +12,7 @@ of the turn-to-turn short circuit:
 import math
 from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import scipy.integrate
 
@@ -21,22 +22,25 @@ P = MachineParameters()
 W = 2 * math.pi * 400.0
 
 
-def krause_inductance(theta):
+def krause_inductance(theta, P=P):
     """Phase-domain inductances, motor signs, rows a b c fd kd kq; Krause eqs. 5.2-8 to 5.3-18.
 
-    One matrix for each angle.
+    One matrix for each angle; one matrix of objects for a symbol.
     """
-    theta = np.asarray(theta)
     A, B = (P.L_md + P.L_mq) / 3, (P.L_md - P.L_mq) / 3
     s = 2 * np.pi / 3
-    L = np.zeros((*theta.shape, 6, 6), dtype=np.result_type(theta, float))
+    cos, sin, shape, kind = ca.cos, ca.sin, (), object
+    if not isinstance(theta, ca.SX):
+        theta = np.asarray(theta)
+        cos, sin, shape, kind = np.cos, np.sin, theta.shape, np.result_type(theta, float)
+    L = np.zeros((*shape, 6, 6), dtype=kind)
     for j, k in ((0, 0), (1, 1), (2, 2)):
-        L[..., j, k] = P.L_ls + A - B * np.cos(2 * (theta - j * s))
+        L[..., j, k] = P.L_ls + A - B * cos(2 * (theta - j * s))
     for j, k, shift in ((0, 1, np.pi / 3), (0, 2, -np.pi / 3), (1, 2, np.pi)):
-        L[..., j, k] = L[..., k, j] = -A / 2 - B * np.cos(2 * (theta - shift))
+        L[..., j, k] = L[..., k, j] = -A / 2 - B * cos(2 * (theta - shift))
     for j in range(3):
-        L[..., j, 3] = L[..., j, 4] = P.L_md * np.sin(theta - j * s)
-        L[..., j, 5] = P.L_mq * np.cos(theta - j * s)
+        L[..., j, 3] = L[..., j, 4] = P.L_md * sin(theta - j * s)
+        L[..., j, 5] = P.L_mq * cos(theta - j * s)
     L[..., 3:, :3] = 2 / 3 * L[..., :3, 3:].swapaxes(-1, -2)
     L[..., 3:5, 3:5] = P.L_md
     L[..., 3, 3] += P.L_lfd
@@ -118,6 +122,96 @@ def independent_machine(point, load, fault, t_end, n_out, *, isolated=False):
     rows = [signals(ti, si)[:3] for ti, si in zip(sol.t, sol.y.T, strict=True)]
     v, i, i_sh = (np.array(c).T for c in zip(*rows, strict=True))
     return SimpleNamespace(t=sol.t, v=v, i=i, i_sh=i_sh)
+
+
+class PhaseMachine:
+    """A machine with AC5A on a resistive load, grounded neutral, at a speed that is given in steps.
+
+    CVODES integrates the equations written here, with tolerances of their own.
+
+    Its short circuit (kappa = mu) is a resistance beside the load's.  Energies are states: work of
+    the shaft, of the field, output, extra loss of (8), and copper loss.
+
+    Parameters
+    ----------
+    gen, load : parameters are read from the first, resistances from the second.
+    point : steady state to start from.
+    """
+
+    def __init__(self, gen, load, point):
+        self.p, self.e, self.V_ref = gen.machine, gen.exciter, point.V_ref
+        self.R, self.fault = np.array(load.R), None
+        x = point.ss.x.unpack(point.x)
+        self.theta = x["theta_e"]
+        angles = self.theta - np.array([0, 1, 2]) * 2 * np.pi / 3
+        lam = np.cos(angles) * x["lam_sq"] + np.sin(angles) * x["lam_sd"]
+        rotor = [x[n] for n in ("lam_fd", "lam_kd", "lam_kq", "V_c", "V_R", "E_fd", "x_F1")]
+        self.s = np.array([*lam, *rotor, *np.zeros(5)])
+        p = self.p
+        self.r = np.array([p.r_s] * 3 + [p.r_fd, p.r_kd, p.r_kq])
+
+    def stored(self):
+        """Magnetic energy, J; rotor rows are referred by 2/3."""
+        i = np.linalg.solve(krause_inductance(self.theta, self.p), self.s[:6])
+        return 0.5 * (self.s[:3] @ i[:3] + 1.5 * self.s[3:6] @ i[3:])
+
+    def _functions(self):
+        """Waveforms and rates as functions of (time, state, speed, angle); CasADi computes them."""
+        p, e, R = self.p, self.e, self.R
+        t, s, w, theta0 = (ca.SX.sym(n, k) for n, k in (("t", 1), ("s", 15), ("w", 1), ("th", 1)))
+        theta = theta0 + w * t
+        # harmonics 0, 1 and 2 of the angle are all that there is
+        harmonics = np.fft.fft(krause_inductance(2 * np.pi * np.arange(8) / 8, p), axis=0) / 8
+        L = sum(
+            (2 if k else 1)
+            * (ca.cos(k * theta) * ca.DM(c.real) - ca.sin(k * theta) * ca.DM(c.imag))
+            for k, c in enumerate(harmonics[:3])
+        )
+        i, symmetric = ca.solve(L, s[:6]), ca.DM([1, 1, 1, 1.5, 1.5, 1.5])
+        g_sh = np.zeros(3)
+        if self.fault is not None:
+            g_sh["abc".index(self.fault.phase)] = 1.0 / self.fault.R_shunt(p)
+        v = -i[:3] / ca.DM(1.0 / R + g_sh)
+        i_load, i_sh, V_fd = v / ca.DM(R), ca.dot(v, ca.DM(g_sh)), p.V_fd_base * s[8]
+        dL = ca.reshape(ca.jacobian(ca.vec(L), theta0), 6, 6)
+        torque = -0.5 * p.n_pp * ca.dot(i * symmetric, dL @ i)
+        dlam = ca.vertcat(v, V_fd, 0, 0) - self.r * i
+        V_t = ca.sqrt((ca.dot(v, v) - ca.sum1(v) ** 2 / 3) / 3) / p.V_rated_rms
+        V_c, V_R, E, x_F = ca.vertsplit(s[6:10])
+        V_F = e.K_F / e.T_F1 * (E - x_F)
+        dV_R = (e.K_A * (self.V_ref - V_c - V_F) - V_R) / e.T_A
+        dV_R = ca.fmax(ca.fmin(dV_R, (e.V_R_max - V_R) / e.T_lim), (e.V_R_min - V_R) / e.T_lim)
+        B = math.log(e.S_E1 / e.S_E2) / (e.E_1 - e.E_2)
+        S = e.S_E2 * ca.exp(B * (E - e.E_2))
+        d_ex = [(V_t - V_c) / e.T_R, dV_R, (V_R - (e.K_E + S) * E) / e.T_E, (E - x_F) / e.T_F1]
+        loss = shunt = 0.0
+        if self.fault is not None:
+            k, mu = "abc".index(self.fault.phase), self.fault.mu
+            i_F, shunt = i_sh / mu, i_sh * v[k]  # equal ampere-turns: mu of the turns have i_F more
+            loss = self.fault.r_fault(p) * i_F**2
+            loss += mu * p.r_s * ((i_load[k] + i_F) ** 2 - i_load[k] ** 2)
+        copper = ca.dot(self.r * i, i * symmetric)
+        energy = [torque * w / p.n_pp, 1.5 * V_fd * i[3], ca.dot(v, i_load), loss, copper + shunt]
+        waves = ca.vertcat(v, i_load, torque)
+        model = {
+            "x": s,
+            "t": t,
+            "p": ca.vertcat(w, theta0),
+            "ode": ca.vertcat(dlam, *d_ex, *energy),
+        }
+        return model, ca.Function("waves", [t, s, model["p"]], [waves])
+
+    def step(self, w, t):
+        """Go on at the electrical speed w over instants t from 0; return waveforms at them."""
+        model, waves = self._functions()
+        how = {"reltol": 1e-11, "abstol": 1e-12}
+        solve = ca.integrator("reference", "cvodes", model, 0.0, t, how)
+        p = [w, self.theta]
+        x = solve(x0=self.s, p=p)["xf"].full()
+        rows = waves.map(t.size)(ca.DM(t).T, x, p).full()
+        before, self.s, self.theta = self.s, x[:, -1], self.theta + w * t[-1]
+        means = (self.s[10:] - before[10:]) / t[-1]
+        return SimpleNamespace(v=rows[:3], i=rows[3:6], T_e=rows[6], means=means)
 
 
 # Radau IIA with three stages (Hairer and Wanner, Solving Ordinary Differential Equations II,

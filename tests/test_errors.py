@@ -24,7 +24,7 @@ def test_a_campaign_can_catch_the_family(error):
 def test_each_is_also_of_the_builtin_kind(error):
     """Python convention: wrong input is a ValueError, a calculation that failed a RuntimeError."""
     failed = {"EstimationError", "OperatingPointError", "SimulationError", "BackendError"}
-    failed |= {"NotApplicable"}  # a SimulationError
+    failed |= {"NotApplicable", "ValidityError"}  # a SimulationError each
     assert issubclass(error, RuntimeError if error.__name__ in failed else ValueError)
 
 

@@ -9,6 +9,7 @@ from apu_casadi import Apu, FaultChange, LoadChange, SeriesLoad, Ttsc
 from apu_casadi.core import results
 from apu_casadi.core.errors import ScenarioError
 from scenarios import registry
+from scenarios.campaigns import random_faults, run_campaign
 from scenarios.commands import run as run_command
 from scenarios.figures import plotting, runwords
 from scenarios.fileschema import file_schema
@@ -198,3 +199,28 @@ def test_the_library_has_a_fault_in_one_machine():
     assert healthy["I_a_rms"] == pytest.approx(a[2]["generators"][0]["I_a_rms"], rel=1e-6)
     before = both.time.values <= 10.0 + 1e-9
     assert (one.N.values[before] == both.N.values[before]).all()
+
+
+def test_a_campaign_keeps_each_generator(tmp_path):
+    """One run whose generators differ, and one whose generators are alike."""
+    alike = scenario(phase={"fault": SHORT}, name="alike")
+    runs = [scenario(), alike]
+    made = run_campaign(runs, workers=1, out=tmp_path)
+    assert made["status"].values.tolist() == [0, 0]
+    assert made["mu"].dims == ("run", "phase", "generator")
+    assert made["mu"].values[:, 1].tolist() == [[0.0, 0.05], [0.05, 0.05]]
+    assert made["fault_phase"].values[:, 1].tolist() == [["-", "c"], ["c", "c"]]
+    assert made["PW_kW"].dims == ("run", "phase")
+    again = run_campaign(runs, workers=1, out=tmp_path)
+    assert again.drop_vars("seconds").identical(made.drop_vars("seconds"))
+    rows = results.phase_summary(registry.run(runs[0], solver="propagator"))
+    assert made["I_c_rms"].values[0, 1, 1] == rows[1]["generators"][1]["I_c_rms"]
+    assert "generator" not in run_campaign([alike], workers=1).dims
+
+
+def test_random_faults_stay_in_their_generator():
+    drawn = random_faults(3, seed=1, base="joint_one_machine")
+    faults = [s.phases[3].fault for s in drawn]
+    assert all(len(f) == 1 and f[0].generator == 2 for f in faults)
+    plain = random_faults(3, seed=1, base="joint")
+    assert [f[0].fault for f in faults] == [s.phases[3].fault for s in plain]

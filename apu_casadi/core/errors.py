@@ -7,6 +7,7 @@ All derive from :class:`ApuError`, so that a campaign can catch the family.
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable
 
 from apu_casadi.core import interrupts
@@ -47,6 +48,19 @@ class SimulationError(ApuError, RuntimeError):
 
 class NotApplicable(SimulationError):  # noqa: N818 - not a failure
     """An integrator cannot take a step, or is not made for it; says why.  Another one may."""
+
+
+class ValidityError(SimulationError):
+    """A run that was to be strict left the range in which the model holds; ``t`` says when, s."""
+
+    t: float
+
+    def __init__(self, words: str, t: float = math.nan) -> None:
+        super().__init__(words if math.isnan(t) else f"at t = {t:.6g} s: {words}")
+        self.words, self.t = words, t
+
+    def __reduce__(self) -> tuple[type[ValidityError], tuple[str, float]]:
+        return type(self), (self.words, self.t)
 
 
 class ScenarioError(ApuError, ValueError):

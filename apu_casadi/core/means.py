@@ -247,6 +247,39 @@ def sequences(parts: np.ndarray, *, symmetric: bool = False) -> np.ndarray:
     return np.concatenate([size, angle, ratio])
 
 
+def of_samples(t: Any, theta_e: Any, waves: Mapping[str, Any]) -> dict[str, float]:
+    """Return rms values, phasors and symmetrical components of sampled waveforms, by name.
+
+    As over a step, with the same weight, by the trapezoidal rule: for the waveforms of a generator
+    that was simulated alone, ``of_samples(ds["time"], ds["theta_e"], ds)``, or for part of them.
+
+    Args:
+        t, theta_e: instants, s, and rotor angle, rad, shape (n,).
+        waves: v_a ... i_c by name, each of shape (n,).
+
+    Raises:
+        SignalError: a waveform is absent, or fewer than 20 samples or less than a period are given.
+    """
+    t, angle = np.asarray(t, dtype=float), np.unwrap(np.asarray(theta_e, dtype=float))
+    missing = [n for n in PHASORS.values() if n not in waves]
+    turn = abs(float(angle[-1] - angle[0])) / (2 * math.pi) if angle.size else 0.0
+    if missing or t.size < 20 or turn < LEAST:
+        raise SignalError(
+            f"waveforms over a period or more are needed, 20 samples at least; {t.size} over "
+            f"{turn:.3g} periods given" + (f", without {', '.join(missing)}" if missing else "")
+        )
+    tau = (t - t[0]) / (t[-1] - t[0])
+    means = {}
+    for name in wanted(phasors=True, short=False, symmetric=False):
+        q = Term.of(name)
+        value = 1.0 if q.base == "1" else np.asarray(waves[q.base], dtype=float) ** q.power
+        wave = window(tau) * value * (getattr(np, q.trig)(q.k * angle) if q.trig else 1.0)
+        means[name] = np.array([np.sum((wave[1:] + wave[:-1]) / 2.0 * np.diff(tau))])
+    found = settled(means, turn=turn, symmetric=False, phasors=True)
+    rows = np.concatenate([found, sequences(found[len(RMS) :])])[:, 0]
+    return dict(zip((*RMS, *PARTS, *SEQUENCES), rows.tolist(), strict=True))
+
+
 def as_dict(names: Sequence[str], means: np.ndarray) -> dict[str, np.ndarray]:
     """Return means of shape (names, steps) or (names,) by name."""
     return dict(zip(names, means, strict=True))

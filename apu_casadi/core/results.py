@@ -350,7 +350,8 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
 
     Each row holds name, start, end [s] and window [s]; the means over the last 0.5 s of the phase
     (over all of a shorter one) of N_rpm, PW_kW, Wf [kg/s], SFC [kg/(W s)], T3, T4, T5 [K], P3_kPa,
-    SM_percent, V_a_rms ... [V], I_a_rms ... [A], and P_e and P_loss_fault [W] of one generator; the
+    SM_percent, V_a_rms ... [V], I_a_rms ... [A], and P_e and P_loss_fault [W] of one generator,
+    and V_2_over_V_1 and I_2_over_I_1 where the dataset has them; the
     extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
     its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
     (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
@@ -405,9 +406,13 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     return rows
 
 
+_UNBALANCE = ("V_2_over_V_1", "I_2_over_I_1")
+
+
 def _of_one(col: _Columns, tail: np.ndarray, end: int) -> dict[str, Any]:
     """Return means over the end of a phase of one generator, and the severity of its fault."""
-    means = {v: float(np.mean(col[v][tail])) for v in _MEANS_OF_EACH}
+    more = [v for v in _UNBALANCE if v in col.ds]  # files of before lack them
+    means = {v: float(np.mean(col[v][tail])) for v in (*_MEANS_OF_EACH, *more)}
     return means | severity(*(float(col[v][end]) for v in _SEVERITY))
 
 

@@ -61,6 +61,7 @@ from apu_casadi.unit.machines import kinds, means_of
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Recorder, stored_severities
 from apu_casadi.unit.stepmeans import MEANS
+from apu_casadi.unit.strictness import Strict
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -120,6 +121,7 @@ def simulate_joint(
     hook: Callable[[int, np.ndarray], np.ndarray] | None = None,
     solver: str = "auto",
     start_from: str = "balanced",
+    strict: bool = False,
     rtol: float = 1e-8,
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
@@ -150,6 +152,7 @@ def simulate_joint(
         noise, seed: uncertainty and the seed of its random numbers.
         hook: processes the rotor speed between state update and output (Algorithm 2).
         start_from: one of ``STARTS``, as above.
+        strict: stop with an error where there would be a warning, at its instant where it shows.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
         progress: called with (done, total) seconds.
         attrs: more attributes for the dataset.
@@ -169,6 +172,7 @@ def simulate_joint(
     Raises:
         ScenarioError, DataError: impossible times or events; no room in the ``storage`` folder.
         OperatingPointError, SimulationError: no steady start; a step failed: when and why.
+        ValidityError: a strict run left the model (:mod:`apu_casadi.unit.strictness`).
     """
     noise = Noise() if noise is None else noise
     duration = number("duration", duration, error=ScenarioError)
@@ -198,8 +202,10 @@ def simulate_joint(
     severities = stored_severities(events, *start.faults)
     record = Recorder(apu.gas_generator, asked.grid, samples, means, storage, severities)
     record.put(0, 1, system.at_start())
-    run(system, asked.grid, stops, record=record.put, progress=progress)
-    return _concluded(system, record, rng, exchange, events, warn_exchange, attrs or {})
+    put = Strict(system, means, record.put) if strict else record.put
+    run(system, asked.grid, stops, record=put, progress=progress)
+    how = {"warn_exchange": warn_exchange, "strict": strict}
+    return _concluded(system, record, rng, exchange, events, **how, attrs=attrs or {})
 
 
 def _settled(start_from: str) -> bool:
@@ -238,7 +244,9 @@ def _concluded(
     rng: np.random.Generator,
     exchange: str,
     events: Sequence[Event],
+    *,
     warn_exchange: bool,
+    strict: bool,
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
     """Make the dataset of a run, with what must be known of it in attributes and warnings."""
@@ -281,4 +289,4 @@ def _concluded(
     ]
     notes += [ValidityWarning(words) for words in (starved, *unserved) if words]
     found = validity.departures(apu.gas_generator, grid, rows)
-    return validity.conclude(ds, found, notes, stacklevel=4)
+    return validity.conclude(ds, found, notes, stacklevel=4, strict=strict)

@@ -117,20 +117,34 @@ class StepMeans:
         kept = (values[: len(MEANS)], rms, of_symmetry, *((parts,) if self.phasors else ()))
         return np.concatenate(kept)
 
+    def too_little(self, raw: RawMeans) -> tuple[str, float] | None:
+        """Return the words for the first of steps in which (8) gives too little, and its end, s."""
+        by_name = as_dict(raw.quad, raw.values)
+        torque = 2.0 * by_name["T_e"] * raw.w_r / self.gen.machine.n_pp
+        excess = torque - by_name["P_total"]
+        out = np.flatnonzero(excess > EXCESS * 2.0 * self.gen.machine.P_rated)
+        if not out.size:
+            return None
+        k, t = out[0], np.broadcast_to(np.atleast_1d(raw.t), excess.shape)
+        return self._words(excess[k], torque[k], by_name["P_total"][k], float(t[k])), float(t[k])
+
     @property
     def warnings(self) -> list[str]:
         """What must be known of the steps settled so far."""
-        *powers, t = self.excess
-        more, torque, power = (self._pairs * P for P in powers)
-        if more <= EXCESS * self._pairs * 2.0 * self.gen.machine.P_rated:
+        if self.excess[0] <= EXCESS * 2.0 * self.gen.machine.P_rated:
             return []
-        return [
+        return [self._words(*self.excess)]
+
+    def _words(self, *powers_and_t: float) -> str:
+        *powers, t = powers_and_t
+        more, torque, power = (self._pairs * P for P in powers)
+        return (
             f"eq. (8) gives too little: in the step that ends at t = {t:.6g} s the torque of "
             f"{self._of} takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
             f"the gas generator is loaded, {power / 1e3:.4g} kW; {more / 1e3:.3g} kW are more "
             f"than {100 * EXCESS:g} % of the rated power. Eq. (8) holds output and extra loss "
             "of the fault only: near a short circuit the machine's own loss is missing"
-        ]
+        )
 
 
 def rms_at_rest(point: GeneratorPoint) -> dict[str, float]:

@@ -31,8 +31,15 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.errors import ApuWarning, ExchangeWarning, OperatingPointError, ValidityWarning
+from apu_casadi.core.errors import (
+    ApuWarning,
+    ExchangeWarning,
+    OperatingPointError,
+    ValidityError,
+    ValidityWarning,
+)
 from apu_casadi.core.profiles.profile import Varying, at, later
+from apu_casadi.core.results import phases
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
@@ -51,6 +58,8 @@ __all__ = [
     "Departure",
     "ExchangeError",
     "before",
+    "beyond_words",
+    "by_phase",
     "conclude",
     "departures",
     "exchange_error",
@@ -102,15 +111,19 @@ class Departure:
 
     def text(self) -> str:
         """Return it in words."""
-        unit = {"1": "", "off_c": " table spans", "off_t": " table spans"}.get(
-            self.quantity if self.quantity.startswith("off_") else self.unit, f" {self.unit}"
-        )
-        words = _WORDS.get(self.quantity, "beyond a limit")
+        when = f" at t = {self.at:.6g} s"
         return (
-            f"{words}: {self.quantity} = {self.worst:.5g}{unit} at t = {self.at:.6g} s (limit "
-            f"{self.limit:.5g}), first beyond it at t = {self.first:.6g} s, for "
-            f"{self.duration:.4g} s in all"
+            f"{beyond_words(self.quantity, self.worst, self.unit, self.limit, when)}, first beyond "
+            f"it at t = {self.first:.6g} s, for {self.duration:.4g} s in all"
         )
+
+
+def beyond_words(quantity: str, value: float, unit: str, limit: float, when: str = "") -> str:
+    """Return in words that a quantity is beyond its limit."""
+    spans = {"1": "", "off_c": " table spans", "off_t": " table spans"}
+    unit = spans.get(quantity if quantity.startswith("off_") else unit, f" {unit}")
+    words = _WORDS.get(quantity, "beyond a limit")
+    return f"{words}: {quantity} = {value:.5g}{unit}{when} (limit {limit:.5g})"
 
 
 def departures(
@@ -139,6 +152,31 @@ def departures(
         k, first = int(np.argmax(beyond)), int(np.argmax(out))
         instants = float(t[first]), float(t[k]), float(steps[out].sum())
         found.append(Departure(name, gg.Y[name].unit, float(limit), float(values[k]), *instants))
+    return found
+
+
+def by_phase(ds: Any) -> list[list[dict[str, Any]]]:
+    """Return for each phase of a run what was beyond its limit in it: a table for each quantity.
+
+    A table has quantity, limit, worst and its instant ``at``, ``first`` instant and duration, s.
+    """
+    rows, t = json.loads(ds.attrs.get("validity", "[]")), ds["time"].values
+    steps, found = np.diff(t, prepend=t[0]), []
+    for k, p in enumerate(phases(ds)):
+        inside = ((t > p["start"] + 1e-9) | (k == 0)) & (t <= p["end"] + 1e-9)
+        own = []
+        for d in rows:
+            sign = 1.0 if d["worst"] > d["limit"] else -1.0
+            values = ds[d["quantity"]].values
+            out = np.flatnonzero(inside & (sign * (values - d["limit"]) > 0))
+            if out.size:
+                worst = out[int(np.argmax(sign * values[out]))]
+                own.append({
+                    **{n: d[n] for n in ("quantity", "unit", "limit")},
+                    "worst": float(values[worst]), "at": float(t[worst]),
+                    "first": float(t[out[0]]), "duration": float(steps[out].sum()),
+                })  # fmt: skip
+        found.append(own)
     return found
 
 
@@ -418,6 +456,7 @@ def conclude(
     notes: Iterable[ApuWarning] = (),
     *,
     stacklevel: int = 3,
+    strict: bool = False,
 ) -> xr.Dataset:
     """Write what was found into the attributes of a run, and raise the warnings.
 
@@ -427,12 +466,18 @@ def conclude(
     Args:
         found: departures from the limits; together they make one :class:`ValidityWarning`.
         notes: further warnings, raised as they are.
+        strict: raise the first as an error instead.
+
+    Raises:
+        ValidityError: there is a warning, and the run was to be strict.
     """
     notes = list(notes)
     if found:
         words = "; ".join(d.text() for d in found)
         text = f"the run left the range in which the model holds: {words}"
         notes.insert(0, ValidityWarning(text))
+    if strict and notes:
+        raise ValidityError(f"at the end of the run: {notes[0]}", float(ds["time"][-1]))
     before = json.loads(ds.attrs.get("warnings", "[]"))
     ds.attrs["validity"] = json.dumps([asdict(d) for d in found])
     ds.attrs["warnings"] = json.dumps([*before, *(str(w) for w in notes)], ensure_ascii=False)

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import dataset
+from apu_casadi.core.results import GENERATOR, dataset
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
@@ -103,8 +103,10 @@ def electrical_samples(
         gains: actual relative gain errors by sensor.
 
     Raises:
-        DataError: the run has no waveforms.
+        DataError: the run has no waveforms, or its generators differ.
     """
+    if GENERATOR in ds.dims:
+        raise DataError("the joint filter takes generators that are alike; those of the run differ")
     if "time_w" not in ds:
         raise DataError("the run has no waveforms; simulate with waveform_dt=1e-4")
     t = np.asarray(ds["time_w"].values, float)

@@ -32,6 +32,7 @@ scenario SCENARIO      | a name, a .toml or a .py file
                        | same price), or corrected; default: the scenario's
 --start-from WORD      | balanced: a fault of the start acts from t = 0; settled: it has been there
                        | for long; default: the scenario's
+--strict               | stop where the model no longer holds, with the reason and the time
 --quiet                | no progress bar, no list of files
 """
 
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(s.name, s.duration, show=show) as progress:
-        ds = registry.run(s, progress=progress, solver=args.solver, phasors=args.phasors)
+        how = {"solver": args.solver, "phasors": args.phasors, "strict": args.strict}
+        ds = registry.run(s, progress=progress, **how)
     made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
     report = registry.summary(ds)
     notices.tell(report["warnings"])
@@ -92,6 +94,7 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("I rms a [A]", lambda r: f"{r['I_a_rms']:.2f}"),
     ("      b", lambda r: f"{r['I_b_rms']:.2f}"),
     ("      c", lambda r: f"{r['I_c_rms']:.2f}"),
+    ("V2/V1, I2/I1 [%]", lambda r: _unbalance(r)),
     ("output of each [kW]", lambda r: f"{r['P_e'] / 1e3:.2f}"),
     ("fault loss of each [kW]", lambda r: f"{r['P_loss_fault'] / 1e3:.3f}"),
     ("f_eta_c, f_W_c", lambda r: f"{r['f_eta_c']:g}, {r['f_W_c']:g}"),
@@ -104,7 +107,13 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 )
 
 
+def _unbalance(r: dict[str, Any]) -> str:
+    names = ("V_2_over_V_1", "I_2_over_I_1")
+    return ", ".join(f"{100 * r[n]:.3g}" for n in names) if names[0] in r else "-"
+
+
 _OF_EACH = {
+    "V2/V1, I2/I1 [%]",
     *("load of each", "V rms a [V]", "I rms a [A]", "      b", "      c", "output of each [kW]"),
     *("fault loss of each [kW]", "TTSC mu [%]", "  phase", "  k_rf", "  kappa"),
     "  h = mu/(k_rf + 1 - mu)",
@@ -133,8 +142,9 @@ def made_with(report: dict[str, Any]) -> list[str]:
     if error is not None:
         lines.append(exchange_words(error, report["exchange"], report["dt"]))
     left = ", ".join(
-        f"{d['quantity']} for {d['duration']:.4g} s from t = {d['first']:.6g} s"
-        for d in report["validity"]
+        f"{d['quantity']} for {d['duration']:.4g} s from t = {d['first']:.6g} s in {p['name']!r}"
+        for p in report["phases"]
+        for d in p["beyond"]
     )
     lines.append(
         f"beyond the model's limits: {left}" if left else "within the model's limits throughout"

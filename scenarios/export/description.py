@@ -127,7 +127,7 @@ def _variable(v: Variable, reference: int, states: int) -> tuple[dict[str, str],
     """Return what a variable is, and the attributes of its value; a rate follows its state."""
     causality, variability, initial = _ROLES[v.role]
     told = {"name": v.signal.name, "valueReference": str(reference), "description": v.signal.doc}
-    told |= {"causality": causality, "variability": variability}
+    told |= {"causality": "output" if v.shown else causality, "variability": variability}
     told |= {"initial": initial} if initial else {}
     value = {"unit": v.signal.unit}
     value |= {k: repr(float(x)) for k, x in (("min", v.least), ("max", v.most)) if abs(x) < 1e300}
@@ -138,12 +138,14 @@ def _variable(v: Variable, reference: int, states: int) -> tuple[dict[str, str],
 
 
 def _structure(parent: Xml.Element, model: FmuModel, fmi: int) -> None:
-    roles = {r: v.role for r, v in enumerate(model.variables, 1) if v.role in ("rate", "output")}
-    outputs, rates = ([r for r, role in roles.items() if role == k] for k in ("output", "rate"))
+    every = list(enumerate(model.variables, 1))
+    outputs = [r for r, v in every if v.role == "output" or v.shown]
+    rates = [r for r, v in every if v.role == "rate"]
+    unknown = [r for r, v in every if v.role in ("rate", "output")]
     for new, old, references in (
         ("Output", "Outputs", outputs),
         ("ContinuousStateDerivative", "Derivatives", rates),
-        ("InitialUnknown", "InitialUnknowns", list(roles)),
+        ("InitialUnknown", "InitialUnknowns", unknown),
     ):
         group = parent if fmi == 3 else Xml.SubElement(parent, old)
         for r in references:

@@ -48,6 +48,7 @@ class Variable(NamedTuple):
         role: one of :data:`ROLES`.
         start: value to start with; NaN of a rate or an output.
         least, most: range.
+        shown: a state is an output as well.
     """
 
     signal: Signal
@@ -55,6 +56,7 @@ class Variable(NamedTuple):
     start: float = math.nan
     least: float = -math.inf
     most: float = math.inf
+    shown: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +142,12 @@ def _finished(
     machines: Sequence[Machine] = (),
     hidden: Iterable[str] = (),
 ) -> FmuModel:
-    """Put a model together; no output is what is ``hidden`` or told by an input or a state."""
+    """Put a model together; what an input or a state tells, or is ``hidden``, is not told twice."""
     taken, signals = {*hidden, *(v.signal.name for v in given)}, list(outputs)
     kept = [i for i, s in enumerate(signals) if s.name not in taken]
-    whole = (*given, *_variables("output", (signals[i] for i in kept)))
+    names = {s.name for s in signals}
+    first = (v._replace(shown=v.role == "state" and v.signal.name in names) for v in given)
+    whole = (*first, *_variables("output", (signals[i] for i in kept)))
     more, numbers = _of_machines(machines) if machines else ({}, {})
     return FmuModel(
         name,
