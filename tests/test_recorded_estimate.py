@@ -3,6 +3,7 @@
 The truth is the joint simulation of 0.2 s with a short circuit at 0.1 s.
 """
 
+import dataclasses
 import json
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.testing import assert_allclose
 
 from apu_casadi.core import results
 from apu_casadi.core.errors import DataError, ParameterError
+from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -29,7 +31,6 @@ from scenarios import cli
 
 APU = Apu()
 SEED = 3
-DAY = {"altitude": 0.0, "Mach": 0.0, "dT_isa": 5.0, "war": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -216,6 +217,44 @@ def test_a_wrong_sensor_is_doubted(readings):
     assert "NOT TO BE BELIEVED" in e.summary()
 
 
+def test_a_stuck_sensor_is_doubted(readings):
+    gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf").items()}
+    gas["t"] = 0.02 * np.arange(gas["t"].size)
+    gas["T5"][10:] = gas["T5"][10]
+    e = estimate(read_recording(gas), backend="vm")
+    assert any("T5 stands still from 0.2 to 0.86 s" in d for d in e.doubts)
+
+
+def test_waveforms_of_a_short_part(readings):
+    """Then the gas path keeps its own shaft power, and both are estimated."""
+    gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW").items()}
+    gas["t"] = 0.02 * np.arange(gas["t"].size)
+    w = readings["electrical"]
+    e = estimate(read_recording(gas, {"t": w["time"].values, **{n: w[n].values for n in w}}))
+    assert not e.joint and e.gaspath["time"].size == 44 and list(e.machines) == [1]
+    assert any("cover less than half" in n for n in e.notes)
+
+
+def test_generators_that_differ():
+    """Each is measured and estimated as itself; r_s of the second is 20 % higher."""
+    g = APU.generator
+    other = dataclasses.replace(g, machine=dataclasses.replace(g.machine, r_s=1.2 * g.machine.r_s))
+    unit = APU.with_generators(g, other)
+    loads = [SeriesLoad.from_power(100e3), SeriesLoad.from_power(60e3)]
+    ds = simulate_joint(unit, duration=0.1, load=loads, dt=0.005, waveform_dt=1e-4)
+    made = measure_run(ds, unit, SEED)
+    assert {"i_a_1", "i_a_2", "w_r_2"} <= set(made["electrical"])
+    e = estimate(read_recording(*({"t": d["time"].values, **{n: d[n].values for n in d}}
+                                  for d in made.values())), unit, backend="vm")  # fmt: skip
+    assert list(e.machines) == [1, 2] and not e.joint
+    assert any("generators differ" in n for n in e.notes)
+    for m in e.machines.values():
+        assert abs(m["h_a"].values[-1]) < 4 * m["h_a_sigma"].values[-1]
+        assert not m["faulty_phase"].values.any()
+    power = [m["P_total"].values[-1] for m in e.machines.values()]
+    assert power[0] / power[1] == pytest.approx(100 / 60, rel=0.1)
+
+
 # ------------------------------------------------------------------------------ sensors, files
 
 
@@ -259,7 +298,7 @@ def test_all_formats_hold_the_same(readings, tmp_path, ending):
     made = write_recording(readings, tmp_path / f"r{ending}")
     assert [p.stem for p in made] == ["r_gaspath", "r_electrical"]
     m = read_recording(*made)
-    for kind, names in (("gaspath", ("T5", "PW", *DAY)), ("electrical", ("i_a", "w_r"))):
+    for kind, names in (("gaspath", ("T5", "PW", *CONDITIONS)), ("electrical", ("i_a", "w_r"))):
         for n in names:
             assert_allclose(m[n].values, readings[kind][n].values, rtol=1e-10, atol=1e-12)
 

@@ -71,6 +71,7 @@ __all__ = [
     "fused",
     "joint_case",
     "speed_from_generators",
+    "unit_of",
 ]
 
 ETA_SIGMA = 0.02  # relative; efficiency of the generators
@@ -113,6 +114,20 @@ def electrical_samples(
     truth = {n: np.asarray(ds[n].values, float) for n in GAIN_SENSORS}
     truth["w_r"] = np.asarray(apu.w_r(np.interp(t, ds["time"].values, ds["N"].values)))
     return {"t": t} | sensors.measure(truth, rng, gains=gains)
+
+
+def unit_of(apu: Apu, number: int) -> Apu:
+    """Return the unit with one of its generators, by number from 1, in place of all.
+
+    Raises:
+        DataError: there is no such generator.
+    """
+    if not 1 <= number <= len(apu.machines):
+        raise DataError(f"generator {number}: the unit has {len(apu.machines)}")
+    if apu.alike:
+        return apu
+    generator, coupling = apu.machines[number - 1]
+    return dataclasses.replace(apu, generator=generator, coupling=coupling, others=None)
 
 
 def loosened(sensors: SensorSet) -> SensorSet:
@@ -345,20 +360,14 @@ def estimate_joint(
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
     t, rows = samples(ds)
     measured = electrical_samples(ds, apu, rng, sensors=electrical_sensors, gains=electrical_gains)
-    side = electrical_side(
-        apu,
-        electrical_sensors,
-        measured,
-        t,
-        ttsc=ttsc,
-        gain_errors=gain_errors,
-        step=electrical_step,
-        backend=backend,
-    )
+    how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend}
+    also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
+    side = electrical_side(apu, electrical_sensors, measured, t, **also, **how)
     for n in gas_gains or {}:
         gas_sensors[n]
     truth = true_readings(gas_sensors, ds)[1]
     read = gas_sensors.measure(truth, noise, gains=gas_gains)
+    how |= {"power": power, "eta": eta, "step": step}
     gas, tracked = fused(
         apu,
         [side],
@@ -366,12 +375,8 @@ def estimate_joint(
         gas_sensors,
         speed=(measured["t"], measured["w_r"]) if speed else None,
         speed_sigma=electrical_sensors.sigma("w_r", float(np.median(measured["w_r"]))),
-        power=power,
         efficiency_error=(gas_gains or {}).get("PW", 0.0),
-        eta=eta,
-        gain_errors=gain_errors,
-        step=step,
-        backend=backend,
+        **how,
     )
     return _as_dataset(ds, t, rows, side, gas, tracked)
 

@@ -29,12 +29,12 @@ import numpy as np
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, ParameterError, nearest
-from apu_casadi.core.results import save
+from apu_casadi.core.results import GENERATOR, generators_of, of_generator, save
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.gaspath import true_readings
-from estimators.apu.joint import electrical_samples
+from estimators.apu.joint import electrical_samples, unit_of
 from estimators.apu.sensors import ELECTRICAL, KNOWN, SensorSet, gas_path_table
 
 if TYPE_CHECKING:
@@ -155,18 +155,13 @@ def _drawn(
 
 
 def _machines(ds: xr.Dataset, apu: Apu) -> list[tuple[str, Apu, xr.Dataset]]:
-    """Ending of the names, unit with that machine as the first, and the run by plain names."""
-    if all(n in ds for n in GAIN_SENSORS):
+    """Ending of the names, unit with that machine as the first, and the run as it sees it."""
+    numbers = generators_of(ds)
+    if GENERATOR not in ds.dims:
         return [("", apu, ds)]
-    out = []
-    for k, (generator, coupling) in enumerate(apu.machines, 1):
-        own = {f"{n}_{k}": n for n in GAIN_SENSORS}
-        lacking = [n for n in own if n not in ds]
-        if lacking:
-            raise DataError(f"the run has no {', '.join(lacking)}")
-        one = dataclasses.replace(apu, generator=generator, coupling=coupling, others=None)
-        out.append((f"_{k}", one, ds.rename(own)))
-    return out
+    if len(numbers) != len(apu.machines):
+        raise DataError(f"the run has {len(numbers)} generators, the unit {len(apu.machines)}")
+    return [(f"_{k}", unit_of(apu, k), of_generator(ds, k)) for k in numbers]
 
 
 def _dataset(

@@ -35,7 +35,7 @@ from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES
 from estimators.apu.gaspath import N_SIGMA, GasPathFilter, gas_path_filter
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import Tracked, track_jumps
-from estimators.apu.joint import ETA_SIGMA, H_GAIN, ElectricalSide, electrical_side, fused
+from estimators.apu.joint import ETA_SIGMA, H_GAIN, ElectricalSide, electrical_side, fused, unit_of
 from estimators.apu.recorded_report import (
     SURE,
     Z95,
@@ -47,7 +47,7 @@ from estimators.apu.recorded_report import (
     words,
 )
 from estimators.apu.recordings.measured import Measurements
-from estimators.apu.recordings.plausible import clipped, stuck
+from estimators.apu.recordings.plausible import WAVES, clipped, plain
 from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
 from estimators.filters.filtering import FilterResult
 from estimators.information.consistency import exceeded
@@ -64,6 +64,7 @@ PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
+STILL = 25  # equal readings in a row that noise does not give
 FEWEST = 20  # innovations that a verdict takes
 STEEP = 0.1  # change of a factor beyond which no filter was tried
 
@@ -140,7 +141,7 @@ def estimate(
         backend: see :func:`apu_casadi.core.backend.compiled`.
 
     Raises:
-        ParameterError: unknown ``only`` or ambient condition, generators that differ.
+        ParameterError: unknown ``only`` or ambient condition.
         DataError: nothing can be estimated; a rate below twice the frequency, a gap in the fuel
             flow, an ambient condition out of range.
     """
@@ -158,9 +159,8 @@ def estimate(
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     if only != "gaspath" and m.electrical:
-        apu.refuse_different("the electrical estimate")
         for k in _machines(m):
-            waves = _Waves(m.machine(k), k, apu, electrical_sensors, backend)
+            waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
             found |= waves.sequences(lacking)
             side = waves.side(begin, lacking, doubts)
             if side is not None:
@@ -169,11 +169,7 @@ def estimate(
         lacking["generators"] = "nothing of them was measured"
     tracked: Tracked | None = None
     e = None
-    grids = [s.t for s in sides.values()]
-    if any(g.shape != grids[0].shape or np.abs(g - grids[0]).max() > 1e-9 for g in grids):
-        notes.append("the generators were sampled at other instants: power is that of the first")
-    fusable = [s for s in sides.values() if s.t.shape == grids[0].shape]
-    fusable = [s for s in fusable if np.abs(s.t - grids[0]).max() <= 1e-9]
+    fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
         path = _GasPath(m, apu, table, ambient or {}, notes, doubts, backend)
         filt, tracked = path.run(fusable, electrical_sensors)
@@ -184,7 +180,7 @@ def estimate(
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
-    if sides and len(sides) < len(apu.machines):
+    if apu.alike and 0 < len(sides) < len(apu.machines):
         notes.append(
             f"only machine {', '.join(map(str, sides))} is estimated; power is that of "
             f"{len(apu.machines)} equal ones"
@@ -192,12 +188,35 @@ def estimate(
     machines = {k: side_dataset(s) for k, s in sides.items()}
     result = None if tracked is None else tracked.result
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    return RecordedEstimate(e, machines, found, gas and bool(sides), lacking, *texts, result)
+    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, result)
+
+
+def _fusable(
+    m: Measurements, apu: Apu, sides: Mapping[int, ElectricalSide], notes: list[str]
+) -> dict[int, ElectricalSide]:
+    """Return the machines whose powers make the shaft power."""
+    if not sides:
+        return {}
+    if not apu.alike:
+        notes.append("the generators differ: the gas path has no shaft power from the waveforms")
+        return {}
+    t, fuel = next(iter(sides.values())).t, m.streams("Wf")["Wf"][0]
+    if min(t[-1], fuel[-1]) - max(t[0], fuel[0]) < 0.5 * (fuel[-1] - fuel[0]):
+        notes.append(
+            f"the waveforms, {t[0]:g} to {t[-1]:g} s, cover less than half of the gas path's time: "
+            "the two are estimated apart; give that part of the gas path alone to have both"
+        )
+        return {}
+    alike = {k: s for k, s in sides.items() if s.t.shape == t.shape}
+    alike = {k: s for k, s in alike.items() if np.abs(s.t - t).max() <= 1e-9}
+    if len(alike) < len(sides):
+        notes.append("the generators were sampled at other instants: power is that of the first")
+    return alike
 
 
 def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     """Say why there is no gas-path estimate; None if there is one."""
-    if "Wf" not in m:
+    if "Wf" not in m or not np.isfinite(m["Wf"].values).any():
         return "the filter takes the fuel flow Wf as an input, which was not measured"
     if not [n for n in table.outputs if n in m and n != "N"]:
         return f"none of {', '.join(n for n in table.outputs if n != 'N')} was measured"
@@ -205,16 +224,29 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
 
 
 def _odd_channels(m: Measurements) -> Iterator[str]:
-    """Say which channels stand still while the others move, or are clipped."""
-    for c in m.values():
-        others = [o.values for o in m.values() if o is not c and o.t is c.t]
-        rows = stuck(c.values, others)
+    """Say which channels stand still while most others move, or are clipped."""
+    sensors = {n: c for n, c in m.items() if n not in CONDITIONS and np.isfinite(c.values).any()}
+    for n, c in sensors.items():
+        others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
+        rows = _still(c.values, others)
         if rows is not None:
-            yield f"{c.source}: {c.name} stands still from {c.t[rows[0]]:g} to {c.t[rows[1]]:g} s"
-        if c.name.rpartition("_")[0] in ("i", "v") or c.name[:2] in ("i_", "v_"):
-            count = clipped(c.values) if np.isfinite(c.values).any() else 0
-            if count:
-                yield f"{c.source}: {count} samples of {c.name} are clipped"
+            yield f"{c.source}: {n} stands still from {c.t[rows[0]]:g} to {c.t[rows[1]]:g} s"
+        count = clipped(c.values) if plain(n) in WAVES else 0
+        if count:
+            yield f"{c.source}: {count} samples of {n} are clipped"
+
+
+def _still(values: np.ndarray, others: Sequence[np.ndarray]) -> tuple[int, int] | None:
+    """First and last row of the longest run of one reading, if most others change in it."""
+    change = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
+    length = np.diff(np.append(change, values.size))
+    k = int(length.argmax())
+    if length[k] < STILL:
+        return None
+    part = slice(change[k], change[k] + length[k])
+    there = [o[part][np.isfinite(o[part])] for o in others]
+    moving = [np.ptp(o) > 0 for o in there if o.size]
+    return (int(change[k]), int(part.stop) - 1) if moving and np.mean(moving) > 0.5 else None
 
 
 def _machines(m: Measurements) -> list[int]:
@@ -321,9 +353,10 @@ class _GasPath:
     backend: str | None
 
     def run(
-        self, sides: list[ElectricalSide], electrical: SensorSet
+        self, of: Mapping[int, ElectricalSide], electrical: SensorSet
     ) -> tuple[GasPathFilter, Tracked]:
         """Filter, with the power of the electrical side where there is one."""
+        sides = list(of.values())
         power = bool(sides) or "PW" in self.m
         keep = [n for n in self.table.names if n in self.m or n in ("N", "Wf", "PW")]
         sensors = self.table.only(keep)
@@ -334,7 +367,7 @@ class _GasPath:
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
-            own = self.m.machine(_machines(self.m)[0]).streams("w_r")["w_r"]
+            own = self.m.machine(next(iter(of))).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
             own = own[0][inside], own[1][inside]
             return fused(
