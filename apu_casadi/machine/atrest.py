@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
 from apu_casadi.core.errors import OperatingPointError
 from apu_casadi.core.means import PHASORS, RMS, SEQUENCES, sequences
+from apu_casadi.core.sharing import derived
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import Load
@@ -61,7 +61,7 @@ class GeneratorPoint:
         """Whether the phases differ by rotation only, and nothing moves on the rotor's axes."""
         return self.states is None
 
-    @cached_property
+    @derived
     def turn(self) -> Turn:
         """States and outputs over one turn from here."""
         return Turn.of(self.ss, self.x if self.states is None else self.states, self.u, self.theta)

@@ -19,7 +19,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -30,6 +29,7 @@ from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import PROFILES, Profile, in_run
 from apu_casadi.core.register import Key
+from apu_casadi.core.sharing import derived
 
 FILE_KEYS = ("file", "column", "time")
 """Keys of a profile that is read from a file; the last two have defaults."""
@@ -73,7 +73,7 @@ class OfPoints(Profile):
             if b < a:
                 raise ScenarioError(f"times[{i}]: {b:g} s is before {a:g} s; times go on")
 
-    @cached_property
+    @derived
     def arrays(self) -> tuple[np.ndarray, np.ndarray, bool]:
         """Times and points, and whether two times are equal."""
         times = np.array(self.times)
