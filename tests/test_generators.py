@@ -15,6 +15,7 @@ from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.unit import recorder
 from apu_casadi.unit.apu import CouplingParameters, OnShaft
 from apu_casadi.unit.events import HealthChange, Holding
+from apu_casadi.unit.linearisation import linearise_joint
 from apu_casadi.unit.machines import kinds
 from apu_casadi.unit.monolithic import simulate_monolithic
 
@@ -95,6 +96,12 @@ def test_wrong_generators_are_refused():
         OTHER.PW(1e5)
     with pytest.raises(ParameterError, match="one model of the unit needs equal"):
         simulate_monolithic(OTHER, duration=0.1, load=KW100)
+    with pytest.raises(ScenarioError, match="2 loads; the one model of the unit has one for all"):
+        simulate_monolithic(Apu(), duration=0.1, load=[KW100, KW100])
+    with pytest.raises(ParameterError, match="averaged unit needs generators of equal load"):
+        linearise_joint(Apu(), Apu().steady_state([KW100, SeriesLoad.from_power(50e3)]))
+    with pytest.raises(ParameterError, match="power 1 "):
+        Apu().change({"generator.power": 1})
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.errors import SignalError
+from apu_casadi.core.errors import ParameterError, SignalError
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
@@ -283,7 +283,11 @@ def joint_vectors(
 
     Raises:
         SignalError: the point's load is not balanced.
+        ParameterError: the generators differ, or their loads or faults at this point do.
     """
+    apu.refuse_different("the averaged unit")
+    if point.others:
+        raise ParameterError("the averaged unit needs generators of equal load and fault")
     gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, point.generator)
     ss = joint_averaged(apu, load_kind(point.generator), free)
     gas = GasGenerator.U.unpack(point.gas.u)
