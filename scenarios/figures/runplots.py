@@ -231,7 +231,7 @@ def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> 
     text = "\n".join(
         line
         for part in words.split("\n")
-        for line in textwrap.wrap(part, letters + 2 * part.count("$"))
+        for line in textwrap.wrap(part, letters + 2 * part.count("$"), break_long_words=False)
     )
     lines = text.split("\n")
     longest = max(len(line) - 5 * (line.count("$") // 2) for line in lines)
@@ -263,7 +263,7 @@ def figure_20(ds: xr.Dataset) -> Figure:
     n = int(ds.attrs.get("generators", 2))
     with fs.drawing():
         fig = fs.new_figure(3.7 + 0.8 * (len(lanes) - 3))
-        m = fs.margins(fig, top=0.45, bottom=0.8)
+        m = fs.margins(fig, top=0.45, bottom=0.95)
         ax = fig.add_axes((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
         fs.bands(ax, rows, names=True)
         span = rows[-1]["end"] - rows[0]["start"]
