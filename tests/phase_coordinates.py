@@ -160,7 +160,13 @@ class PhaseMachine:
         p, e, R = self.p, self.e, self.R
         t, s, w, theta0 = (ca.SX.sym(n, k) for n, k in (("t", 1), ("s", 15), ("w", 1), ("th", 1)))
         theta = theta0 + w * t
-        L = ca.SX(ca.blockcat(krause_inductance(theta, p).tolist()))
+        # harmonics 0, 1 and 2 of the angle are all that there is
+        harmonics = np.fft.fft(krause_inductance(2 * np.pi * np.arange(8) / 8, p), axis=0) / 8
+        L = sum(
+            (2 if k else 1)
+            * (ca.cos(k * theta) * ca.DM(c.real) - ca.sin(k * theta) * ca.DM(c.imag))
+            for k, c in enumerate(harmonics[:3])
+        )
         i, symmetric = ca.solve(L, s[:6]), ca.DM([1, 1, 1, 1.5, 1.5, 1.5])
         g_sh = np.zeros(3)
         if self.fault is not None:

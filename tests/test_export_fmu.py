@@ -273,6 +273,31 @@ def test_what_cannot_be_is_told(built, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.ci
+def test_a_fault_begins_anew_whatever_is_read_before(asked, tmp_path):
+    """Model exchange: outputs read between the change and event mode leave the reset undone."""
+    mine = Asked(asked.unit, SeriesLoad.from_power(100e3, 0.85), None, asked.ambient)
+    path = fmu.build(fmu_model("generator", mine), tmp_path / "g.fmu")
+    one = Fmu(path, tmp_path, exchange=True)
+    one.start({})
+    one.put({"mu": 0.05})
+    one.update()
+    states = one.vector("GetContinuousStates")
+    at = [n for n in one.names if n != "time"].index("i_fault") - one.at["lam_sq"] + 1
+    assert states[at] == 0.0
+    states[at] = 100.0
+    one.vector("SetContinuousStates", states)
+    assert one.take(["i_fault"]) == [100.0]
+    for mu, after in ((0.0, 0.0), (0.05, 0.0)):
+        one.put({"mu": mu})
+        one.take(["P_total"])  # computed with the new parameter, before event mode
+        one.update()
+        assert one.vector("GetContinuousStates")[at] == after
+        states[at] = 50.0
+        one.vector("SetContinuousStates", states)
+
+
+@needs_compiler
 def test_state_is_kept_and_restored(built, tmp_path):
     import ctypes
 

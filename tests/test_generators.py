@@ -9,15 +9,17 @@ import pytest
 
 from apu_casadi import Apu, FaultChange, Generator, LoadChange, SeriesLoad, Ttsc, simulate_joint
 from apu_casadi.core import results
-from apu_casadi.core.errors import DataError, ParameterError, ScenarioError
+from apu_casadi.core.errors import DataError, OperatingPointError, ParameterError, ScenarioError
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
+from apu_casadi.machine.measurement import MeasurementNoise
 from apu_casadi.unit import recorder
 from apu_casadi.unit.apu import CouplingParameters, OnShaft
 from apu_casadi.unit.events import HealthChange, Holding
 from apu_casadi.unit.linearisation import linearise_joint
 from apu_casadi.unit.machines import kinds
 from apu_casadi.unit.monolithic import simulate_monolithic
+from apu_casadi.unit.noise import Noise
 
 KW100, KW150 = SeriesLoad.from_power(100e3), SeriesLoad.from_power(150e3)
 FAULT = Ttsc(0.05, 20.0)
@@ -98,7 +100,7 @@ def test_wrong_generators_are_refused():
         simulate_monolithic(OTHER, duration=0.1, load=KW100)
     with pytest.raises(ScenarioError, match="2 loads; the one model of the unit has one for all"):
         simulate_monolithic(Apu(), duration=0.1, load=[KW100, KW100])
-    with pytest.raises(ParameterError, match="averaged unit needs generators of equal load"):
+    with pytest.raises(OperatingPointError, match="the averaged unit"):
         linearise_joint(Apu(), Apu().steady_state([KW100, SeriesLoad.from_power(50e3)]))
     with pytest.raises(ParameterError, match="power 1 "):
         Apu().change({"generator.power": 1})
@@ -312,3 +314,62 @@ def test_different_generators_in_a_file_have_the_same_bits(piece, tmp_path, monk
     path = results.save(file, tmp_path / "a.nc")
     assert path.read_bytes() == results.save(memory, tmp_path / "b.nc").read_bytes()
     assert results.load(path).identical(memory)
+
+
+# -- what takes part, and what refuses ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        dict(exchange="predicted"),
+        dict(exchange="corrected"),
+        dict(solver="cvodes", waveform_dt=1e-3),
+        dict(waveform_dt=1e-4, phasors=True),
+        dict(solver="idas", duration=0.16),
+    ],
+    ids=str,
+)
+def test_two_that_only_seem_to_differ_give_the_bits_of_one(how):
+    """The generators differ by a number that nothing here depends on: each has its own group."""
+    events = [faulty(None), LoadChange(0.14, KW150)]
+    a = run(events=events, **how)
+    b = run(Apu().change({"generator2.exciter.T_lim": 2e-3}), events=events, **how)
+    assert b.sizes["generator"] == 2
+    for name, v in a.variables.items():
+        for own in np.atleast_2d(b[name].values):
+            assert own.tobytes() == v.values.tobytes(), name
+
+
+def test_noise_is_drawn_for_each_group():
+    ds = run(load=[KW100, KW150], solver="cvodes", noise=Noise(w1=2.0), seed=1, duration=0.1)
+    V = ds.V_a_rms.values
+    assert abs(np.corrcoef(np.diff(V[0]), np.diff(V[1]))[0, 1]) < 0.99
+    terminal = Noise(terminal=MeasurementNoise(sigma_i=1.0))
+    read = run(load=[KW100, KW150], noise=terminal, seed=1, duration=0.1, waveform_dt=1e-3)
+    wrong = read.i_a_meas.values - read.i_a.values
+    assert wrong.shape == (2, read.time_w.size) and 0.5 < wrong.std() < 1.5
+    assert abs(np.corrcoef(*wrong)[0, 1]) < 0.5
+
+
+def test_three_in_one_model_load_the_shaft_as_in_the_joint_run():
+    unit = Apu().change({"generator.count": 3})
+    kw = dict(duration=0.1, load=KW100)
+    one, joint = simulate_monolithic(unit, **kw), simulate_joint(unit, waveform_dt=None, **kw)
+    assert one.P_total.values == pytest.approx(joint.P_total.values, rel=1e-8)
+    assert one.PW.values == pytest.approx(one.P_total.values, rel=1e-6)
+
+
+def test_linear_models_refuse_generators_that_differ_and_know_how_many():
+    at = Apu().steady_state([KW100, KW150])
+    with pytest.raises(OperatingPointError, match="averaged unit needs equal generators"):
+        linearise_joint(Apu(), at)
+    with pytest.raises(ParameterError, match="averaged unit needs equal generators"):
+        linearise_joint(OTHER, OTHER.steady_state(KW100))
+    # the shaft power of four takes twice as much of the speed as that of two
+    gains = []
+    for n in (2, 4):
+        unit = Apu().change({"generator.count": n})
+        model = linearise_joint(unit, unit.steady_state(SeriesLoad.from_power(50e3)))
+        gains.append(model.derivative("PW", "V_ref"))
+    assert gains[1] == pytest.approx(2 * gains[0], rel=1e-6)

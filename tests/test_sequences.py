@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.core.means import COMPONENTS, PARTS, SEQUENCES, UNBALANCE, as_dict, sequences
+from apu_casadi.core.errors import SignalError
+from apu_casadi.core.means import (
+    COMPONENTS,
+    PARTS,
+    SEQUENCES,
+    UNBALANCE,
+    as_dict,
+    of_samples,
+    sequences,
+)
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
@@ -98,3 +107,21 @@ def test_a_healthy_machine_has_a_positive_sequence_only():
     a = ds["V_a_re"].values + 1j * ds["V_a_im"].values
     assert_allclose(ds["V_1_angle"], np.angle(a), atol=1e-12)
     assert ds["V_2_over_V_1"].attrs["units"] == "1"
+
+
+def test_of_a_generator_alone_by_its_samples():
+    """Of the waveforms of a settled generator, against the phasors of its turn: 1e-7."""
+    gen = APU.generator
+    point = gen.steady_state(UNEVEN, Ttsc(0.05, 20.0))
+    ds = gen.simulate(UNEVEN, 0.02, fault=Ttsc(0.05, 20.0), dt_out=10e-6)
+    found = of_samples(ds["time"], ds["theta_e"], ds)
+    for q in "VI":
+        exact = FORTESCUE @ [point.turn.phasor(f"{q.lower()}_{p}") for p in "abc"]
+        seen = [found[f"{q}_{s}"] * np.exp(1j * found[f"{q}_{s}_angle"]) for s in "120"]
+        assert_allclose(seen, exact, atol=1e-6 * abs(exact[0]))
+        assert found[f"{q}_a_rms"] == pytest.approx(point.turn.rms(f"{q.lower()}_a"), rel=1e-5)
+    with pytest.raises(SignalError, match=r"without i_c"):
+        of_samples(ds["time"], ds["theta_e"], ds.drop_vars("i_c"))
+    part = ds.isel(time=slice(0, 100))
+    with pytest.raises(SignalError, match=r"over 0\.396 periods"):
+        of_samples(part["time"], part["theta_e"], part)

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.core.errors import ApuWarning, OperatingPointError, ParameterError, ScenarioError
+from apu_casadi.core.errors import (
+    ApuWarning,
+    OperatingPointError,
+    ParameterError,
+    ScenarioError,
+    SignalError,
+)
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.openphase import OpenPhase
@@ -15,10 +21,12 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import MachineParameters, SaturatedMachine
 from apu_casadi.unit.apu import Apu, trim
 from apu_casadi.unit.events import Ambient, FaultChange, LoadChange
+from apu_casadi.unit.linearisation import linearise_generator, linearise_joint
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios import registry
 from scenarios.cli import main
 from scenarios.schema import Scenario
+from scenarios.studies.jointrun import truth
 
 APU = Apu()
 KW100, KW225 = SeriesLoad.from_power(100e3), SeriesLoad.from_power(225e3)
@@ -219,3 +227,18 @@ def test_refusal_tells_why():
     with pytest.raises(OperatingPointError, match="no regulated steady state"):
         APU.steady_state(SeriesLoad.from_power(3e6))
     assert not math.isnan(APU.steady_state(KW100).gas["Wf"])
+
+
+def test_what_needs_a_balanced_or_another_machine_says_so():
+    """Linear models of a faulty point; the joint estimation with another power or saturation."""
+    with pytest.raises(SignalError, match=r"without a fault"):
+        linearise_generator(APU.generator, APU.generator.steady_state(KW100, FAULT))
+    saturated = APU.change({"machine.S_10": 0.1, "machine.S_12": 0.4})
+    for unit in (saturated, TORQUE):
+        model = linearise_joint(unit, unit.steady_state(KW100))
+        assert np.abs(model.xdot0).max() < 1e-5 * np.abs(model.x0).max()
+    quiet = registry.get("quiet")
+    with pytest.raises(ScenarioError, match=r"generator\.power must be 'paper'"):
+        truth(quiet.change(parameters={"generator.power": "torque"}))
+    with pytest.raises(ParameterError, match="the joint estimation needs the linear machine"):
+        truth(quiet.change(parameters={"machine.S_10": 0.1}))

@@ -105,10 +105,11 @@ class Term(NamedTuple):
         if self.base in ("v", "i"):
             return sum(y[ss.y.index(f"{self.base}_{p}")] ** 2 for p in PHASES) / 3.0
         if f"~{self.base}" in AXES:
-            turn = ca.cos if self.base[2] == "q" else ca.sin
-            axes = (x[ss.x.index("theta_e")] - 2 * math.pi / 3 * k for k in range(3))
-            phases = (y[ss.y.index(f"{self.base[0]}_{p}")] for p in PHASES)
-            return 2.0 / 3.0 * sum(turn(a) * v for a, v in zip(axes, phases, strict=True))
+            a, b, c = (y[ss.y.index(f"{self.base[0]}_{p}")] for p in PHASES)
+            # by the addition theorem: of one cosine and one sine, which the outputs have as well
+            even, odd = (2.0 * a - b - c) / 3.0, (b - c) / math.sqrt(3.0)
+            cos, sin = (f(x[ss.x.index("theta_e")]) for f in (ca.cos, ca.sin))
+            return cos * even + sin * odd if self.base[2] == "q" else sin * even - cos * odd
         return 1.0 if self.base == "1" else y[ss.y.index(self.base)] ** self.power
 
     def nominal(self, ss: StateSpace) -> float:
@@ -245,6 +246,39 @@ def sequences(parts: np.ndarray, *, symmetric: bool = False) -> np.ndarray:
     none = np.full(positive.shape, np.nan)
     ratio = np.divide(size[1::3], positive, out=none, where=positive > 0)
     return np.concatenate([size, angle, ratio])
+
+
+def of_samples(t: Any, theta_e: Any, waves: Mapping[str, Any]) -> dict[str, float]:
+    """Return rms values, phasors and symmetrical components of sampled waveforms, by name.
+
+    As over a step, with the same weight, by the trapezoidal rule: for the waveforms of a generator
+    that was simulated alone, ``of_samples(ds["time"], ds["theta_e"], ds)``, or for part of them.
+
+    Args:
+        t, theta_e: instants, s, and rotor angle, rad, shape (n,).
+        waves: v_a ... i_c by name, each of shape (n,).
+
+    Raises:
+        SignalError: a waveform is absent, or fewer than 20 samples or less than a period are given.
+    """
+    t, angle = np.asarray(t, dtype=float), np.unwrap(np.asarray(theta_e, dtype=float))
+    missing = [n for n in PHASORS.values() if n not in waves]
+    turn = abs(float(angle[-1] - angle[0])) / (2 * math.pi) if angle.size else 0.0
+    if missing or t.size < 20 or turn < LEAST:
+        raise SignalError(
+            f"waveforms over a period or more are needed, 20 samples at least; {t.size} over "
+            f"{turn:.3g} periods given" + (f", without {', '.join(missing)}" if missing else "")
+        )
+    tau = (t - t[0]) / (t[-1] - t[0])
+    means = {}
+    for name in wanted(phasors=True, short=False, symmetric=False):
+        q = Term.of(name)
+        value = 1.0 if q.base == "1" else np.asarray(waves[q.base], dtype=float) ** q.power
+        wave = window(tau) * value * (getattr(np, q.trig)(q.k * angle) if q.trig else 1.0)
+        means[name] = np.array([np.sum((wave[1:] + wave[:-1]) / 2.0 * np.diff(tau))])
+    found = settled(means, turn=turn, symmetric=False, phasors=True)
+    rows = np.concatenate([found, sequences(found[len(RMS) :])])[:, 0]
+    return dict(zip((*RMS, *PARTS, *SEQUENCES), rows.tolist(), strict=True))
 
 
 def as_dict(names: Sequence[str], means: np.ndarray) -> dict[str, np.ndarray]:

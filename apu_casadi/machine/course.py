@@ -17,7 +17,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -34,7 +34,7 @@ from apu_casadi.machine.propagation import Propagator
 DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
 TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
 DEEPEST = 16  # times that an interval may be halved
-_INSIDE = 1e-6  # share of an interval that nodes keep from its ends, where profiles may jump
+_INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 
 F = TypeVar("F", MeanStep, Propagator)
 
@@ -73,12 +73,18 @@ class Piece(Generic[F]):
     powers: np.ndarray
     nodes: np.ndarray
     rates: np.ndarray
+    buffers: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
 
     def at(self, s: np.ndarray) -> np.ndarray:
-        """Return all numbers at values of the coordinate, (numbers, steps)."""
-        x = (s - self.middle) / self.half
-        basis = np.polynomial.chebyshev.chebvander(x, self.powers.shape[0] - 1)
-        return np.asarray((basis @ self.powers).T)
+        """Return all numbers at values of the coordinate, (numbers, steps).
+
+        The next call for as many steps overwrites them: new memory costs as much as the sums.
+        """
+        x = np.clip((s - self.middle) / self.half, -1.0, 1.0)
+        basis = np.cos(np.arccos(x)[:, None] * np.arange(self.powers.shape[0]))
+        if s.size not in self.buffers:
+            self.buffers[s.size] = np.empty((s.size, self.powers.shape[1]))
+        return np.matmul(basis, self.powers, out=self.buffers[s.size]).T
 
 
 class Course(Generic[F]):
@@ -138,6 +144,8 @@ class Course(Generic[F]):
     def numbers(self, t: np.ndarray, before: float | None = None) -> tuple[F, Numbers]:
         """Return what propagates over steps whose middles are ``t``, s, and its numbers.
 
+        The next call overwrites the numbers.
+
         Args:
             before: the middle of the step before them, if the first goes on from it.
 
@@ -146,26 +154,37 @@ class Course(Generic[F]):
                 those of the steps differ in structure.
         """
         s = self._coordinate(np.asarray(t, dtype=float))
-        pieces = [self._piece(float(v)) for v in s]
-        if any(p.fast.layout != pieces[0].fast.layout for p in pieces):
-            raise NotApplicable(f"{self.ss.name}: the structure changes on the way")
-        first = s[:1] if before is None else self._coordinate(np.array([before]))
-        moved = np.abs(np.diff(s, prepend=first)).tolist()
-        rates = (float(np.interp(v, p.nodes, p.rates)) for p, v in zip(pieces, s, strict=True))
-        jump = max(r * d for r, d in zip(rates, moved, strict=True))
+        pieces = [self._piece(float(v)) for v in (s.min(), s.max())]
+        alone = pieces[0] is pieces[1]
+        if not alone:
+            pieces = [self._piece(float(v)) for v in s]
         fast = pieces[0].fast
+        if any(p.fast.layout != fast.layout for p in pieces[1:]):
+            raise NotApplicable(f"{self.ss.name}: the structure changes on the way")
+        first = s[0] if before is None else self._coordinate(np.array([before]))[0]
+        jump = self._jump(pieces, s, float(first))
         if jump > fast.smooth:
             raise NotApplicable(
                 f"{self.ss.name}: load or fault change by {jump:.1e} of the transition matrices "
                 f"in a step, {fast.smooth:g} at most"
             )
-        if all(p is pieces[0] for p in pieces):
+        if alone:
             values = pieces[0].at(s)
         else:
-            columns = [p.at(s[k : k + 1]) for k, p in enumerate(pieces)]
+            columns = [p.at(s[k : k + 1]).copy() for k, p in enumerate(pieces)]
             values = np.concatenate(columns, axis=1)
-        sizes = (fast.vector.size, len(self.ss.u), fast.theta.size)
-        return fast, Numbers(*np.split(values, np.cumsum(sizes)))
+        a = fast.vector.size
+        b = a + len(self.ss.u)
+        c = b + fast.theta.size
+        return fast, Numbers(values[:a], values[a:b], values[b:c], values[c:])
+
+    def _jump(self, pieces: list[Piece[F]], s: np.ndarray, first: float) -> float:
+        """Return a bound of the largest change of a transition matrix from step to step."""
+        moved = s.copy()
+        moved[0] -= first
+        moved[1:] -= s[:-1]
+        rates = (np.interp(s, p.nodes, p.rates) for p in (pieces[0], pieces[-1]))
+        return float((np.maximum(*rates) * np.abs(moved)).max())
 
     def _piece(self, s: float) -> Piece[F]:
         """Return the polynomials around a value of the coordinate, made when first asked for."""
@@ -190,7 +209,7 @@ class Course(Generic[F]):
     def _fitted(self, a: float, b: float) -> Piece[F] | None:
         """Return the polynomials of [a, b]; None where none of ``DEGREES`` is enough."""
         middle, half = (a + b) / 2, (b - a) / 2
-        reach, made = half * (1 - _INSIDE), dict[float, F]()
+        reach, made = half * (1 - _INSIDE), dict[float, tuple[F, np.ndarray]]()
         for degree in DEGREES:
             nodes: np.ndarray = _lobatto(degree)
             between: np.ndarray = _lobatto(2 * degree)[1::2]
@@ -205,6 +224,8 @@ class Course(Generic[F]):
                     self._table(middle + reach * x, made, x, harmonics=harmonics) for x in wanted
                 ]
             fast = tables[0][0]
+            if any(t[0].layout != fast.layout for t in tables):
+                raise NotApplicable(f"{self.ss.name}: its symmetry changes on the way")
             values = np.array([v for _, v in tables])
             fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
             powers = fit @ values[: degree + 1]
@@ -222,11 +243,11 @@ class Course(Generic[F]):
         return None
 
     def _table(
-        self, s: float, made: dict[float, Any], x: float, *, harmonics: int = 0
+        self, s: float, made: dict[float, tuple[F, np.ndarray]], x: float, *, harmonics: int = 0
     ) -> tuple[F, np.ndarray]:
         """Return what propagates at a value of the coordinate, and all of its numbers."""
         if x in made:
-            return made[x]  # type: ignore[no-any-return]
+            return made[x]
         load, fault = self._made(self.load, s), self._made(self.fault, s)
         ss, theta = self.gen.variant(load, fault), self.gen.fault_vector(load, fault)
         if ss != self.ss:
@@ -236,7 +257,7 @@ class Course(Generic[F]):
         severity = [] if fault is None else list(fault.severity.values())
         severity = [0.0 if math.isnan(v) else v for v in severity]
         made[x] = fast, np.concatenate([fast.vector, u, fast.theta, severity])
-        return made[x]  # type: ignore[no-any-return]
+        return made[x]
 
 
 def _lobatto(degree: int) -> np.ndarray:

@@ -365,20 +365,24 @@ class Generator(Parametric):
             _, then = ac5a.exciter_steady(e, E_fd=E + (h := 1e-6), V_t=V_t / p.V_rated_rms)
             return now - value, 1.0 / p.V_rated_rms, (then - now) / h
 
+        def at_rest(V_t: float, E: float) -> tuple[dict[str, float], float]:
+            states, ref = ac5a.exciter_steady(e, E_fd=E, V_t=V_t / p.V_rated_rms)
+            return {n: v for n, v in states._asdict().items() if v is not None}, ref
+
         held = self.excitation == "constant"
         E = value / p.V_fd_base if name == "V_fd" else states.E_fd
         ref = value if name == "V_ref" else ref
         u = self.inputs(load, w_r=w_r, V_ref=ref)
-        closing = Closing(held, E, ref, name == ("V_fd" if held else "V_ref"), miss)
+        exact = name == ("V_fd" if held else "V_ref")
+        closing = Closing(held, E, ref, exact, miss, at_rest)
         reversing = ("lam_s0", *(fault.reversing if fault else ()), *load.reversing)
         found = solve_periodic(ss, x, u, vector, closing, reversing)
         states_ = found.x
         V_t = Turn.of(ss, states_, u, vector).mean("V_t")
         if held:  # the regulator is not there; its states are those of a field at rest
-            at, ref = ac5a.exciter_steady(e, E_fd=found.value, V_t=V_t / p.V_rated_rms)
-            for n, v in at._asdict().items():
-                if v is not None:
-                    states_[ss.x.index(n)] = v
+            at, ref = at_rest(V_t, found.value)
+            for n, v in at.items():
+                states_[ss.x.index(n)] = v
         else:
             ref = found.value
         u = self.inputs(load, w_r=w_r, V_ref=ref)

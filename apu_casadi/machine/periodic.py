@@ -98,6 +98,7 @@ class Closing(NamedTuple):
         E_fd, V_ref: field voltage and reference, per unit: first guesses, ...
         exact: ... or whether that of the two which acts is given exactly.
         miss: (mean V_t in V, mean E_fd) -> what must vanish, per unit, and its derivatives by both.
+        at_rest: of the same, states of the exciter by name and the reference, if nothing rippled.
     """
 
     held: bool
@@ -105,6 +106,7 @@ class Closing(NamedTuple):
     V_ref: float
     exact: bool
     miss: Callable[[float, float], tuple[float, float, float]]
+    at_rest: Callable[[float, float], tuple[dict[str, float], float]]
 
 
 class Periodic(NamedTuple):
@@ -141,9 +143,12 @@ def solve_periodic(
     signs, start = _signs(ss, u, theta, reversing), float(x[ss.x.index("theta_e")])
     X, value, half = x[:, None], closing.E_fd, NODES[0]
     if not closing.held:  # with a constant field of the voltage wanted first: it is nearly linear
-        first = closing._replace(held=True, exact=False)
-        X, E_fd, half, _ = _refined(_Problem(ss, u, theta, first, signs), X, value, start, half)
-        X[ss.x.indices(["E_fd", "x_F1"])], value = E_fd, closing.V_ref
+        held = _Problem(ss, u, theta, closing._replace(held=True, exact=False), signs)
+        X, E_fd, half, _ = _refined(held, X, value, start, half)
+        states, value = closing.at_rest(held.voltage(X, E_fd), E_fd)
+        for n, v in states.items():
+            X[ss.x.index(n)] = v
+        value = closing.V_ref if closing.exact else value
     problem = _Problem(ss, u, theta, closing, signs)
     X, value, half, (defect, worst) = _refined(problem, X, value, start, half)
     if not defect <= ACCEPTED:  # a limit met and left within the turn
@@ -238,6 +243,10 @@ class _Problem:
         m = len(self.free)
         return f, V_t.ravel(), J.reshape(m + 1, n, m + 1).transpose(1, 0, 2)
 
+    def voltage(self, X: np.ndarray, value: float) -> float:
+        """Return the mean terminal voltage, V."""
+        return float(self._at(X, value)[1].mean())
+
     def newton(self, X: np.ndarray, value: float, start: float) -> tuple[np.ndarray, float]:
         """Solve for the nodes; damped where the residual would grow."""
         n, m, nominal = X.shape[1], len(self.free), self.nominal
@@ -257,7 +266,11 @@ class _Problem:
 
         r, J = residual(X, value)
         for _ in range(_STEPS):
-            step, size, share = np.linalg.solve(J, -r), np.abs(r).max(), 1.0
+            size, share = np.abs(r).max(), 1.0
+            try:
+                step = np.linalg.solve(J, -r)
+            except np.linalg.LinAlgError:  # at a limit of the regulator nothing acts
+                break
             while True:
                 new = X.copy()
                 new[self.free] += share * step[:-1].reshape(m, n) * nominal[:, None]

@@ -30,7 +30,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.errors import ParameterError, SignalError
+from apu_casadi.core.errors import SignalError
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
@@ -173,7 +173,7 @@ def generator_vectors(
     """Return the averaged generator of a steady point, and x, u, theta (healthy) there.
 
     Raises:
-        SignalError: the point's load is not balanced.
+        SignalError: the point's load is not balanced, or it has a fault.
     """
     u_full = point.ss.u.unpack(point.u)
     ss = averaged_generator(gen, load_kind(point))
@@ -187,6 +187,8 @@ def generator_vectors(
                 f"{', '.join(f'{p:g}' for p in phases)} {ss.u[n].unit} in phases a, b, c"
             )
         values[n] = phases[0]
+    if not point.balanced:
+        raise SignalError("the averaged generator needs a healthy steady point, without a fault")
     x = ss.x.pack({n: x_full[n] for n in ss.x.names})
     return ss, x, ss.u.pack(values), np.zeros(len(ss.theta))
 
@@ -283,13 +285,12 @@ def joint_vectors(
 
     Raises:
         SignalError: the point's load is not balanced.
-        ParameterError: the generators differ, or their loads or faults at this point do.
+        ParameterError, OperatingPointError: the generators differ, or their loads.
     """
     apu.refuse_different("the averaged unit")
-    if point.others:
-        raise ParameterError("the averaged unit needs generators of equal load and fault")
-    gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, point.generator)
-    ss = joint_averaged(apu, load_kind(point.generator), free)
+    at = point.common("the averaged unit")
+    gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, at)
+    ss = joint_averaged(apu, load_kind(at), free)
     gas = GasGenerator.U.unpack(point.gas.u)
     values: Mapping[str, float] = {
         **{n: gas[n] for n in AMBIENT},

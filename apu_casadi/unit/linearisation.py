@@ -424,6 +424,7 @@ def linearise_joint(apu: Apu, point: JointPoint, free: Sequence[str] = ()) -> Li
 
     Raises:
         SignalError: unknown parameters, or some on which nothing depends.
+        ParameterError, OperatingPointError: the generators differ, or their loads.
     """
     ss, x, u, theta = joint_vectors(apu, point, tuple(free))
     equations = joint_equations(apu, load_kind(point.generator), tuple(free))

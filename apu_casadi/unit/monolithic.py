@@ -190,6 +190,7 @@ def simulate_monolithic(
     run(system, grid, events, record=record, progress=progress)
     gg = apu.gas_generator
     values = dict(zip((*gg.Y.names, *MEANS, *RMS), rows, strict=True))
+    values["P_total"] *= n / 2  # the model's is the power of two
     told = runrecord.asked(start=start, events=events)
     attrs = {**system.how, "nsteps": system.nsteps, **told}
     ds = dataset({"time": grid}, {"time": values}, signals=gg.Y, attrs=attrs)

@@ -60,8 +60,10 @@ __all__ = [
     "N_WALK",
     "GasPathFilter",
     "gas_path_filter",
+    "jumps_at",
     "null_direction",
     "samples",
+    "true_readings",
     "window_means",
 ]
 
@@ -165,12 +167,7 @@ class GasPathFilter(Parametric):
         Raises:
             DataError: the run has no samples 20 ms apart, or lacks a signal; a wrong length.
         """
-        t, rows = samples(ds)
-        time = np.asarray(ds["time"].values, float)
-        needed = {n for s in self.sensors.sensors for n in s.reads}
-        there = {n: np.asarray(ds[n].values, float) for n in needed}
-        truth = {n: v[rows] for n, v in self.sensors.true(time, there).items()}
-        truth["PW"] = window_means(time, ds["PW"].values, t)
+        t, truth = true_readings(self.sensors, ds)
         return self.measured(
             t,
             truth,
@@ -204,20 +201,50 @@ class GasPathFilter(Parametric):
             self.sensors[n]
         # every sensor draws, so that the noise of one does not hang on what else is used
         reading = self.sensors.measure(self.sensors.true(t, truth), rng, gains=gains)
-        # what a filter can know: the reading's own standard deviation
-        sigma = {n: np.broadcast_to(self.sensors.sigma(n, v), v.shape) for n, v in reading.items()}
-        if power is not None:
-            reading["PW"], sigma["PW"] = (_windows(v, t.size) for v in power)
-        inputs: dict[str, Any] = {"jump": (t, _jumps_at(t, dict.fromkeys(jumps, JUMP)))}
+        known = power and (t, _windows(power[0], t.size), _windows(power[1], t.size))
+        inputs: dict[str, Any] = {"jump": (t, jumps_at(t, dict.fromkeys(jumps, JUMP)))}
         if power_jumps:
-            inputs["jump_PW"] = (t, _jumps_at(t, power_jumps))
+            inputs["jump_PW"] = (t, jumps_at(t, power_jumps))
+        streams = {n: (t, v) for n, v in reading.items()}
+        return self.of_readings(streams, power=known, inputs=inputs | dict(ambient or {}))
+
+    def of_readings(
+        self,
+        readings: Mapping[str, tuple[np.ndarray, np.ndarray]],
+        *,
+        power: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+        inputs: Mapping[str, Any] | None = None,
+        max_dt: float = math.inf,
+    ) -> Recording:
+        """Make the filter's recording from readings as they are, each with its own instants.
+
+        Args:
+            readings: ``{name: (t, values)}`` by sensor; what the filter does not take is left out.
+            power: instants, shaft power and its standard deviation, instead of the sensor's.
+            inputs: others by name, ambient conditions among them, as
+                :func:`estimators.models.recording.record` takes them.
+            max_dt: longest step of the filter, s.
+
+        Raises:
+            DataError: as :func:`estimators.models.recording.record`.
+        """
+        # what a filter can know: the reading's own standard deviation
+        sigma = {
+            n: np.broadcast_to(self.sensors.sigma(n, v), v.shape)
+            for n, (_, v) in readings.items()
+            if n in self.sensors
+        }
+        held: dict[str, Any] = {}
         for n in ("Wf", "PW") if self.known_power else ("Wf",):
-            inputs |= {n: (t, reading[n]), f"sigma_{n}": (t, sigma[n])}
+            t, v, s = power if n == "PW" and power is not None else (*readings[n], sigma[n])
+            held |= {n: (t, v), f"sigma_{n}": (t, s)}
+        outputs = {n: readings[n] for n in self.model.y.names if n in readings}
         return record(
             self.model,
-            outputs={n: (t, reading[n]) for n in self.model.y.names},
-            sigma={n: sigma[n] for n in self.model.y.names},
-            inputs={**inputs, **DEFAULT_DAY, **(ambient or {})},
+            outputs=outputs,
+            sigma={n: sigma[n] for n in outputs},
+            inputs={**held, **DEFAULT_DAY, **(inputs or {})},
+            max_dt=max_dt,
         )
 
     def run(
@@ -341,6 +368,21 @@ def samples(ds: xr.Dataset, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
     return t, rows
 
 
+def true_readings(sensors: SensorSet, ds: xr.Dataset) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the filter's instants in a joint run, and what the sensors would read without errors.
+
+    The shaft power is the mean of the window from an instant to the next.
+
+    Raises:
+        DataError: the run has no samples 20 ms apart.
+    """
+    t, rows = samples(ds)
+    time = np.asarray(ds["time"].values, float)
+    there = {n: np.asarray(ds[n].values, float) for s in sensors.sensors for n in s.reads}
+    truth = {n: v[rows] for n, v in sensors.true(time, there).items()}
+    return t, truth | {"PW": window_means(time, ds["PW"].values, t)}
+
+
 def window_means(time: np.ndarray, held: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Means over [t(k), t(k+1)] of a quantity that is held over each step before ``time``, (K,).
 
@@ -351,7 +393,7 @@ def window_means(time: np.ndarray, held: np.ndarray, t: np.ndarray) -> np.ndarra
     return np.append(mean, mean[-1])
 
 
-def _jumps_at(t: np.ndarray, sizes: Mapping[float, float]) -> np.ndarray:
+def jumps_at(t: np.ndarray, sizes: Mapping[float, float]) -> np.ndarray:
     """Size of the jumps in the step from each instant to the next, shape (K,)."""
     jump = np.zeros(t.size)
     for when, size in sizes.items():

@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import dataset
+from apu_casadi.core.results import GENERATOR, dataset
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
@@ -41,7 +41,14 @@ from estimators.apu.electrical.electricalfilter import ElectricalFilter, electri
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import FAULT_LEVEL
-from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples, window_means
+from estimators.apu.gaspath import (
+    GasPathFilter,
+    gas_path_filter,
+    jumps_at,
+    samples,
+    true_readings,
+    window_means,
+)
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
@@ -54,13 +61,17 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ETA_SIGMA",
+    "ElectricalSide",
     "JointCase",
     "better_speed",
     "cross_talk",
     "electrical_samples",
+    "electrical_side",
     "estimate_joint",
+    "fused",
     "joint_case",
     "speed_from_generators",
+    "unit_of",
 ]
 
 ETA_SIGMA = 0.02  # relative; efficiency of the generators
@@ -93,14 +104,30 @@ def electrical_samples(
         gains: actual relative gain errors by sensor.
 
     Raises:
-        DataError: the run has no waveforms.
+        DataError: the run has no waveforms, or its generators differ.
     """
+    if GENERATOR in ds.dims:
+        raise DataError("the joint filter takes generators that are alike; those of the run differ")
     if "time_w" not in ds:
         raise DataError("the run has no waveforms; simulate with waveform_dt=1e-4")
     t = np.asarray(ds["time_w"].values, float)
     truth = {n: np.asarray(ds[n].values, float) for n in GAIN_SENSORS}
     truth["w_r"] = np.asarray(apu.w_r(np.interp(t, ds["time"].values, ds["N"].values)))
     return {"t": t} | sensors.measure(truth, rng, gains=gains)
+
+
+def unit_of(apu: Apu, number: int) -> Apu:
+    """Return the unit with one of its generators, by number from 1, in place of all.
+
+    Raises:
+        DataError: there is no such generator.
+    """
+    if not 1 <= number <= len(apu.machines):
+        raise DataError(f"generator {number}: the unit has {len(apu.machines)}")
+    if apu.alike:
+        return apu
+    generator, coupling = apu.machines[number - 1]
+    return dataclasses.replace(apu, generator=generator, coupling=coupling, others=None)
 
 
 def loosened(sensors: SensorSet) -> SensorSet:
@@ -147,42 +174,65 @@ def better_speed(filt: GasPathFilter, data: Recording, N: np.ndarray, s: np.ndar
     """Replace the sensor's speed by its weighted mean with another measurement."""
     i = filt.model.y.index("N")
     y, variance = data.y.copy(), data.variance.copy()
-    there = np.isfinite(s)
-    weight = 1 / variance[i] + np.where(there, 1 / np.where(there, s, 1.0) ** 2, 0.0)
-    y[i] = (y[i] / variance[i] + np.where(there, N / np.where(there, s, 1.0) ** 2, 0.0)) / weight
-    variance[i] = 1 / weight
+    own, there = np.isfinite(y[i]), np.isfinite(s)
+    own_weight = np.where(own, 1 / variance[i], 0.0)
+    weight = own_weight + np.where(there, 1 / np.where(there, s, 1.0) ** 2, 0.0)
+    total = np.where(own, y[i] / variance[i], 0.0)
+    total = total + np.where(there, N / np.where(there, s, 1.0) ** 2, 0.0)
+    known = weight > 0
+    y[i] = np.where(known, total / np.where(known, weight, 1.0), np.nan)
+    variance[i] = 1 / np.where(known, weight, 1.0)
     return Recording(data.t, data.u, y, variance, data.p)
 
 
 @dataclass(frozen=True, eq=False)
-class _Electrical:
-    """What the electrical filters say at the K instants of the gas path.
+class ElectricalSide:
+    """What the electrical filters of one machine say at K instants, 20 ms apart.
 
-    ``P``, ``variance``: of the K - 1 windows; ``severities``: h and its standard deviation by
-    phase, (2, 3, K); ``phase``: found faulty, 0 for none, (K,); ``found_at``: windows from which on
-    the power is that of a filter with a fault; ``resets``, s.
+    Args:
+        t: the instants, s.
+        P, variance: mechanical power of both generators over the K - 1 windows, and its variance.
+        severities: h and its standard deviation by phase, (2, 3, K).
+        phase: found faulty, 0 for none, (K,).
+        found_at: windows from which on the power is that of a filter with a fault.
+        resets: instants, s, at which the machine changed.
+        result: of the filter with the three h, at every sample; without them, of the healthy
+            machine's.
     """
 
+    t: np.ndarray
     P: np.ndarray
     variance: np.ndarray
     severities: np.ndarray
     phase: np.ndarray
     found_at: tuple[int, ...]
     resets: tuple[float, ...]
+    result: FilterResult
 
 
-def _electrical_side(
+def electrical_side(
     apu: Apu,
     sensors: SensorSet,
     measured: Mapping[str, np.ndarray],
     t: np.ndarray,
     *,
-    ttsc: bool,
-    gain_errors: bool,
-    step: StepMaker,
-    backend: str | None,
-) -> _Electrical:
-    """Run the electrical filters and put together what is known causally."""
+    ttsc: bool = True,
+    gain_errors: bool = True,
+    step: StepMaker = ekf_step,
+    backend: str | None = None,
+) -> ElectricalSide:
+    """Run the electrical filters and put together what is known causally.
+
+    Args:
+        apu: the unit as the filters know it.
+        sensors: 1-sigma table.
+        measured: samples as :meth:`ElectricalFilter.recording` takes them.
+        t: ends of the windows of the mean power, among the instants of the samples.
+        ttsc, gain_errors, step, backend: as for :func:`estimate_joint`.
+
+    Raises:
+        DataError, EstimationError: as the filter; windows that the waveforms do not cover.
+    """
     known = loosened(sensors) if gain_errors else sensors
 
     def filt(phases: tuple[str, ...]) -> ElectricalFilter:
@@ -214,10 +264,10 @@ def _electrical_side(
     K = t.size
     # the inputs are the same for all: made once
     base = filt(()).recording(measured, window=DT, start=float(t[0]))
-    _, P, var, _ = windows((), float(t[0]))
+    healthy, P, var, _ = windows((), float(t[0]))
     severities, phase = np.zeros((2, 3, K)), np.zeros(K, dtype=int)
     if not ttsc:
-        return _Electrical(P, var, severities, phase, (), ())
+        return ElectricalSide(t, P, var, severities, phase, (), (), healthy)
     r, _, _, resets = windows(PHASES, float(t[0]))
     at = np.minimum(np.searchsorted(r.t, t - 1e-9), r.t.size - 1)
     for i, n in enumerate(PHASES):
@@ -235,7 +285,8 @@ def _electrical_side(
         while last + 1 < K and phase[last + 1] == phase[k]:
             last += 1
         P[k - 1 : last], var[k - 1 : last] = (v[k - 1 - first : last - first] for v in (P_k, var_k))
-    return _Electrical(P, var, severities, phase, tuple(k - 1 for k in changes), tuple(resets))
+    found_at = tuple(k - 1 for k in changes)
+    return ElectricalSide(t, P, var, severities, phase, found_at, tuple(resets), r)
 
 
 def _found(severities: np.ndarray, floor: float) -> np.ndarray:
@@ -309,24 +360,82 @@ def estimate_joint(
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
     t, rows = samples(ds)
     measured = electrical_samples(ds, apu, rng, sensors=electrical_sensors, gains=electrical_gains)
-    side = _electrical_side(
+    how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend}
+    also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
+    side = electrical_side(apu, electrical_sensors, measured, t, **also, **how)
+    for n in gas_gains or {}:
+        gas_sensors[n]
+    truth = true_readings(gas_sensors, ds)[1]
+    read = gas_sensors.measure(truth, noise, gains=gas_gains)
+    how |= {"power": power, "eta": eta, "step": step}
+    gas, tracked = fused(
         apu,
-        electrical_sensors,
-        measured,
-        t,
-        ttsc=ttsc,
-        gain_errors=gain_errors,
-        step=electrical_step,
-        backend=backend,
+        [side],
+        {n: (t, v) for n, v in read.items()},
+        gas_sensors,
+        speed=(measured["t"], measured["w_r"]) if speed else None,
+        speed_sigma=electrical_sensors.sigma("w_r", float(np.median(measured["w_r"]))),
+        efficiency_error=(gas_gains or {}).get("PW", 0.0),
+        **how,
     )
-    gas = _gas_filter(apu, gas_sensors, power, gain_errors, eta)
-    slow = _gas_recording(gas, apu, ds, noise, t, side, gas_gains or {})
-    if speed:
-        w_sigma = electrical_sensors.sigma("w_r", float(np.median(measured["w_r"])))
-        other = speed_from_generators(measured["t"], measured["w_r"], w_sigma, t, apu)
-        slow = better_speed(gas, slow, *other)
-    tracked = track_jumps(gas, slow, test=TEST, step=step, backend=backend)
     return _as_dataset(ds, t, rows, side, gas, tracked)
+
+
+def fused(
+    apu: Apu,
+    sides: Sequence[ElectricalSide],
+    readings: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    sensors: SensorSet = GAS_PATH,
+    *,
+    speed: tuple[np.ndarray, np.ndarray] | None = None,
+    speed_sigma: float = math.nan,
+    power: bool = True,
+    efficiency_error: float = 0.0,
+    prior: Mapping[str, float] | None = None,
+    inputs: Mapping[str, Any] | None = None,
+    eta: float = ETA_SIGMA,
+    gain_errors: bool = True,
+    step: StepMaker | None = None,
+    backend: str | None = None,
+    max_dt: float = math.inf,
+) -> tuple[GasPathFilter, Tracked]:
+    """Run the gas-path filter with what the electrical filters say.
+
+    Args:
+        apu: the unit as the filters know it.
+        sides: of one machine, which stands for both, or of the two, on the same instants.
+        readings: ``{name: (t, values)}`` by gas-path sensor.
+        sensors: 1-sigma table of the gas path.
+        speed: instants and samples of a generator's speed pick-up.
+        speed_sigma: standard deviation of each of them.
+        power: whether the filter gets the shaft power.
+        efficiency_error: actual relative error of the generators' efficiency.
+        prior: means of the start by state.
+        inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
+        eta, gain_errors, step, backend: as for :func:`estimate_joint`.
+    """
+    gas = _gas_filter(apu, sensors, power, gain_errors, eta)
+    t, n = sides[0].t, len(sides)
+    # one measurement of shaft power for each window, eq. (1)
+    mean = apu.PW(sum(s.P for s in sides) / n) * (1 + efficiency_error)
+    sigma = np.sqrt(sum(s.variance for s in sides)) / n / apu.coupling.eta_gtSg
+    # the loss that belongs to the error of h, of both machines; the fault is a shunt r_s/h
+    machine = apu.generator.machine
+    ghost = 2 * machine.V_rated_rms**2 / machine.r_s / machine.eta_sg * H_GAIN
+    found_at = {k for s in sides for k in s.found_at}
+    new = {float(t[k]): float(np.hypot(sigma[k], ghost) / mean[k]) for k in found_at}
+    inputs = dict(inputs or {})
+    if "jump_PW" in gas.model.u.names and new:
+        inputs["jump_PW"] = (t, jumps_at(t, new))
+    mean, sigma = (np.append(v, v[-1]) for v in (mean, sigma))
+    data = gas.of_readings(readings, power=(t, mean, sigma), inputs=inputs, max_dt=max_dt)
+    if speed is not None:
+        rows = np.isfinite(data.y).any(axis=0)
+        N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
+        N[rows], N_sigma[rows] = speed_from_generators(*speed, speed_sigma, data.t[rows], apu)
+        data = better_speed(gas, data, N, N_sigma)
+    start = gas.prior(**(prior or {}))
+    return gas, track_jumps(gas, data, test=TEST, prior=start, step=step, backend=backend)
 
 
 def _gas_filter(
@@ -344,31 +453,11 @@ def _gas_filter(
     )
 
 
-def _gas_recording(
-    gas: GasPathFilter,
-    apu: Apu,
-    ds: xr.Dataset,
-    rng: np.random.Generator | None,
-    t: np.ndarray,
-    side: _Electrical,
-    gains: Mapping[str, float],
-) -> Recording:
-    """The gas path's recording, with one measurement of shaft power for each window, eq. (1)."""
-    mean = apu.PW(side.P) * (1 + gains.get("PW", 0.0))
-    sigma = np.sqrt(side.variance) / apu.coupling.eta_gtSg
-    # the loss that belongs to the error of h, of both machines; the fault is a shunt r_s/h
-    machine = apu.generator.machine
-    ghost = 2 * machine.V_rated_rms**2 / machine.r_s / machine.eta_sg * H_GAIN
-    new = {float(t[k]): float(np.hypot(sigma[k], ghost) / mean[k]) for k in side.found_at}
-    jumps = new if "jump_PW" in gas.model.u.names else None
-    return gas.recording(ds, rng, gains=gains, power=(mean, sigma), power_jumps=jumps)
-
-
 def _as_dataset(
     ds: xr.Dataset,
     t: np.ndarray,
     rows: np.ndarray,
-    side: _Electrical,
+    side: ElectricalSide,
     gas: GasPathFilter,
     tracked: Tracked,
 ) -> xr.Dataset:

@@ -1,5 +1,6 @@
-"""Estimate faults with confidence: along a joint run, and in studies over many random runs.
+"""Estimate faults with confidence: from recordings, along a joint run, and in studies.
 
+apu estimate data FILE...          what a recording's channels suffice for
 apu estimate joint                 along the paper's joint scenario: summary, data, figure
 apu estimate study NAME            one study (or all), kept part by part
 apu estimate page                  ESTIMATION.md from the kept studies
@@ -13,15 +14,18 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from scenarios.commands import given
+from scenarios.commands import given, readingoptions
 from scenarios.shell import jsontext, usage
 from scenarios.shell.progress import bar, moving
 from scenarios.studies.estimation import names
 
+if TYPE_CHECKING:
+    from estimators.apu.recordings.measured import Measurements
+
 NAME = "estimate"
-HELP = "estimate faults with confidence: joint run, studies, their page"
+HELP = "estimate faults with confidence: recordings, joint run, studies, their page"
 KEPT = "docs/estimation"
 
 
@@ -34,6 +38,18 @@ _JOINT = f"""
 --figures =on               | draw truth, estimate and band (default)
 --json                      | print the summary as JSON only
 --quiet                     | no progress bar, no list of files
+"""
+_DATA = f"""
+files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or both
+{given.UNIT}
+{readingoptions.OPTIONS.strip()}
+--only {{gaspath,electrical}} | one of the two
+--sensors FILE | noise and gain of sensors (TOML, as apu measure); default: apu estimate sensors
+{given.ambient_options("a column, what the run file says, else ")}
+--out DIR      | keep estimates, JSON and figure there
+--figures =on  | draw estimates and bands into it (default)
+--json         | print JSON only
+--quiet        | no list of files
 """
 _STUDY = f"""
 study NAME    | all, or one of {", ".join(names())}
@@ -55,9 +71,10 @@ _SENSORS = f"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the four actions."""
+    """Declare the actions."""
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     for name, call, table in (
+        ("data", _data, _DATA),
         ("joint", _joint, _JOINT),
         ("study", _study, _STUDY),
         ("page", _page, _PAGE),
@@ -79,6 +96,60 @@ def run(args: argparse.Namespace) -> int:
     """Do what was asked for."""
     status: int = args.action(args)
     return status
+
+
+# ------------------------------------------------------------------------------ data
+
+
+def _data(args: argparse.Namespace) -> int:
+    """Estimate from recorded data what its channels suffice for, with bands and verdicts."""
+    from apu_casadi.core import results
+    from apu_casadi.core.files import save_figure, write_text
+    from estimators.apu.measuring import read_sensors
+    from estimators.apu.recorded_estimate import estimate
+    from estimators.apu.recordings.measured import read_recording
+    from scenarios import registry
+    from scenarios.figures.recordedplot import plot_recorded
+    from scenarios.shell import progress
+
+    apu = given.engine_file(args).unit
+    reading, mapping = readingoptions.reading(args, apu.gas_generator)
+    columns = {n: c if u is None else f"{c}:{u}" for n, (c, u) in mapping.items()}
+    m = read_recording(*args.files, columns=columns, reading=reading)
+    sensors = read_sensors(args.sensors)
+    progress.tell(f"estimating from {', '.join(m)}", quiet=args.quiet or args.json)
+    e = estimate(
+        m,
+        apu,
+        only=args.only,
+        sensors=sensors.gas_path.including(*m.gaspath),
+        electrical_sensors=sensors.electrical,
+        ambient=_day(args, m),
+    )
+    report = e.report() | {"files": args.files, **given.own(args), **given.assumed(args)}
+    made = []
+    if args.out is not None:
+        folder = registry.prepare(args.out)
+        made = [results.save(d, folder / f"estimate_{n}.nc") for n, d in e.datasets().items()]
+        made.append(write_text(folder / "estimate.json", jsontext.dumps(report) + "\n"))
+        if args.figures:
+            note = f"{', '.join(args.files)}; {given.program(args)}."
+            made.append(save_figure(plot_recorded(e, note), folder / "estimate.png"))
+    if args.json:
+        jsontext.show(report)
+        return 0
+    print(e.summary())
+    if made and not args.quiet:
+        given.written(made)
+    return 0
+
+
+def _day(args: argparse.Namespace, m: Measurements) -> dict[str, float]:
+    """Ambient conditions of the options, and of run files where no column has them."""
+    from estimators.apu.recordings.runfiles import recorded_ambient
+
+    said = {n: v for f in args.files for n, v in recorded_ambient(f).items() if n not in m}
+    return said | {n: v for n, v in given.ambient_given(args).items() if v is not None}
 
 
 # ------------------------------------------------------------------------------ joint

@@ -1,7 +1,13 @@
 """Export models for other tools: functions as C99, or an FMU of a model.
 
-apu export c step ekf --out c_code --check
-apu export c generator.f --load 'kind = "RL", power_kW = 90' --fault 'mu = 0.05, k_rf = 20'
+  apu export c step ekf --out c_code --check
+  apu export c generator.f --load 'kind = "RL", power_kW = 90' --fault 'mu = 0.05, k_rf = 20'
+  apu export fmu apu --load 225e3 --out apu.fmu
+
+An FMU has health factors and each fault's parameters as tunable parameters, loads and the day as
+inputs.  A fault whose first parameter is zero is none: so it starts where no --fault is given.  By
+co-simulation the whole unit exchanges power and speed every 20 ms, as the paper does; by model
+exchange it is one continuous model.
 """
 
 from __future__ import annotations

@@ -30,13 +30,12 @@ from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import AMBIENT, CONDITIONS, DEFAULT_DAY, day_words
 from apu_casadi.gaspath.health import HEALTH
-from scenarios.commands import given
+from scenarios.commands import given, readingoptions
 from scenarios.shell import jsontext, progress
 
 if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.fitting import EngineData, EngineFit
-    from estimators.apu.recordings.layout import Reading
     from estimators.apu.recordings.recorded import Table
     from estimators.apu.sensors import SensorSet
     from estimators.batch.fitresult import Profile
@@ -49,22 +48,7 @@ files FILE +           | recorded data (see above)
                        | four health factors)
 {given.UNIT}
 --own A,B =            | gains or biases that each file has for itself
---column NAME=COLUMN[:UNIT] ... | column of another name, or its unit
---columns FILE         | how the files are laid out (TOML): columns, names, units, rate, ...
---names A,B            | names of the columns in order, where the file has none; an empty one
-                       | leaves a column out
---units A,B            | their units, an empty one for SI
---time COLUMN          | time column (default: time, t, Timestamp and the like)
---rate float HZ        | of the rows, where no column is the time
---sort                 | put the rows in the order of time, and join those of one stamp
---barometer PRESSURE   | of the air around, for gauge pressures: 101.3kPa
---encoding NAME        | of text files, such as utf-16
---decimal {{point,comma}} | decimal point or comma
---missing A,B =        | numbers and words that stand for a gap: --missing=-999,off
---exclude-implausible  | leave out readings that cannot be, instead of refusing the file
---range NAME=LOW:HIGH ... | another plausible range, in SI: T5=250:1300
---time-format FORMAT   | of dates, such as %%d.%%m.%%Y %%H:%%M:%%S
---time-zone ZONE       | of dates without one: UTC, Europe/Berlin
+{readingoptions.OPTIONS.strip()}
 --steady               | each row is a steady point
 --sigma NAME=VALUE ... | standard deviation of a sensor: 0.5%% of the reading, or a number with
                        | unit: 3K
@@ -85,13 +69,11 @@ RIDGE = 0.95  # correlation from which a pair is said to be confounded
 def run(args: argparse.Namespace) -> int:
     """Read, fit, print; return 0."""
     from estimators.apu import fitting
-    from estimators.apu.recordings.layout import parse_mapping
     from estimators.apu.recordings.recorded import read_table
     from estimators.apu.recordings.runfiles import recorded_ambient
 
     gg = given.engine(args)
-    reading, mapping = _reading(args, gg)
-    mapping |= parse_mapping(args.column)
+    reading, mapping = readingoptions.reading(args, gg)
     _known_targets(mapping, gg)
     notes: list[str] = []
     tables = [read_table(f, mapping, reading=reading, notes=notes) for f in args.files]
@@ -150,37 +132,6 @@ def _profiles(fit: EngineFit, args: argparse.Namespace) -> list[Profile]:
 
 
 # ------------------------------------------------------------------------------ options
-
-
-def _reading(
-    args: argparse.Namespace, gg: GasGenerator
-) -> tuple[Reading, dict[str, tuple[str, str | None]]]:
-    """Return how files are read that leave a question, and their columns by --columns."""
-    from estimators.apu.recordings.layout import Reading, merged, pressure, read_layout
-    from estimators.apu.recordings.plausible import parse_limits
-
-    base, mapping = read_layout(args.columns) if args.columns else (Reading(), {})
-    own: dict[str, Any] = {n: tuple(_blanks(getattr(args, n))) for n in ("names", "units")}
-    own |= {"encoding": args.encoding, "decimal": args.decimal, "time": args.time}
-    own |= {"time_format": args.time_format, "time_zone": args.time_zone, "rate": args.rate}
-    own |= {"sort": args.sort, "exclude": args.exclude_implausible}
-    own |= {"missing": tuple(map(_number_or_word, given.names(args.missing)))}
-    own |= {"barometer": pressure(args.barometer) if args.barometer else None}
-    limits = {**base.ranges, **parse_limits(args.range)}
-    how = merged(base, Reading(**own))
-    return dataclasses.replace(how, ranges=limits, engine=gg), mapping
-
-
-def _blanks(text: str | None) -> list[str]:
-    """Return the names of ``A,,B``, empty ones among them."""
-    return [n.strip() for n in text.split(",")] if text else []
-
-
-def _number_or_word(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _priors(items: Sequence[str]) -> dict[str, tuple[float, float]]:

@@ -28,6 +28,7 @@ from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios import registry
+from scenarios.pages import shaftpower
 from scenarios.shell.template import Template
 from scenarios.validation.comparison import reference
 from scenarios.validation.paper_figures import HEALTH
@@ -369,6 +370,9 @@ def page() -> str:
     for title, items in ITEMS.items():
         rows = [vars(i) | {"effect": i.effect_text()} for i in items]
         text += [f"## {title}", TEXT.table("table", rows, right=())]
+    text.append(TEXT.text("shaft_power", fixed=shaftpower.fixed_loss()))
+    text.append(TEXT.table("shaft_power table", shaftpower.rows(), right=()))
+    text.append(TEXT.text("shaft_power end"))
     return "\n\n".join(text) + "\n"
 
 

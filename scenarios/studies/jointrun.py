@@ -21,6 +21,7 @@ from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.sharing import last
 from apu_casadi.gaspath.health import HEALTH, HEALTH_FACTORS
+from apu_casadi.machine.machinedata import require_linear
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT
@@ -153,6 +154,12 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
     fine["solver"] = "cvodes"
     unit = registry.unit_for(s)
     unit.refuse_different("the joint estimation")
+    require_linear(unit.generator.machine, "the joint estimation")
+    if unit.generator.power != "paper":
+        raise ScenarioError(
+            f"{s.name}: the joint estimation passes on the shaft power of (8): generator.power "
+            f"must be 'paper', the scenario has {unit.generator.power!r}"
+        )
     ds = simulate_joint(unit, duration=s.duration, progress=progress, **given, **fine)
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)

@@ -19,6 +19,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -71,6 +72,12 @@ class OfPoints(Profile):
         for i, (a, b) in enumerate(itertools.pairwise(self.times), 2):
             if b < a:
                 raise ScenarioError(f"times[{i}]: {b:g} s is before {a:g} s; times go on")
+
+    @cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Times and points, and whether two times are equal."""
+        times = np.array(self.times)
+        return times, np.array(self.points), bool((np.diff(times) == 0).any())
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -203,7 +210,9 @@ class Points(OfPoints):
 
     def values(self, t: np.ndarray) -> np.ndarray:
         """Linear in between; at a jump the later value."""
-        times, points = np.array(self.times), np.array(self.points)
+        times, points, jumps = self.arrays
+        if not jumps:
+            return np.asarray(np.interp(t, times, points))
         k = np.searchsorted(times, t, side="right")  # of the next point
         a, b = np.clip(k - 1, 0, None), np.clip(k, None, times.size - 1)
         span = np.where(times[b] > times[a], times[b] - times[a], 1.0)
@@ -234,8 +243,9 @@ class Steps(OfPoints):
 
     def values(self, t: np.ndarray) -> np.ndarray:
         """The last point that is not later."""
-        k = np.searchsorted(np.array(self.times), t + 1e-12, side="right") - 1
-        return np.array(self.points)[np.clip(k, 0, None)]
+        times, points, _ = self.arrays
+        k = np.searchsorted(times, t + 1e-12, side="right") - 1
+        return np.asarray(points[np.clip(k, 0, None)])
 
     def instants(self, duration: float) -> tuple[float, ...]:
         """The times at which the value changes."""

@@ -56,7 +56,7 @@ from estimators.filters.belief import Belief
 from estimators.models.filtermodel import FilterModel, Unknown, augment
 from estimators.models.recording import SAME_TIME, Recording, plain_numbers
 
-__all__ = ["GAINS", "ElectricalFilter", "electrical_filter"]
+__all__ = ["GAINS", "ElectricalFilter", "electrical_filter", "window_starts"]
 
 #: Harmonics that each channel consists of, for what is missing of it.
 HARMONICS_OF: dict[str, tuple[int, ...]] = dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3))
@@ -133,7 +133,7 @@ class ElectricalFilter(Parametric):
             given |= self._smooth(a, given)
         if self.power:
             given["keep"] = np.ones(t.size)
-            given["keep"][_window_starts(t, 0.02 if window is None else window, start)] = 0.0
+            given["keep"][window_starts(t, 0.02 if window is None else window, start)] = 0.0
         u = self.model.u.pack(given)
         y = np.array([a[n] for n in MEASURED])
         sigma = np.array([[self.sensors.sigma(n, 0.0)] for n in MEASURED])
@@ -323,7 +323,7 @@ def _middles(t: np.ndarray, v: np.ndarray, w_r: np.ndarray, jumped: np.ndarray) 
     return out
 
 
-def _window_starts(t: np.ndarray, window: float, start: float | None) -> np.ndarray:
+def window_starts(t: np.ndarray, window: float, start: float | None) -> np.ndarray:
     """Return the indices of the first instants of the windows."""
     if not window > 0:
         raise DataError(f"window = {window!r} s must be > 0")

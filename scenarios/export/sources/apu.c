@@ -10,15 +10,14 @@
 
 enum { AT_GOVERNOR = AT_X + 1, AT_TUNED = AT_P + N_P - N_TUNED };
 
-/* Take speed, inputs and faults; where a fault has come or gone, its states begin at zero. */
-static void turn(Unit *u, int reset)
+/* Take speed, inputs and faults. */
+static void turn(Unit *u)
 {
   double w_r[N_GENERATORS];
   int k;
   unit_call(u, link_speed, IN(u->v + AT_X), OUT(w_r));
   for (k = 0; k < N_GENERATORS; k++)
-    if (machine_turn(u, k, w_r[k]) && reset)
-      machine_reset(u, k);
+    machine_turn(u, k, w_r[k]);
 }
 
 /* Outputs: of the gas generator, power of all generators, then each with the means that are
@@ -56,7 +55,7 @@ int model_evaluate(Unit *u)
   double x[M_X], rates[M_X], y[N_RAW], theta[G_THETA], in[2 + N_AMBIENT], P[N_GENERATORS];
   double *D = u->v + AT_D;
   int status = FINE, i, k;
-  turn(u, 0);
+  turn(u);
   for (i = 0; i < N_X; i++)
     D[i] = 0.0;
   for (k = 0; k < N_GENERATORS && status == FINE; k++) {
@@ -86,7 +85,10 @@ int model_evaluate(Unit *u)
 
 int model_switch(Unit *u)
 {
-  turn(u, 1);
+  int k;
+  turn(u);
+  for (k = 0; k < N_GENERATORS; k++)
+    machine_reset(u, k);
   return model_start(u);
 }
 
@@ -95,7 +97,7 @@ int model_step(Unit *u, double h)
   double x[M_X], y[N_RAW], theta[G_THETA], after[1 + N_GOVERNOR], z[N_Z], residual;
   double P[N_GENERATORS], states[N_X];
   int status = FINE, i, k, like[N_GENERATORS];
-  turn(u, 0);
+  turn(u);
   for (k = 0; k < N_GENERATORS; k++)
     like[k] = same(u, k) ? MACHINES[k].like : k;
   for (k = 0; k < N_GENERATORS && status == FINE; k++) {

@@ -34,8 +34,8 @@ int model_evaluate(Unit *u)
 
 int model_switch(Unit *u)
 {
-  if (machine_turn(u, 0, u->v[AT_U]))
-    machine_reset(u, 0);
+  machine_turn(u, 0, u->v[AT_U]);
+  machine_reset(u, 0);
   u->machine[0].step = FIRST;
   return FINE;
 }

@@ -8,21 +8,21 @@
 
 #define OWN(u, k, what) MACHINES[k].what[(u)->machine[k].faulty]
 
-/* Take speed, inputs and fault; returns 1 if the fault has come, gone or moved. */
-int machine_turn(Unit *u, int k, double w_r)
+/* Take speed, inputs and fault. */
+void machine_turn(Unit *u, int k, double w_r)
 {
   const Equations *e = &MACHINES[k];
   const double *fault = u->v + AT_P + e->p;
   Machine *m = &u->machine[k];
   const int was = m->faulty;
   double given[M_GIVEN];
-  int n = 0, moved = 0;
+  int n = 0;
   memset(m->u, 0, sizeof m->u);
   m->u[0] = w_r;
   memcpy(m->u + 1, u->v + AT_U + e->u, (size_t)e->n_inputs * sizeof(double));
   m->faulty = fault[0] > 0.0;
   if (e->axis >= 0) {
-    moved = was && m->faulty && m->axis != fault[e->axis];
+    m->moved = m->moved || (was && m->faulty && m->axis != fault[e->axis]);
     m->axis = fault[e->axis];
   }
   if (m->faulty)
@@ -30,14 +30,16 @@ int machine_turn(Unit *u, int k, double w_r)
       given[n] = fault[n];
   memcpy(given + n, e->numbers, (size_t)e->n_numbers * sizeof(double));
   unit_call(u, OWN(u, k, follow), IN(given), OUT(m->theta));
-  return was != m->faulty || moved;
+  m->moved = m->moved || was != m->faulty;
 }
 
+/* Let the states of a fault begin at zero where it has come, gone or moved. */
 void machine_reset(Unit *u, int k)
 {
   int i;
-  for (i = 0; i < MACHINES[k].n_reset; i++)
+  for (i = 0; u->machine[k].moved && i < MACHINES[k].n_reset; i++)
     u->v[AT_X + MACHINES[k].x + MACHINES[k].reset[i]] = 0.0;
+  u->machine[k].moved = 0;
 }
 
 int machine_size(const Unit *u, int k) { return OWN(u, k, size); }

@@ -3,7 +3,7 @@
 #include "unit.h"
 
 /* Generator k without or with its fault, on the states of the faulty one. */
-int machine_turn(Unit *u, int k, double w_r);
+void machine_turn(Unit *u, int k, double w_r);
 void machine_reset(Unit *u, int k);
 int machine_size(const Unit *u, int k);
 double machine_nominal(const Unit *u, int k, int i);

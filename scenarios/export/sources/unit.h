@@ -43,6 +43,7 @@ extern const Equations MACHINES[];
 /* A generator between two switches. */
 typedef struct {
   int faulty;               /* which equations hold */
+  int moved;                /* the fault has come, gone or moved, and its states are old */
   double theta[M_TH];       /* what they take of the parameters */
   double u[M_U];            /* speed, voltage reference, load, noise */
   double step;              /* last step of the integrator, s */

@@ -1,0 +1,146 @@
+"""Symmetrical components of measured waveforms, window by window, and whether they change.
+
+What three currents (or voltages) tell without a model of the machine: in each window a sinusoid is
+fitted to each phase, and with a = exp(2 pi i/3), by Fortescue (1918),
+
+    X_1 = (X_a + a X_b + a^2 X_c)/3,  X_2 = (X_a + a^2 X_b + a X_c)/3,  X_0 = (X_a + X_b + X_c)/3.
+
+X_2/X_1 does not depend on where a window begins.  A short circuit between turns changes it, and so
+do an unbalanced load and a wrong gain: it is no severity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from apu_casadi.core.errors import DataError
+
+__all__ = ["WINDOW", "Sequences", "sequences"]
+
+WINDOW = 0.1  # s, but PERIODS periods at least
+PERIODS = 4
+LEAST = 8  # windows of the reference
+MARGIN = 1.5  # on the threshold: the spread itself is estimated
+TURN = np.exp(2j * math.pi / 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Sequences:
+    """Symmetrical components by window, amplitudes.
+
+    Args:
+        t: ends of the windows, s, (n,).
+        frequency: of each window, Hz, (n,).
+        components: positive, negative and zero sequence, complex, (3, n).
+        sigma: standard deviation of either part of X_2/X_1 by what the sinusoids leave, (n,).
+        reference: windows of the beginning that later ones are compared with; 0: too few for that.
+        alarms: ends of the windows in which a change of X_2/X_1 is found, one for each change, s.
+    """
+
+    t: np.ndarray
+    frequency: np.ndarray
+    components: np.ndarray
+    sigma: np.ndarray
+    reference: int
+    alarms: tuple[float, ...]
+
+    @property
+    def unbalance(self) -> np.ndarray:
+        """X_2/X_1 by window, complex."""
+        return np.asarray(self.components[1] / self.components[0])
+
+
+def sequences(t: np.ndarray, phases: np.ndarray, *, rate: float = 1.0) -> Sequences:
+    """Find the symmetrical components of three phases.
+
+    Args:
+        t: instants, s, (K,).
+        phases: samples of phases a, b, c, NaN where there is none, (3, K).
+        rate: false alarms an hour on a stationary machine, at most.
+
+    Raises:
+        DataError: too short, or no sinusoid in it.
+    """
+    there = np.isfinite(phases).all(axis=0)
+    t, x = np.asarray(t, float)[there], np.asarray(phases, float)[:, there]
+    if t.size < 16:
+        raise DataError(f"{t.size} instants with all three phases: 16 are needed at least")
+    f = _frequency(t, x)
+    length = max(WINDOW, PERIODS / f)
+    n = int((t[-1] - t[0]) / length * (1 + 1e-9))
+    if n < 1:
+        raise DataError(f"{t[-1] - t[0]:.3g} s hold no window of {length:.3g} s")
+    edges = np.searchsorted(t, t[0] + length * np.arange(n + 1) - 1e-9)
+    rows = [(i, j) for i, j in pairwise(edges) if j - i >= 16]
+    found = [_window(t[i:j], x[:, i:j], f) for i, j in rows]
+    if not found:
+        raise DataError("no window has 16 samples of all three phases")
+    freq, parts, sigma = (np.array([v[k] for v in found]) for k in range(3))
+    ends = np.array([t[j - 1] for _, j in rows])
+    ratio = parts[:, 1] / parts[:, 0]
+    reference, alarms = _changes(ratio, sigma, rate * length / 3600)
+    return Sequences(ends, freq, parts.T, sigma, reference, tuple(float(ends[k]) for k in alarms))
+
+
+def _frequency(t: np.ndarray, x: np.ndarray) -> float:
+    """Frequency of the largest line of the space vector, Hz."""
+    step = float(np.median(np.diff(t)))
+    even = np.arange(t[0], t[-1], step)[: 1 << 16]
+    space = sum(np.interp(even, t, v) * TURN**k for k, v in enumerate(x))
+    space = (space - space.mean()) * np.hanning(even.size)
+    size = np.abs(np.fft.fft(space, 4 * even.size))
+    f = float(abs(np.fft.fftfreq(size.size, step)[int(size.argmax())]))
+    if not size.max() > 0 or f * (t[-1] - t[0]) < PERIODS:
+        raise DataError(f"no alternating quantity: its largest line is at {f:.3g} Hz")
+    return f
+
+
+def _phasors(t: np.ndarray, x: np.ndarray, f: float) -> tuple[np.ndarray, float]:
+    """Symmetrical components of a sinusoid in each phase, and what it leaves, rms."""
+    w = 2 * math.pi * f * (t - t[0])
+    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+    c = np.linalg.lstsq(basis, x.T, rcond=None)[0]
+    a, b, z = c[0] + 1j * c[1]
+    # phase b lags by 120 degrees in the positive sequence
+    parts = np.array([a + TURN * b + TURN**2 * z, a + TURN**2 * b + TURN * z, a + b + z]) / 3
+    return parts, float(np.sqrt(np.mean((x.T - basis @ c) ** 2)))
+
+
+def _window(t: np.ndarray, x: np.ndarray, f: float) -> tuple[float, np.ndarray, float]:
+    """Frequency, symmetrical components and noise of X_2/X_1 of one window."""
+    half = t.size // 2
+    for _ in range(2):
+        first, second = (_phasors(t[s], x[:, s], f)[0] for s in (np.s_[:half], np.s_[half:]))
+        k = int(np.abs(first[:2]).argmax())  # the order of the phases may be the other one
+        turned = second[k] / first[k] * np.exp(-2j * math.pi * f * (t[half] - t[0]))
+        f += float(np.angle(turned)) / (2 * math.pi * (t[half] - t[0]))
+    parts, rest = _phasors(t, x, f)
+    if abs(parts[1]) > abs(parts[0]):
+        parts = parts[[1, 0, 2]]
+    return f, parts, rest * math.sqrt(2 / (3 * t.size)) / max(abs(parts[0]), 1e-300)
+
+
+def _changes(ratio: np.ndarray, sigma: np.ndarray, allowed: float) -> tuple[int, list[int]]:
+    """Windows of the reference, and the windows in which the ratio has left it, two in a row."""
+    n, alarms, begin = max(LEAST, ratio.size // 4), list[int](), 0
+    if ratio.size < n + 2:
+        return 0, []
+    # a complex Gaussian with s in either part exceeds c s with probability exp(-c^2/2)
+    level = MARGIN * math.sqrt(2 * math.log(1 / allowed))
+    while begin + n + 2 <= ratio.size:
+        own = ratio[begin : begin + n]
+        middle = complex(np.median(own.real), np.median(own.imag))
+        off = np.concatenate([(own - middle).real, (own - middle).imag])
+        spread = max(1.4826 * float(np.median(np.abs(off))), float(np.median(sigma)))
+        out = np.abs(ratio[begin + n :] - middle) > level * max(spread, 1e-12)
+        twice = np.flatnonzero(out[1:] & out[:-1])
+        if not twice.size:
+            break
+        at = begin + n + int(twice[0]) + 1
+        alarms.append(at)
+        begin = at  # a new reference
+    return n, alarms

@@ -1,0 +1,166 @@
+"""What an estimate from a recording says: over time, in numbers and in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apu_casadi.core.results import dataset
+from apu_casadi.core.signals import Signal
+from apu_casadi.gaspath.health import HEALTH, HEALTH_FACTORS
+from apu_casadi.machine.park import PHASES
+from estimators.apu.electrical.sequences import Sequences
+from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
+from estimators.apu.healthjumps import JumpTest, Tracked
+from estimators.apu.joint import GAIN_SHARE, ElectricalSide
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "SURE",
+    "Z95",
+    "gas_dataset",
+    "gas_report",
+    "machine_report",
+    "sequence_report",
+    "side_dataset",
+    "words",
+]
+
+Z95 = 1.96
+SURE = 3.0  # sigmas from which a factor is said to have changed
+TOLD = 0.7  # share of the prior's sigma above which the data say little of a factor
+
+
+def gas_dataset(filt: GasPathFilter, tracked: Tracked) -> xr.Dataset:
+    """Return speed and health with their sigmas over time; alarms and onsets as attributes."""
+    r = tracked.result
+    names = [
+        n for n in ("N", *HEALTH, "PW", *(f"gain_{g}" for g in filt.gains)) if n in filt.model.x
+    ]
+    values: dict[str, Any] = {"nis": r.nis}
+    signals = [Signal("nis", "1", "normalised innovation squared")]
+    for n in names:
+        x = filt.model.x[n]
+        values[n], values[f"{n}_sigma"] = r[n]
+        signals += [Signal(n, x.unit, x.doc)]
+        signals += [Signal(f"{n}_sigma", x.unit, f"standard deviation of {n}")]
+    e = dataset({"time": r.t}, {"time": values}, signals=signals)
+    e.attrs["alarms"] = json.dumps([float(r.t[k]) for k in tracked.alarms])
+    e.attrs["onsets"] = json.dumps([float(r.t[k]) for k in tracked.onsets])
+    return e
+
+
+def side_dataset(side: ElectricalSide) -> xr.Dataset:
+    """Return severities and power of a machine over time; resets as an attribute."""
+    values: dict[str, Any] = {"faulty_phase": side.phase}
+    signals = [Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c")]
+    rows = {f"h_{p}": side.severities[:, i] for i, p in enumerate(PHASES)}
+    # the gain errors of the sensors are common to all windows
+    sigma = np.hypot(np.sqrt(side.variance), GAIN_SHARE * side.P)
+    rows["P_total"] = np.array([np.append(np.nan, v) for v in (side.P, sigma)])
+    for n, pair in rows.items():
+        unit = "W" if n == "P_total" else "1"
+        doc = f"severity of a short circuit in phase {n[2:]}"
+        doc = "mechanical power of two such machines, mean" if n == "P_total" else doc
+        values[n], values[f"{n}_sigma"] = pair
+        signals += [Signal(n, unit, doc), Signal(f"{n}_sigma", unit, f"standard deviation of {n}")]
+    e = dataset({"time": side.t}, {"time": values}, signals=signals)
+    e.attrs["resets"] = json.dumps([float(v) for v in side.resets])
+    return e
+
+
+def _last(e: xr.Dataset, name: str) -> dict[str, float]:
+    x, s = (float(e[f"{name}{end}"].values[-1]) for end in ("", "_sigma"))
+    return {"estimate": x, "half_width": Z95 * s}
+
+
+def gas_report(e: xr.Dataset, *, joint: bool) -> dict[str, Any]:
+    """Return estimates at the end, alarms and what is told, ready for JSON."""
+    values = {str(n): _last(e, str(n)) for n in e.data_vars if f"{n}_sigma" in e}
+    off = [
+        n for n in HEALTH if abs(values[n]["estimate"] - 1) > SURE / Z95 * values[n]["half_width"]
+    ]
+    little = [n for n in HEALTH if values[n]["half_width"] > TOLD * Z95 * HEALTH_SIGMA]
+    t = e["time"].values
+    out: dict[str, Any] = {
+        "joint": joint,
+        "samples": int(t.size),
+        "from": float(t[0]),
+        "to": float(t[-1]),
+    }
+    out |= {"values": values, "changed": off, "hardly_told": little}
+    out |= {"alarms": json.loads(e.attrs["alarms"]), "onsets": json.loads(e.attrs["onsets"])}
+    return out | {"false_alarms_per_hour": JumpTest().rate}
+
+
+def machine_report(e: xr.Dataset) -> dict[str, Any]:
+    """Return the same of a generator."""
+    t, phase = e["time"].values, e["faulty_phase"].values.astype(int)
+    rising = [k for k in range(1, t.size) if phase[k] and phase[k] != phase[k - 1]]
+    alarms = [{"t": float(t[k]), "phase": PHASES[phase[k] - 1]} for k in rising]
+    now = PHASES[phase[-1] - 1] if phase[-1] else None
+    values = {n: _last(e, n) for n in (*(f"h_{p}" for p in PHASES), "P_total")}
+    out = {"from": float(t[0]), "to": float(t[-1]), "values": values}
+    return out | {"faulty_phase": now, "alarms": alarms, "resets": json.loads(e.attrs["resets"])}
+
+
+def sequence_report(s: Sequences) -> dict[str, Any]:
+    """Return the same of symmetrical components."""
+    size = np.abs(s.unbalance)
+    out: dict[str, Any] = {"windows": int(s.t.size), "frequency": float(np.median(s.frequency))}
+    out |= {"positive": float(np.median(np.abs(s.components[0])))}
+    out |= {"first": float(size[0]), "last": float(size[-1]), "sigma": float(np.median(s.sigma))}
+    return out | {"reference_windows": s.reference, "alarms": list(s.alarms)}
+
+
+def words(r: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a report's lines."""
+    if "gaspath" in r:
+        g = r["gaspath"]
+        how = "gas path with the power of the waveforms" if g["joint"] else "gas path"
+        yield f"{how}, {g['from']:g} to {g['to']:g} s, {g['samples']} samples; at the end, 95 %"
+        for n in HEALTH:
+            v, f = g["values"][n], HEALTH_FACTORS[n]
+            mark = "changed" if n in g["changed"] else ""
+            mark = "these data hardly tell it" if n in g["hardly_told"] else mark
+            text = f"  {f'{f.component} {f.quantity}':<22} {n:<8} {v['estimate']:.4f} +- "
+            yield f"{text}{v['half_width']:.4f}  {mark}".rstrip()
+        v = g["values"]["N"]
+        yield f"  {'speed [rad/s]':<22} {'N':<8} {v['estimate']:.1f} +- {v['half_width']:.1f}"
+        for t, onset in zip(g["alarms"], g["onsets"], strict=True):
+            yield f"  change of health after {onset:g} s, reported at {t:g} s"
+        if not g["alarms"]:
+            yield "  no sudden change of health"
+        yield f"  (at most {g['false_alarms_per_hour']:g} false report an hour if the model holds)"
+    for k, e in r["machines"].items():
+        yield f"generator {k}, {e['from']:g} to {e['to']:g} s; at the end, 95 %"
+        for n, v in e["values"].items():
+            scale, form = (1e-3, ".2f") if n == "P_total" else (1e3, ".3f")
+            label = "power of both [kW]" if n == "P_total" else f"severity {n} [1e-3]"
+            x, half = (f"{scale * v[key]:{form}}" for key in ("estimate", "half_width"))
+            yield f"  {label:<22} {x} +- {half}"
+        for a in e["alarms"]:
+            yield f"  short circuit in phase {a['phase']}, reported at {a['t']:g} s"
+        if not e["alarms"]:
+            yield "  no short circuit reported; one within the bands above may be there"
+    for n, s in r["sequences"].items():
+        yield (
+            f"{n}: {s['frequency']:.2f} Hz, positive sequence {s['positive']:.4g}, negative over "
+            f"positive {100 * s['first']:.3f} % at first, {100 * s['last']:.3f} % at last (+- "
+            f"{100 * Z95 * s['sigma']:.3f})"
+        )
+        for t in s["alarms"]:
+            yield f"  it changed before {t:g} s; a load, a fault or a sensor does that"
+        if not s["alarms"]:
+            few = f"{s['windows']} windows are too few to look for a change"
+            yield "  no change of it" if s["reference_windows"] else f"  {few}"
+    yield from (f"not estimated: {n}: {why}" for n, why in r["lacking"].items())
+    yield from (f"read: {n}" for n in r["notes"])
+    yield from (f"doubt: {d}" for d in r["doubts"])
+    if not r["believable"]:
+        yield "NOT TO BE BELIEVED as it stands, for the doubts above"

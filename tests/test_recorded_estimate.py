@@ -1,0 +1,328 @@
+"""From a run to a recording to estimates: the very numbers of the estimation along the run.
+
+The truth is the joint simulation of 0.2 s with a short circuit at 0.1 s.
+"""
+
+import dataclasses
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose
+
+from apu_casadi.core import results
+from apu_casadi.core.errors import DataError, ParameterError
+from apu_casadi.gaspath.conditions import CONDITIONS
+from apu_casadi.gaspath.health import HEALTH
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import FaultChange
+from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.electrical.sequences import sequences
+from estimators.apu.gaspath import gas_path_filter
+from estimators.apu.healthjumps import track_jumps
+from estimators.apu.joint import ETA_SIGMA, GAIN_SHARE, estimate_joint, joint_case
+from estimators.apu.measuring import measure_run, read_sensors, write_recording
+from estimators.apu.recorded_estimate import estimate
+from estimators.apu.recordings.measured import read_recording
+from scenarios import cli
+
+APU = Apu()
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def run():
+    fault = Ttsc(mu=0.05, k_rf=20.0, phase="a")
+    return simulate_joint(
+        APU, duration=0.2, load=SeriesLoad.from_power(100e3), events=[FaultChange(0.1, fault)],
+        dt=0.005, exchange="corrected", waveform_dt=1e-4,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def readings(run):
+    return measure_run(run, APU, SEED)
+
+
+@pytest.fixture(scope="module")
+def files(readings, tmp_path_factory):
+    return write_recording(readings, tmp_path_factory.mktemp("recording") / "run.csv")
+
+
+@pytest.fixture(scope="module")
+def joint(files):
+    return estimate(read_recording(*files), backend="vm")
+
+
+def gas_of(readings, *names):
+    """Arrays of some gas-path channels, as a user has them."""
+    ds = readings["gaspath"]
+    return {"t": ds["time"].values, **{n: ds[n].values for n in names}}
+
+
+# ------------------------------------------------------------------------------ the same numbers
+
+
+def test_run_measure_estimate_is_the_joint_estimation(run, joint):
+    """Efficiency has no error in a recording: it is the truth's. All else is of the same draws."""
+    case = joint_case(SEED)
+    gains = {n: v for n, v in case.gas_gains.items() if n != "PW"}
+    e = estimate_joint(
+        run, SEED, apu=APU, gas_gains=gains, electrical_gains=case.electrical_gains, backend="vm"
+    )
+    assert joint.joint and joint.believable, joint.doubts
+    for n in ("N", *HEALTH):
+        for end in ("", "_sigma"):
+            assert_allclose(joint.gaspath[n + end], e[n + end], rtol=1e-7, err_msg=n)
+    machine = joint.machines[1]
+    for n in ("h_a", "h_b", "h_c", "h_a_sigma", "P_total", "faulty_phase"):
+        assert_allclose(machine[n], e[n], rtol=1e-6, atol=1e-10, err_msg=n)
+    wide = np.hypot(e["P_total_sigma"], GAIN_SHARE * e["P_total"])
+    assert_allclose(machine["P_total_sigma"], wide, rtol=1e-6)
+    for n in ("alarms", "onsets"):
+        assert joint.gaspath.attrs[n] == e.attrs[n]
+    assert machine.attrs["resets"] == e.attrs["resets"]
+    report = joint.report()
+    json.dumps(report, allow_nan=False)
+    assert report["machines"]["1"]["alarms"] == [{"t": pytest.approx(0.12), "phase": "a"}]
+    assert "short circuit in phase a, reported at 0.12 s" in joint.summary()
+
+
+def test_gas_path_alone_is_the_filter_of_the_studies(run, files):
+    filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)
+    noise = np.random.default_rng([SEED, 2])
+    data = filt.recording(run, noise, gains=joint_case(SEED).gas_gains)
+    r = track_jumps(filt, data, backend="vm").result
+    e = estimate(read_recording(files[0]), backend="vm")
+    assert not e.joint and not e.machines and e.believable
+    for n in ("N", *HEALTH):
+        assert_allclose(e.gaspath[n], r[n][0], rtol=1e-7, err_msg=n)
+        assert_allclose(e.gaspath[f"{n}_sigma"], r[n][1], rtol=1e-7, err_msg=n)
+
+
+def test_generators_alone(joint, files):
+    e = estimate(read_recording(*files), only="electrical", backend="vm")
+    assert e.gaspath is None
+    for n in ("h_a", "h_a_sigma", "P_total"):
+        assert_allclose(e.machines[1][n], joint.machines[1][n], rtol=1e-12)
+
+
+def test_two_machines_and_their_mean_power(readings):
+    """Machine 2 with other noise: power is the mean, known better than either's."""
+    w = readings["electrical"]
+    one = {f"{n}_1": w[n].values for n in w}
+    two = {f"{n}_2": w[n].values for n in w}
+    rng = np.random.default_rng(0)
+    two |= {f"i_{p}_2": two[f"i_{p}_2"] + 0.1 * rng.standard_normal(w["time"].size) for p in "abc"}
+    waves = {"t": w["time"].values, **one, **two}
+    gas = gas_of(readings, "N", "P3", "T3", "T5", "Wf")
+    e = estimate(read_recording(gas, waves), backend="vm")
+    assert list(e.machines) == [1, 2] and e.joint
+    assert not any("only machine" in n for n in e.notes)
+    assert e.machines[2]["h_a"].values[-1] == pytest.approx(
+        e.machines[1]["h_a"].values[-1], rel=0.1
+    )
+
+
+# ------------------------------------------------------------------------------ fewer channels
+
+
+def test_a_subset_of_the_gas_path(readings):
+    """Without shaft power, speed and temperatures: wider, and said so."""
+    few = estimate(read_recording(gas_of(readings, "P3", "Wf")), backend="vm")
+    all_ = estimate(
+        read_recording(gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW")), backend="vm"
+    )
+    for n in HEALTH:
+        assert few.gaspath[f"{n}_sigma"].values[-1] > all_.gaspath[f"{n}_sigma"].values[-1]
+    assert "random walk" in few.summary() and "hardly tell" in few.summary()
+    assert "dT_isa = 5 K" in few.summary()
+
+
+def test_missing_samples_and_other_rates(readings):
+    """T5 at 10 Hz, P3 with a gap, fuel flow with a missing sample: all are taken as they are."""
+    gas = gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW")
+    slow = {"t": gas["t"][::5], "T5": gas.pop("T5")[::5]}
+    gas["P3"][3:6] = np.nan
+    gas["Wf"][4] = np.nan
+    e = estimate(read_recording(gas, slow), backend="vm")
+    i = e.result.y.index("T5")
+    assert np.isfinite(e.result.innovation[i]).sum() == 3
+    assert e.believable
+
+
+def test_three_currents_alone(readings):
+    """Sequence components and no severity; the fault at half time doubles I2/I1 and more."""
+    w = readings["electrical"]
+    data = {"t": w["time"].values, **{f"i_{p}": w[f"i_{p}"].values for p in "abc"}}
+    e = estimate(read_recording(data))
+    assert e.gaspath is None and not e.machines
+    (s,) = e.sequences.values()
+    assert s.frequency[0] == pytest.approx(400, rel=0.01)
+    assert abs(s.unbalance[-1]) > 3 * abs(s.unbalance[0])
+    assert "needs w_r, v_a" in e.summary() and "severity h" not in e.summary()
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_sequences_of_a_known_machine(reverse):
+    """50 Hz at 1 kHz, as public inter-turn data: the exact I2/I1, its noise, and its change."""
+    rng = np.random.default_rng(1)
+    t, f, ratio = np.arange(8000) * 1e-3, 49.3, 0.02 * np.exp(0.7j)
+    now = ratio + np.where(t < 5.0, 0, 0.01)
+    turn = np.exp(2j * np.pi / 3 * np.arange(3))[:, None] ** (-1 if not reverse else 1)
+    x = (np.exp(2j * np.pi * f * t) * (turn + now * turn.conj())).real * 300
+    s = sequences(t, x + rng.standard_normal(x.shape))
+    assert_allclose(s.frequency, f, atol=0.02)
+    assert_allclose(np.abs(s.components[0]), 300, rtol=2e-3)
+    before = s.t < 5.0
+    error = s.unbalance[before] - ratio
+    assert np.sqrt(np.mean(np.abs(error) ** 2) / 2) == pytest.approx(s.sigma.mean(), rel=0.3)
+    assert len(s.alarms) == 1 and 5.0 < s.alarms[0] < 5.4
+    assert not sequences(t[:5000], x[:, :5000] + rng.standard_normal((3, 5000))).alarms
+
+
+def test_what_cannot_be_used_is_refused(readings):
+    w = readings["electrical"]
+    slow = {"t": w["time"].values[::20], **{f"i_{p}": w[f"i_{p}"].values[::20] for p in "abc"}}
+    with pytest.raises(DataError, match=r"500 samples a second show nothing of 400 Hz: 800"):
+        estimate(read_recording(slow))
+    with pytest.raises(DataError, match="takes the fuel flow Wf as an input, which was not"):
+        estimate(read_recording(gas_of(readings, "N", "P3")))
+    with pytest.raises(DataError, match="none of P3, T3, T5 was measured"):
+        estimate(read_recording(gas_of(readings, "N", "Wf")))
+    m = read_recording(gas_of(readings, "N", "P3", "Wf"))
+    with pytest.raises(DataError, match="generators: nothing of them was measured"):
+        estimate(m, only="electrical")
+    with pytest.raises(ParameterError, match="did you mean 'gaspath'"):
+        estimate(m, only="gas-path")
+    with pytest.raises(DataError, match="altitude = 20000 m is outside"):
+        estimate(m, ambient={"altitude": 2e4})
+    gap = gas_of(readings, "N", "P3", "Wf")
+    gap["t"] = np.where(gap["t"] > 0.1, gap["t"] + 1.0, gap["t"])
+    with pytest.raises(DataError, match=r"Wf: no reading from 0.1 to 1.12 s"):
+        estimate(read_recording(gap))
+
+
+def test_a_wrong_sensor_is_doubted(readings):
+    """T5 is 10 % too high in each second sample: no health explains that."""
+    gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW").items()}
+    gas["t"] = 0.02 * np.arange(gas["t"].size)
+    assert estimate(read_recording(gas), backend="vm").believable
+    gas["T5"] = gas["T5"] * np.where(np.arange(gas["t"].size) % 2, 1.1, 1.0)
+    e = estimate(read_recording(gas), backend="vm")
+    assert not e.believable and any(d.startswith("T5: its innovations") for d in e.doubts)
+    assert "NOT TO BE BELIEVED" in e.summary()
+
+
+def test_a_stuck_sensor_is_doubted(readings):
+    gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf").items()}
+    gas["t"] = 0.02 * np.arange(gas["t"].size)
+    gas["T5"][10:] = gas["T5"][10]
+    e = estimate(read_recording(gas), backend="vm")
+    assert any("T5 stands still from 0.2 to 0.86 s" in d for d in e.doubts)
+
+
+def test_waveforms_of_a_short_part(readings):
+    """Then the gas path keeps its own shaft power, and both are estimated."""
+    gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW").items()}
+    gas["t"] = 0.02 * np.arange(gas["t"].size)
+    w = readings["electrical"]
+    e = estimate(read_recording(gas, {"t": w["time"].values, **{n: w[n].values for n in w}}))
+    assert not e.joint and e.gaspath["time"].size == 44 and list(e.machines) == [1]
+    assert any("cover less than half" in n for n in e.notes)
+
+
+def test_generators_that_differ():
+    """Each is measured and estimated as itself; r_s of the second is 20 % higher."""
+    g = APU.generator
+    other = dataclasses.replace(g, machine=dataclasses.replace(g.machine, r_s=1.2 * g.machine.r_s))
+    unit = APU.with_generators(g, other)
+    loads = [SeriesLoad.from_power(100e3), SeriesLoad.from_power(60e3)]
+    ds = simulate_joint(unit, duration=0.1, load=loads, dt=0.005, waveform_dt=1e-4)
+    made = measure_run(ds, unit, SEED)
+    assert {"i_a_1", "i_a_2", "w_r_2"} <= set(made["electrical"])
+    e = estimate(read_recording(*({"t": d["time"].values, **{n: d[n].values for n in d}}
+                                  for d in made.values())), unit, backend="vm")  # fmt: skip
+    assert list(e.machines) == [1, 2] and not e.joint
+    assert any("generators differ" in n for n in e.notes)
+    for m in e.machines.values():
+        assert abs(m["h_a"].values[-1]) < 4 * m["h_a_sigma"].values[-1]
+        assert not m["faulty_phase"].values.any()
+    power = [m["P_total"].values[-1] for m in e.machines.values()]
+    assert power[0] / power[1] == pytest.approx(100 / 60, rel=0.1)
+
+
+# ------------------------------------------------------------------------------ sensors, files
+
+
+def test_a_file_of_sensors(run, tmp_path):
+    path = tmp_path / "sensors.toml"
+    path.write_text(
+        "[T5]\nnoise = 0.0\ngain = 0.0\nrate = 10\n[T41]\n[i_a]\nnoise = 0\ngain = 0.01\n"
+    )
+    s = read_sensors(path)
+    made = measure_run(run, APU, SEED, s)
+    t5 = made["gaspath"]["T5"].values
+    rows = np.searchsorted(run["time"].values, made["gaspath"]["time"].values - 1e-7)
+    assert_allclose(t5[::5], run["T5"].values[rows][::5], rtol=1e-12)
+    assert np.isnan(t5[1:5]).all() and "T41" in made["gaspath"]
+    ratio = made["electrical"]["i_a"].values[5:] / run["i_a"].values[5:]
+    assert np.ptp(ratio) < 1e-9 and 1e-4 < abs(ratio[0] - 1) < 0.04
+    exact = measure_run(run, APU, None)["gaspath"]
+    assert_allclose(exact["P3"], run["P3"].values[rows], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[T55]\nnoise = 1", "unknown sensor 'T55' .did you mean 'T5'"),
+        ("[T5]\nnoize = 1", "T5: unknown key 'noize' .did you mean 'noise'"),
+        ("[T5]\nnoise = -1", "noise must be a number >= 0, got -1"),
+        ("[T5]\nrate = 0", "rate must be a number > 0"),
+        ("T5 = 1", r"a table \[T5\] is expected"),
+        ("[T5", "no TOML"),
+    ],
+)
+def test_wrong_sensor_files(tmp_path, text, words):
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    with pytest.raises(DataError, match=words):
+        read_sensors(path)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".nc", ".parquet"])
+def test_all_formats_hold_the_same(readings, tmp_path, ending):
+    made = write_recording(readings, tmp_path / f"r{ending}")
+    assert [p.stem for p in made] == ["r_gaspath", "r_electrical"]
+    m = read_recording(*made)
+    for kind, names in (("gaspath", ("T5", "PW", *CONDITIONS)), ("electrical", ("i_a", "w_r"))):
+        for n in names:
+            assert_allclose(m[n].values, readings[kind][n].values, rtol=1e-10, atol=1e-12)
+
+
+def test_commands(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    results.save(run, "run.nc")
+    assert cli.main(["measure", "run.nc", "--seed", "3", "--out", "r.csv"]) == 0
+    assert "r_electrical.csv: v_a" in capsys.readouterr().out
+    assert len(pd.read_csv("r_gaspath.csv")) == 11
+    command = ["estimate", "data", "r_gaspath.csv", "--altitude", "100", "--out", "o", "--json"]
+    assert cli.main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["believable"] and set(found["gaspath"]["values"]) >= {"N", *HEALTH}
+    assert not any("assumed" in n for n in found["notes"])
+    names = {p.name for p in (tmp_path / "o").iterdir()}
+    assert names == {"estimate_gaspath.nc", "estimate.json", "estimate.png"}
+    assert (tmp_path / "o" / "estimate.png").stat().st_size > 10_000
+    for wrong, words in (
+        (["measure", "run.nc"], "--out FILE is needed"),
+        (["measure", "run.nc", "--out", "r.xlsx"], ".csv, .parquet, .nc is expected"),
+        (["measure", "run.nc", "--out", "r.csv", "--seed", "-1"], "--seed must be >= 0"),
+        (["estimate", "data", "none.csv"], "none.csv"),
+        (["estimate", "data", "r_gaspath.csv", "--column", "T55=T5"], "unknown quantity"),
+    ):
+        assert cli.main(wrong) != 0
+        assert words in capsys.readouterr().err
