@@ -184,6 +184,7 @@ def read_fault(data: Any, place: str = "fault") -> Fault | Varying[Fault | None]
         for k in data:
             takes = ("kind", *(key.name for key in kind.keys), *other.values())
             hint = nearest(str(k), (*takes, "generator"))
+            hint = "(no single generator is meant here: leave it out)" if k == "generator" else hint
             require(k in takes, str(k), f"unknown key {hint}")
         needed = [k.name for k in kind.keys if k.default is ...]
         for n in needed:
