@@ -23,6 +23,7 @@ from scenarios import extensions
 if TYPE_CHECKING:
     from apu_casadi.unit.noise import Noise
 
+_ONE_LOAD = "(give a list with a load for each generator, or an [[event]] with generator)"
 DEFAULT_FAULT = "ttsc"
 """Kind of a fault whose table names none."""
 
@@ -158,7 +159,8 @@ def read_load(data: Any, place: str = "load") -> Load | Varying[Load]:
         every = {k.name for c in LOADS.classes for keys in c.tables.values() for k in keys}
         takes = ("kind", *(k.name for k in LOADS[kind].tables[kind]))
         for k in data:
-            require(k in every or k in takes, str(k), f"unknown key {nearest(str(k), takes)}")
+            hint = nearest(str(k), takes) if k != "generator" else _ONE_LOAD
+            require(k in every or k in takes, str(k), f"unknown key {hint}")
         return of_profiles(load_of, data) or load_from_table(data)
 
 
@@ -181,7 +183,9 @@ def read_fault(data: Any, place: str = "fault") -> Fault | Varying[Fault | None]
         other = {n: k.name for n, k in kind.instead.items()}
         for k in data:
             takes = ("kind", *(key.name for key in kind.keys), *other.values())
-            require(k in takes, str(k), f"unknown key {nearest(str(k), takes)}")
+            hint = nearest(str(k), (*takes, "generator"))
+            hint = "(no single generator is meant here: leave it out)" if k == "generator" else hint
+            require(k in takes, str(k), f"unknown key {hint}")
         needed = [k.name for k in kind.keys if k.default is ...]
         for n in needed:
             both = f"{' and '.join(needed)} are both needed for a severity"

@@ -82,7 +82,8 @@ def test_any_unit_comes_back_from_its_file(tmp_path, tpe):
         if isinstance(v, float) and k.startswith(("machine.", "exciter.T", "governor.", "coupl"))
     }
     changes = {k: min(v, 1.0) if "eta" in k else v for k, v in changes.items()}
-    unit = default.change({**changes, "generator.neutral": "isolated", "gas_generator.eta_c": 0.84})
+    words = {"generator.neutral": "isolated", "generator.power": "torque"}
+    unit = default.change({**changes, **words, "gas_generator.eta_c": 0.84})
     gg = unit.gas_generator
     own = dataclasses.replace(gg.compressor_map.table, name="own")
     choice = dataclasses.replace(gg.compressor_map, table=own)
@@ -205,6 +206,8 @@ gear = 3.2
         ("[generator.machin]\nr_s = 1", r"\[generator\]: unknown 'machin' .*'machine'"),
         ("[generator.exciter]\nK_A = 'high'", r"\[generator.exciter\]: .*K_A \[1\].*number"),
         ("[generator]\nneutral = 'open'", r"\[generator\]: neutral = 'open' .*isolated"),
+        ("[generator]\npower = 'torq'", r"\[generator\]: power = 'torq' \(did you mean 'torque'"),
+        ("[generator]\nexcitation = 1", r"\[generator\]: excitation = 1 .*regulated"),
         ("generator = 3", r"\[generator\]: a table is expected, got 3"),
         ("[generator]\ncount = 5", r"\[generator\]: count = 5; a unit has 1 to 4 generators"),
         ("[generator]\ncount = 2.0", r"\[generator\]: count = 2\.0; a unit has"),

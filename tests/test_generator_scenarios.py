@@ -72,9 +72,10 @@ REFUSED = [
     (dict(fault={"generator": 3, **SHORT}), "fault: generator 3, but the unit has 1 to 2"),
     (dict(fault={"generator": 0, **SHORT}), r"fault.generator: the number of a generator, 1 to 4"),
     (dict(fault={"generator": 2, "mu": 0.05}), "fault.k_rf: missing"),
-    (dict(fault={"generater": 2, **SHORT}), r"fault.generater: unknown key"),
+    (dict(fault={"generater": 2, **SHORT}), r"fault.generater: unknown key .*'generator'"),
     (dict(load=[KW100]), "load: 1 loads, but the unit has 2 generators"),
     (dict(load=[]), "load: 1 to 4 loads"),
+    (dict(load={"generator": 2, **KW100}), r"load.generator: unknown key .*a list .*event"),
     (dict(load=[KW100, {"kind": "R", "power": 1.0}]), r"load\[2\].power: unknown key"),
 ]
 

@@ -98,6 +98,12 @@ def test_wrong_generators_are_refused():
         OTHER.PW(1e5)
     with pytest.raises(ParameterError, match="one model of the unit needs equal"):
         simulate_monolithic(OTHER, duration=0.1, load=KW100)
+    with pytest.raises(ScenarioError, match="2 loads; the one model of the unit has one for all"):
+        simulate_monolithic(Apu(), duration=0.1, load=[KW100, KW100])
+    with pytest.raises(OperatingPointError, match="the averaged unit"):
+        linearise_joint(Apu(), Apu().steady_state([KW100, SeriesLoad.from_power(50e3)]))
+    with pytest.raises(ParameterError, match="power 1 "):
+        Apu().change({"generator.power": 1})
 
 
 @pytest.mark.parametrize(

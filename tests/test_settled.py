@@ -128,6 +128,23 @@ def test_in_scenarios_and_commands(tmp_path, capsys):
     assert "k_rf: missing" in capsys.readouterr().err
 
 
+def test_trim_takes_the_fault_of_one_generator(capsys):
+    keys = ["--load", "100e3", "--fault", "generator = 2, mu = 0.05, k_rf = 20"]
+    assert main(["trim", *keys, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    both = trim(APU, load=KW100, fault=FAULT).gas["PW"] + trim(APU, load=KW100).gas["PW"]
+    assert report["outputs"]["PW"] == pytest.approx(both / 2, rel=1e-9)
+    healthy, faulty = report["generators"]
+    assert healthy["P_loss_fault"] == 0.0 < faulty["P_loss_fault"]
+    for more, fault, words in (
+        (["--voltage", "230"], keys[3], "leave out generator"),
+        ([], "generator = 3, mu = 0.05, k_rf = 20", "the unit has 1 to 2"),
+        ([], "generator = 5, mu = 0.05, k_rf = 20", "--fault.generator: the number"),
+    ):
+        assert main(["trim", *keys[:3], fault, *more]) == 2
+        assert words in capsys.readouterr().err
+
+
 # -- power by torque --------------------------------------------------------------------------
 
 

@@ -40,6 +40,8 @@ __all__ = ["Generator", "GeneratorPoint", "fault_of_kind", "load_of_kind"]
 NEUTRALS = ("grounded", "isolated")
 EXCITATIONS = ("regulated", "constant")
 POWERS = ("paper", "torque")
+CHOICES = {"neutral": NEUTRALS, "excitation": EXCITATIONS, "power": POWERS}
+"""What is chosen by a word, and its words."""
 
 SAME_INSTANT = 1e-9  # s; switches closer than this are one
 #: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to
@@ -74,11 +76,10 @@ class Generator(Parametric):
     power: str = "paper"
 
     def __post_init__(self) -> None:
-        choices = {"neutral": NEUTRALS, "excitation": EXCITATIONS, "power": POWERS}
-        for what, known in choices.items():
+        for what, known in CHOICES.items():
             value = getattr(self, what)
             if value not in known:
-                raise ParameterError(f"{what} {value!r} {nearest(value, known)}")
+                raise ParameterError(f"{what} {value!r} {nearest(str(value), known)}")
 
     # -- variants ---------------------------------------------------------------------------
 

@@ -26,7 +26,7 @@ from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
-from apu_casadi.machine.generator import Generator, GeneratorPoint
+from apu_casadi.machine.generator import CHOICES, Generator, GeneratorPoint
 from apu_casadi.machine.machinedata import magnetics
 from apu_casadi.unit.control import GOVERNORS, Governor, GovernorParameters, word_of
 from apu_casadi.unit.events import MOST, Ambient
@@ -425,7 +425,7 @@ _UNSATURATED = {"machine.S_10": 0.0, "machine.S_12": 0.0}
 
 def _words(gen: Generator) -> dict[str, str]:
     """Return what is chosen by a word."""
-    return {n: getattr(gen, n) for n in ("neutral", "excitation", "power")}
+    return {n: getattr(gen, n) for n in CHOICES}
 
 
 def _values(prefix: str, p: Parameters) -> dict[str, Any]:

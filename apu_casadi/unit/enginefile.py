@@ -10,7 +10,7 @@
 
     [generator]                  # all of them alike, 1 to 4; or one table [[generator]] for each
     count = 2
-    neutral = "isolated"
+    neutral = "isolated"         # also excitation, and power = "torque"
     [generator.machine]          # apu_casadi.machine.machinedata; with S_10 or S_12 it saturates
     r_s = { value = 5.1, unit = "mohm", source = "measured" }
     [generator.exciter]
@@ -53,7 +53,7 @@ from apu_casadi.gaspath.engines import (
 )
 from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS, Limits
 from apu_casadi.gaspath.unitnumbers import MAPS
-from apu_casadi.machine.generator import NEUTRALS, Generator
+from apu_casadi.machine.generator import CHOICES, Generator
 from apu_casadi.machine.machinedata import MachineParameters, SaturatedMachine, magnetics
 from apu_casadi.unit.apu import Apu, OnShaft
 from apu_casadi.unit.control import GOVERNORS, Governor, word_of
@@ -145,7 +145,7 @@ def _machines(path: Path, data: Mapping[str, Any], gear: Any, given: Numbers) ->
         where = f"{path}, [generator]" if own is tables else f"{path}, [[generator]] {i}"
         if not isinstance(own, dict):
             raise ParameterError(f"{where}: a table is expected, got {own!r}")
-        known(where, own, (*_INNER, "neutral", "count"))
+        known(where, own, (*_INNER, *CHOICES, "count"))
         first = made[0] if made else OnShaft(Generator(), gear)
         if "count" in own or own is not tables:
             given.values["generator.count"] = True
@@ -168,12 +168,14 @@ def _machine(
     for name, p in zip(_INNER, (base, first.generator.exciter, first.coupling), strict=True):
         place = where.replace("generator]", f"generator.{name}]")
         parts[name] = read_set(place, tables[name], p, given, f"{prefix}{name}")
-    neutral = own.get("neutral", first.generator.neutral)
-    if neutral not in NEUTRALS:
-        raise ParameterError(f"{where}: neutral = {neutral!r} {nearest(str(neutral), NEUTRALS)}")
-    if "neutral" in own:
-        given.values[f"{prefix or 'generator.'}neutral"] = neutral
-    return OnShaft(Generator(parts["machine"], parts["exciter"], neutral), parts["coupling"])
+    words: dict[str, Any] = {}
+    for name, choices in CHOICES.items():
+        words[name] = value = own.get(name, getattr(first.generator, name))
+        if value not in choices:
+            raise ParameterError(f"{where}: {name} = {value!r} {nearest(str(value), choices)}")
+        if name in own:
+            given.values[f"{prefix or 'generator.'}{name}"] = value
+    return OnShaft(Generator(parts["machine"], parts["exciter"], **words), parts["coupling"])
 
 
 def _magnetics(
@@ -234,7 +236,7 @@ def _assumed(
             data_set = unit.gas_generator.parameters.gas_data
             yield Assumed("gas_generator.gas_data", data_set, "1", "default unit")
     words: dict[str, str | float] = {
-        "generator.neutral": unit.generator.neutral,
+        **{f"generator.{n}": getattr(unit.generator, n) for n in CHOICES},
         "generator.count": len(unit.machines),
         "governor.kind": word_of(unit.governor),
     }
@@ -292,7 +294,7 @@ def _machine_lines(e: Engine) -> list[str]:
     saturates = isinstance(machines[0].generator.machine, SaturatedMachine)
     for k, (gen, gear) in enumerate(machines[:1] if e.unit.alike else machines, 1):
         prefix = "" if k == 1 else f"generator{k}."
-        lines += ["", *head, f"neutral = {text(gen.neutral)}"]
+        lines += ["", *head, *(f"{n} = {text(getattr(gen, n))}" for n in CHOICES)]
         for name, p in zip(_INNER, (gen.machine, gen.exciter, gear), strict=True):
             lines += [f"[generator.{name}]", *set_lines(p, f"{prefix}{name}", e.sources)]
             if name == "machine" and saturates and not isinstance(p, SaturatedMachine):

@@ -160,6 +160,8 @@ def simulate_monolithic(
     """
     apu.refuse_different("the one model of the unit")
     n = len(apu.machines)
+    if isinstance(load, list | tuple):
+        raise ScenarioError(f"load: {len(load)} loads; the one model of the unit has one for all")
     events = in_order(events, duration, generators=n)
     for e in events:
         if getattr(e, "generator", None) is not None:

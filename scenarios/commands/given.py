@@ -168,18 +168,24 @@ def load(args: Namespace) -> Load:
     return load
 
 
-def fault(args: Namespace) -> Fault | None:
-    """Return the fault of each generator that ``--fault`` describes by the keys of a scenario."""
+def fault(args: Namespace) -> Fault | dict[int, Fault] | None:
+    """Return the fault of each generator that ``--fault`` describes by the keys of a scenario.
+
+    With ``generator`` among them it is that of one, by its number.
+    """
     from apu_casadi.core.profiles.profile import Varying
-    from scenarios.reading import PlacedError, read_fault
+    from scenarios.reading import PlacedError, number_of, read_fault
 
     parts(args)
     if args.fault is None:
         return None
-    found = read_fault(args.fault, "--fault")
+    own = {k: v for k, v in args.fault.items() if k != "generator"}
+    found = read_fault(own, "--fault")
     if isinstance(found, Varying):
         raise PlacedError("--fault", f"must not change in time here, got {found.label}")
-    return found
+    if own == args.fault:
+        return found
+    return {number_of(args.fault["generator"], "--fault.generator"): found}
 
 
 def power_load(unit: Apu, P: float, power_factor: float = 1.0) -> Load:

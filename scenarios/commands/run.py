@@ -7,6 +7,7 @@ SCENARIO is a name of the library (see ``apu list``), a .toml file, or a .py fil
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -123,13 +124,15 @@ _OF_EACH = {
 
 def made_with(report: dict[str, Any]) -> list[str]:
     """Return the lines that tell what a run was made with, and whether the model holds."""
-    from apu_casadi.gaspath.conditions import day_words
+    from apu_casadi.gaspath.conditions import CONDITIONS, day_words
     from apu_casadi.unit.validity import exchange_words
 
     solver, error = report["solver"] or {}, report["exchange_error"]
     lines = []
     if report["ambient"]:
-        lines.append(f"ambient: {day_words(report['ambient'])}")
+        followed = {re.split("[,:]", words)[0] for words in report.get("profiles", ())}
+        late = "; at first" if followed & set(CONDITIONS) else ""
+        lines.append(f"ambient: {day_words(report['ambient'])}{late}")
     lines += [f"profile of {words}" for words in report.get("profiles", ())]
     if solver:
         lines.append(

@@ -51,7 +51,7 @@ OPTIONS = f"""
                      | 'kind = "series", R_ohm = 1, L_mH = 1'
 --power-factor float PF =1.0 | of --load (default 1)
 --fault KEYS part    | with --load: fault of each generator, by the keys of a scenario:
-                     | 'mu = 0.05, k_rf = 20, phase = "b"'
+                     | 'mu = 0.05, k_rf = 20, phase = "b"'; of one with 'generator = 2, ...'
 --voltage float V    | with --load: one generator alone, V rms
 --field-voltage float V | with --load: one generator alone at a field voltage, V
 --fix NAME=VALUE ... | fix an output, twice; PW=cube is a load like speed cubed through the design
@@ -218,7 +218,13 @@ def _generator(args: argparse.Namespace) -> int:
     unit = given.unit(args, given.MACHINE)
     w_r = None if args.speed is None else unit.w_r(args.speed * RPM)
     how = {"w_r": w_r, "V_t": args.voltage, "V_fd": args.field_voltage}
-    point = unit.generator.steady_state(_load(args, unit), given.fault(args), **how)
+    fault = given.fault(args)
+    if isinstance(fault, dict):
+        raise SignalError(
+            "--fault: with --voltage or --field-voltage one generator is solved alone; "
+            "leave out generator"
+        )
+    point = unit.generator.steady_state(_load(args, unit), fault, **how)
     values = _values(point)
     if args.json:
         report = {"generator": values, "residual": point.residual, "load": _asked(args)}
@@ -249,8 +255,11 @@ def _asked(args: argparse.Namespace) -> Mapping[str, Any] | None:
 def _load_words(args: argparse.Namespace) -> str:
     if args.load is None:
         return ""
-    fault = given.fault(args)
-    return _load_alone(args) + ("" if fault is None else f"fault of each: {fault.label}; ")
+    fault, of = given.fault(args), "each"
+    if isinstance(fault, dict):
+        ((number, fault),) = fault.items()
+        of = f"generator {number}"
+    return _load_alone(args) + ("" if fault is None else f"fault of {of}: {fault.label}; ")
 
 
 def _load_alone(args: argparse.Namespace) -> str:

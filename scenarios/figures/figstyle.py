@@ -101,9 +101,11 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
 
 
 def caption(fig: Figure, text: str) -> None:
-    """Write a caption along the lower edge."""
-    lines, y = textwrap.fill(text, 165), 0.10 / fig.get_figheight()
-    fig.text(0.012, y, lines, fontsize=8.2, color=MUTED, va="bottom")
+    """Write a caption along the lower edge; one of many lines in small letters."""
+    lines, size, y = textwrap.fill(text, 165), 8.2, 0.10 / fig.get_figheight()
+    if lines.count("\n") > 2:
+        lines, size = textwrap.fill(text, 205), 6.6
+    fig.text(0.012, y, lines, fontsize=size, color=MUTED, va="bottom")
 
 
 def margins(fig: Figure, *, top: float = 0.18, bottom: float = 0.98) -> dict[str, float]:

@@ -11,7 +11,7 @@ import numpy as np
 from apu_casadi.core.results import RPM, generators_of, of_generator, phases
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures import figstyle as fs
-from scenarios.figures.runwords import SEVERITY, caption_of, scenario_of
+from scenarios.figures.runwords import SEVERITY, caption_of, fault_phase, scenario_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -200,8 +200,8 @@ def _change(first: float, last: float) -> str:
     return ends[0] if first == last else " → ".join(ends)
 
 
-def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
-    """Return the stretches of a stator fault."""
+def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) -> Lane:
+    """Return the stretches of the stator fault of a generator."""
     t, lane = ds["time"].values, []
     stator = np.column_stack([ds[f].values for f in SEVERITY])
     for a, b, i, j in _segments(t, stator, rows):
@@ -212,10 +212,11 @@ def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
         if m > 0:
             parts = f"µ = {100 * m:g} %", f"$k_{{rf}}$ = {r:g}", kappa
             first, second, third = (x.replace(" ", "\u00a0") for x in parts)
-            words = f"TTSC {first}\n{second}, {third}"
+            of = fault_phase(ds, float(t[worst]), number).replace(" of", "")
+            words = f"TTSC{of}\n{first}, {second}, {third}"
             if not np.array_equal(stator[i], stator[j], equal_nan=True) or j - i > 1 < worst - i:
                 second = f"$k_{{rf}}$\u00a0=\u00a0{r:.4g}"
-                words = f"TTSC changes, at most {first},\n{second}, {third}"
+                words = f"TTSC{of} changes,\nat most {first}, {second}, {third}"
         lane.append((a, b, words, HURT if m > 0 else HEALTHY))
     return lane
 
@@ -231,12 +232,12 @@ def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> 
     text = "\n".join(
         line
         for part in words.split("\n")
-        for line in textwrap.wrap(part, letters + 2 * part.count("$"))
+        for line in textwrap.wrap(part, letters + 2 * part.count("$"), break_long_words=False)
     )
     lines = text.split("\n")
     longest = max(len(line) - 5 * (line.count("$") // 2) for line in lines)
     size = 8.8 if len(lines) < 4 and longest <= letters else 7.0
-    if longest <= 1.3 * letters and len(lines) < 6:
+    if longest <= 1.3 * letters and len(lines) < 5:
         look: dict[str, Any] = {"ha": "center", "va": "center", "linespacing": 1.25}
         ax.text(x, y, text, color=ink, fontsize=size, **look)
 
@@ -258,12 +259,12 @@ def figure_20(ds: xr.Dataset) -> Figure:
         loads[f"Load{of}" if several else "Electrical load"] = [
             (a, b, w, LOADS[i % 2]) for i, (a, b, w) in steps
         ]
-        stators[f"Stator{of}"] = _stator_lane(own, rows)
+        stators[f"Stator{of}"] = _stator_lane(own, rows, k)
     lanes: dict[str, Lane] = {**loads, "Gas path": _gas_lane(ds, rows), **stators}
     n = int(ds.attrs.get("generators", 2))
     with fs.drawing():
         fig = fs.new_figure(3.7 + 0.8 * (len(lanes) - 3))
-        m = fs.margins(fig, top=0.45, bottom=0.8)
+        m = fs.margins(fig, top=0.45, bottom=0.95)
         ax = fig.add_axes((0.125, m["bottom"], 0.86, m["top"] - m["bottom"]))
         fs.bands(ax, rows, names=True)
         span = rows[-1]["end"] - rows[0]["start"]

@@ -66,11 +66,13 @@ def made_with(ds: xr.Dataset) -> str:
     for k, loads in list(by_number.items())[: 1 if alike else None]:
         of = "each generator" if alike else f"generator {k}"
         words += [f"Load of {of} {', then '.join(loads)}"] if loads else []
+    followed = {row.get("part") for row in _rows(ds, "profiles")}
+    late = " at first" if "ambient" in followed else ""
     try:
         day, solver = json.loads(ds.attrs["ambient"]), json.loads(ds.attrs["solver"])
         words.append(
             f"{day['altitude']:g} m, Mach {day['Mach']:g}, ISA {day['dT_isa']:+g} K, "
-            f"war {day['war']:g}"
+            f"war {day['war']:g}{late}"
         )
         words.append(f"{solver['solver']}, exchange {solver['exchange']}, seed {ds.attrs['seed']}")
         words.append(f"apu-casadi {ds.attrs['apu_casadi_version']}")
