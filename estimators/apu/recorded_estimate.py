@@ -150,7 +150,7 @@ def estimate(
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
     table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
     lacking: dict[str, str] = {}
-    notes, doubts = list(m.notes), list(_odd_channels(m))
+    notes, doubts = list(m.notes), list(_odd_channels(m, table))
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     reason = None if only == "electrical" else _no_gas_path(m, table)
@@ -223,9 +223,10 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     return None
 
 
-def _odd_channels(m: Measurements) -> Iterator[str]:
-    """Say which channels stand still while most others move, or are clipped."""
-    sensors = {n: c for n, c in m.items() if n not in CONDITIONS and np.isfinite(c.values).any()}
+def _odd_channels(m: Measurements, table: SensorSet) -> Iterator[str]:
+    """Say which sensors stand still while most others move, or are clipped."""
+    used = (*table.names, *m.electrical)
+    sensors = {n: c for n, c in m.items() if n in used and np.isfinite(c.values).any()}
     for n, c in sensors.items():
         others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
         rows = _still(c.values, others)
