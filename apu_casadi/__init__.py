@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from apu_casadi.core.errors import ApuError
+    from apu_casadi.core.profiles.points import Points, Steps
+    from apu_casadi.core.profiles.profile import varying
+    from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
     from apu_casadi.core.signals import Signal, Signals
     from apu_casadi.core.statespace import StateSpace
     from apu_casadi.gaspath.gasgenerator import GasGenerator
@@ -23,7 +26,7 @@ if TYPE_CHECKING:
     from apu_casadi.machine.loads.open import OpenLoad
     from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu, trim
-    from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange
+    from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
     from apu_casadi.unit.multirate import simulate_joint
     from apu_casadi.unit.noise import Noise
 
@@ -37,20 +40,27 @@ __all__ = [
     "FaultChange",
     "GasGenerator",
     "Generator",
+    "Growth",
     "HealthChange",
     "LoadChange",
     "Noise",
+    "OnOff",
     "OpenLoad",
     "OperatingPoint",
+    "Points",
+    "Ramp",
     "SeriesLoad",
     "Signal",
     "Signals",
+    "SpeedChange",
     "StateSpace",
+    "Steps",
     "Ttsc",
     "__version__",
     "simulate_joint",
     "trim",
     "trim_batch",
+    "varying",
 ]
 
 _HOME = {
@@ -61,19 +71,26 @@ _HOME = {
     "FaultChange": "apu_casadi.unit.events",
     "GasGenerator": "apu_casadi.gaspath.gasgenerator",
     "Generator": "apu_casadi.machine.generator",
+    "Growth": "apu_casadi.core.profiles.shapes",
     "HealthChange": "apu_casadi.unit.events",
     "LoadChange": "apu_casadi.unit.events",
     "Noise": "apu_casadi.unit.noise",
+    "OnOff": "apu_casadi.core.profiles.shapes",
     "OpenLoad": "apu_casadi.machine.loads.open",
     "OperatingPoint": "apu_casadi.gaspath.steady.steadypoint",
+    "Points": "apu_casadi.core.profiles.points",
+    "Ramp": "apu_casadi.core.profiles.shapes",
     "SeriesLoad": "apu_casadi.machine.loads.series",
     "Signal": "apu_casadi.core.signals",
     "Signals": "apu_casadi.core.signals",
+    "SpeedChange": "apu_casadi.unit.events",
     "StateSpace": "apu_casadi.core.statespace",
+    "Steps": "apu_casadi.core.profiles.points",
     "Ttsc": "apu_casadi.machine.faults.ttsc",
     "simulate_joint": "apu_casadi.unit.multirate",
     "trim": "apu_casadi.unit.apu",
     "trim_batch": "apu_casadi.gaspath.steady.trimbatch",
+    "varying": "apu_casadi.core.profiles.profile",
 }
 
 

@@ -33,12 +33,14 @@ import numpy as np
 
 from apu_casadi.core import interrupts
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
+from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.version import installed
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, registry
 from scenarios.campaign_records import COLUMNS, OF_EACH, RUNS, STATUS, each
 from scenarios.extensions import digest
-from scenarios.schema import Phase, Scenario
+from scenarios.phases import Phase
+from scenarios.schema import Scenario
 from scenarios.shell.locking import locked
 from scenarios.shell.workers import pool, stoppable
 
@@ -98,6 +100,12 @@ def _short(p: Phase) -> tuple[Ttsc, int | None] | None:
     """Return the short circuit that a phase begins with, and the generator that has it or None."""
     faults = p.fault if isinstance(p.fault, tuple) else [(None, p.fault)]
     return next(((f, k) for k, f in faults if isinstance(f, Ttsc)), None)
+
+
+def _phase_of(fault: Any) -> str:
+    """Return the phase of a fault, also of one that changes in time; "-" where it has none."""
+    fault = fault.example() if isinstance(fault, Varying) else fault
+    return str(getattr(fault, "phase", "-"))
 
 
 def _drawn(s: Scenario, sick: int, short: int, seed: int, i: int) -> Scenario:
@@ -454,9 +462,9 @@ def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Da
             if isinstance(p.fault, tuple):
                 for of in p.fault:
                     if of.generator <= numbers:
-                        fault[i, j, of.generator - 1] = str(getattr(of.fault, "phase", "-"))
+                        fault[i, j, of.generator - 1] = _phase_of(of.fault)
             elif p.fault is not None:
-                fault[i, j] = str(getattr(p.fault, "phase", "-"))
+                fault[i, j] = _phase_of(p.fault)
     words = "phase a, b or c with the short circuit; - healthy"
     data["phase_name"] = (phases, label, {"long_name": "name of the phase"})
     faulty = fault if numbers > 1 else fault[:, :, 0]

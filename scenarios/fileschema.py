@@ -21,8 +21,9 @@ from apu_casadi.machine.faults.fault import FAULTS, Fault
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST, STARTS
+from scenarios.phases import CHANGES, Change, Phase
 from scenarios.reading import DEFAULT_FAULT, names_of
-from scenarios.schema import CHANGES, EXCHANGES, FILE_KEYS, Change, Phase, Scenario
+from scenarios.schema import EXCHANGES, FILE_KEYS, Scenario
 
 Table = dict[str, Any]
 _GENERATOR = {"$ref": "#/definitions/generator"}
@@ -200,11 +201,11 @@ def _parameters() -> Table:
         table[name] = one
         table.setdefault(part, _object({}))["properties"][last] = one
     own = {n: table[n] for n in ("machine", "exciter", "coupling")}
-    own["neutral"] = table["generator.neutral"]
-    dotted = "|".join(f"{s}\\.{n}" for s in own if s != "neutral" for n in own[s]["properties"])
+    dotted = [f"{s}\\.{n}" for s in own for n in own[s]["properties"]]
+    words = {n: v for n, v in table["generator"]["properties"].items() if n != "count"}
     patterns = {
-        f"^generator[1-{MOST}]$": _object(own),
-        rf"^generator[1-{MOST}]\.({dotted}|neutral)$": {"type": ["number", "string"]},
+        f"^generator[1-{MOST}]$": _object(own | words),
+        rf"^generator[1-{MOST}]\.({'|'.join([*dotted, *words])})$": {"type": ["number", "string"]},
     }
     return _object(table, patternProperties=patterns)
 

@@ -27,8 +27,9 @@ GENERIC = (*INFORMATION, "estimators.batch", "estimators.detection")
 ESTIMATORS = (*UNIT, *GENERIC, "estimators.apu")
 SHELL = (*CORE, "scenarios", "scenarios.shell")
 READING = (*ESTIMATORS, "scenarios.extensions", "scenarios.reading")
-SCENARIO = (*READING, *SHELL, "scenarios.figures", "scenarios.schema", "scenarios.fileschema",
-            "scenarios.registry", "scenarios.campaign_records", "scenarios.campaigns")  # fmt: skip
+SCENARIO = (*READING, *SHELL, "scenarios.figures", "scenarios.phases", "scenarios.schema",
+            "scenarios.fileschema", "scenarios.registry", "scenarios.campaign_records",
+            "scenarios.campaigns")  # fmt: skip
 STUDIES = (*SCENARIO, "scenarios.validation", "scenarios.studies")
 PAGES = (*STUDIES, "scenarios.bench", "scenarios.pages")
 
@@ -52,8 +53,9 @@ BELOW: dict[str, tuple[str, ...]] = {
     "scenarios.figures": UNIT,
     "scenarios.extensions": CORE,
     "scenarios.reading": (*ESTIMATORS, "scenarios.extensions"),
-    "scenarios.schema": READING,
-    "scenarios.fileschema": (*READING, "scenarios.schema"),
+    "scenarios.phases": READING,
+    "scenarios.schema": (*READING, "scenarios.phases"),
+    "scenarios.fileschema": (*READING, "scenarios.phases", "scenarios.schema"),
     "scenarios.registry": SCENARIO,
     "scenarios.campaign_records": SCENARIO,
     "scenarios.campaigns": SCENARIO,

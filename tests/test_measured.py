@@ -258,3 +258,21 @@ def test_mistakes_in_a_file_of_columns(tmp_path, text, words):
     path.write_text(text + "\n")
     with pytest.raises(DataError, match=rf"layout.toml: .*{words}|layout.toml: {words}"):
         read_layout(path)
+
+
+def test_netcdf_4_is_read_where_its_package_is(tmp_path):
+    """Dates, a damaged file, and variables in groups, which are not looked for."""
+    pytest.importorskip("h5netcdf")
+    day = pd.date_range("2026-01-01", periods=3, freq="100ms")
+    ds = xr.Dataset({"T3": ("time", [500.0, 501.0, 502.0], {"units": "K"})}, {"time": day})
+    path = tmp_path / "a.nc"
+    ds.to_netcdf(path, engine="h5netcdf")
+    data = read_recording(path)
+    assert_allclose(data["T3"].t, [0, 0.1, 0.2], atol=1e-12)  # a date counts nanoseconds
+    assert_allclose(data["T3"].values, [500, 501, 502])
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(DataError, match="damaged netCDF file"):
+        read_recording(path)
+    ds.to_netcdf(tmp_path / "g.nc", group="flight", engine="h5netcdf")
+    with pytest.raises(DataError, match=r"in groups .*/flight"):
+        read_recording(tmp_path / "g.nc")

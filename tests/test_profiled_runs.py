@@ -228,3 +228,32 @@ def test_wrong_values_in_a_file_are_told_with_their_place(tmp_path, old, new, me
     with pytest.raises(ScenarioError) as e:
         Scenario.from_toml(path)
     assert message in str(e.value)
+
+
+def test_library_scenarios_campaign_and_figures(tmp_path):
+    """Two short ones in a campaign; every figure of one, its profiles among them."""
+    from scenarios.campaigns import run_campaign
+    from scenarios.figures import plotting
+    from scenarios.figures.profileplots import given_profiles
+
+    cut = {"duration": 1.3, "waveform_dt": None}
+    both = [registry.get(n).change(**cut) for n in ("growing_short", "intermittent_short")]
+    done = run_campaign(both, workers=1, out=tmp_path)
+    assert not done["status"].any()
+    assert done["fault_phase"].values.tolist() == [["-", "a"]] * 2
+    ds = registry.run(both[1])
+    assert {1.08, 1.2, 1.28} <= set(np.round(ds["time"].values, 9))
+    assert [g["name"] for g in given_profiles(ds)] == ["mu"]
+    made = [p.name for p in plotting.save_figures(ds, tmp_path)]
+    assert made[-1] == "profiles.png" and len(made) == 7
+    words = registry.summary(ds)["profiles"]
+    assert words == ["fault mu, from 1 s: on-off 0.05 and 0 at 5 Hz, 40 % of the time"]
+
+
+def test_a_load_of_a_command_must_not_change(tmp_path, capsys):
+    from scenarios.cli import main
+
+    path = tmp_path / "power.csv"
+    path.write_text("time,power_kW\n0,100\n1,200\n")
+    assert main(["trim", "--load", f'kind = "R", power_kW = {{ file = "{path}" }}']) != 0
+    assert "must not change in time here" in capsys.readouterr().err

@@ -105,10 +105,11 @@ class Term(NamedTuple):
         if self.base in ("v", "i"):
             return sum(y[ss.y.index(f"{self.base}_{p}")] ** 2 for p in PHASES) / 3.0
         if f"~{self.base}" in AXES:
-            turn = ca.cos if self.base[2] == "q" else ca.sin
-            axes = (x[ss.x.index("theta_e")] - 2 * math.pi / 3 * k for k in range(3))
-            phases = (y[ss.y.index(f"{self.base[0]}_{p}")] for p in PHASES)
-            return 2.0 / 3.0 * sum(turn(a) * v for a, v in zip(axes, phases, strict=True))
+            a, b, c = (y[ss.y.index(f"{self.base[0]}_{p}")] for p in PHASES)
+            # by the addition theorem: of one cosine and one sine, which the outputs have as well
+            even, odd = (2.0 * a - b - c) / 3.0, (b - c) / math.sqrt(3.0)
+            cos, sin = (f(x[ss.x.index("theta_e")]) for f in (ca.cos, ca.sin))
+            return cos * even + sin * odd if self.base[2] == "q" else sin * even - cos * odd
         return 1.0 if self.base == "1" else y[ss.y.index(self.base)] ** self.power
 
     def nominal(self, ss: StateSpace) -> float:

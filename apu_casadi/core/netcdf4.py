@@ -29,7 +29,7 @@ def read(path: Path) -> xr.Dataset:
             data = ds.load()
     except ValueError:
         raise DataError(
-            f"{path}: a netCDF 4 file; reading it needs h5netcdf: pip install h5netcdf"
+            f"{path}: a netCDF 4 file; reading it needs: pip install h5netcdf h5py"
         ) from None
     except Exception as e:  # damaged files fail with any type
         raise DataError(f"{path}: damaged netCDF file ({type(e).__name__}: {e})") from None

@@ -87,7 +87,7 @@ def gas_generator_functions() -> list[str]:
 
 
 def joint_functions() -> list[str]:
-    """Compile what joint runs by exact propagation use, with a healthy and a faulted machine."""
+    """Compile what joint runs by exact propagation use, with healthy and faulted machines."""
     from apu_casadi.core.backend import loaded_functions
     from apu_casadi.machine.faults.ttsc import Ttsc
     from apu_casadi.machine.loads.series import SeriesLoad
@@ -97,8 +97,9 @@ def joint_functions() -> list[str]:
 
     apu, load = Apu(), SeriesLoad.from_power(100e3)
     for waveform_dt in (50e-6, None):
-        for fault in (Ttsc(0.05, 20.0), Ttsc(0.05, 1.0, 1.0)):
-            events = [FaultChange(0.3, fault)]
+        faults = Ttsc(0.05, 20.0), Ttsc(0.05, 1.0, 1.0)
+        for fault, number in (*((f, None) for f in faults), (faults[0], 2)):
+            events = [FaultChange(0.1 if number else 0.3, fault, number)]
             how: dict[str, Any] = {"solver": "propagator", "waveform_dt": waveform_dt}
             simulate_joint(apu, duration=0.4, load=load, events=events, **how)
     return loaded_functions()

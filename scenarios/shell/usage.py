@@ -89,8 +89,10 @@ def part(text: str) -> float | dict[str, Any]:
     """Return a finite number, or a table of ``key = value`` with commas between, as TOML has it."""
     if "=" not in text:
         return finite(text)
+    keys = text.strip()
+    keys = keys[1:-1] if keys.startswith("{") and keys.endswith("}") else keys
     try:
-        table: dict[str, Any] = tomllib.loads(f"part = {{ {text.strip().strip('{}')} }}")["part"]
+        table: dict[str, Any] = tomllib.loads(f"part = {{ {keys} }}")["part"]
     except tomllib.TOMLDecodeError as e:
         raise argparse.ArgumentTypeError(f"'key = value, ...' is expected ({e})") from None
     return table
