@@ -217,6 +217,23 @@ def test_a_wrong_sensor_is_doubted(readings):
     assert "NOT TO BE BELIEVED" in e.summary()
 
 
+def test_a_short_circuit_too_small_to_report_is_no_change_of_health():
+    """h = 4.95e-4 is not reported, but neither is the change of health believed."""
+    fault = Ttsc(mu=0.05, k_rf=100.0, phase="b")
+    ds = simulate_joint(
+        APU, duration=0.2, load=SeriesLoad.from_power(100e3), health={"f_eta_c": 0.92},
+        fault=fault, dt=0.005, waveform_dt=1e-4,
+    )  # fmt: skip
+    made = measure_run(ds, APU, SEED, gains=False)
+    arrays = ({"t": d["time"].values, **{n: d[n].values for n in d}} for d in made.values())
+    e = estimate(read_recording(*arrays), backend="vm")
+    assert "f_eta_c" in e.report()["gaspath"]["changed"]
+    assert not e.machines[1]["faulty_phase"].values.any()
+    h, sigma = (e.machines[1][n].values[-1] for n in ("h_b", "h_b_sigma"))
+    assert abs(h - 0.05 / 100.95) < 3 * sigma
+    assert any(d.startswith("a short circuit of h_b") for d in e.doubts)
+
+
 def test_a_stuck_sensor_is_doubted(readings):
     gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf").items()}
     gas["t"] = 0.02 * np.arange(gas["t"].size)

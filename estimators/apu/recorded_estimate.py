@@ -359,8 +359,9 @@ class _GasPath:
         """Filter, with the power of the electrical side where there is one."""
         sides = list(of.values())
         power = bool(sides) or "PW" in self.m
-        keep = [n for n in self.table.names if n in self.m or n in ("N", "Wf", "PW")]
-        sensors = self.table.only(keep)
+        # speed and the measured inputs stay in the table
+        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
+        sensors = self.table.only([n for n in self.table.names if n not in absent])
         inputs = self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
