@@ -35,7 +35,15 @@ from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES
 from estimators.apu.gaspath import N_SIGMA, GasPathFilter, gas_path_filter
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import Tracked, track_jumps
-from estimators.apu.joint import ETA_SIGMA, H_GAIN, ElectricalSide, electrical_side, fused, unit_of
+from estimators.apu.joint import (
+    ETA_SIGMA,
+    H_FLOOR,
+    H_GAIN,
+    ElectricalSide,
+    electrical_side,
+    fused,
+    unit_of,
+)
 from estimators.apu.recorded_report import (
     SURE,
     Z95,
@@ -64,6 +72,7 @@ PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
+RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 STILL = 25  # equal readings in a row that noise does not give
 FEWEST = 20  # innovations that a verdict takes
 STEEP = 0.1  # change of a factor beyond which no filter was tried
@@ -334,7 +343,7 @@ class _Waves:
         # gain errors are taken for noise, so that they are there as offsets
         found = [(v - DT, v + DT) for v in (side.t[0], *side.resets)]
         odd = _unexplained(side.result, found, offset=3.0)
-        doubts += (f"machine {self.number}, {text}" for text in odd)
+        doubts += (f"machine {self.number}, {text}" for text in (*odd, *_restless(side)))
         return side
 
 
@@ -502,6 +511,24 @@ def _unexplained(
         # white, if the filter is right
         elif abs(z.mean()) > offset + 6 / math.sqrt(z.size):
             yield f"{name}: its innovations have a mean of {z.mean():+.2f} sigma"
+
+
+def _restless(side: ElectricalSide) -> Iterator[str]:
+    """Say where the electrical filter starts again and again, or finds several phases faulty."""
+    often = [v for k, v in enumerate(side.resets[2:]) if v - side.resets[k] <= RESTLESS]
+    if often:
+        yield (
+            f"its filter began anew {len(side.resets)} times up to {side.resets[-1]:g} s, as after "
+            "a step of load or a fault: no model of one step fits, and reports around are doubtful"
+        )
+    h, s = side.severities
+    second = np.sort((h - H_FLOOR) / s, axis=0)[-2]
+    several = np.flatnonzero((side.phase > 0) & (second > 5))
+    if several.size:
+        yield (
+            f"at {side.t[several[0]]:g} s several phases look faulty at once, which is no short "
+            "circuit of one phase"
+        )
 
 
 def _judge_gas(
