@@ -111,7 +111,7 @@ class JointRun:
     def __init__(
         self, apu: Apu, asked: Asked, settings: Settings, rng: np.random.Generator
     ) -> None:
-        self.apu, self.asked, self.settings, self._rng = apu, asked, settings, rng
+        self.apu, self.asked, self.settings, self.rng = apu, asked, settings, rng
         self.now, self.here = asked.start, asked.start.at(0.0)  # as asked, and its numbers
         there: tuple[Any, ...] = ([load.balanced_part for load in self.here.loads], None)
         if asked.settled:
@@ -200,7 +200,7 @@ class JointRun:
     def _step(self, k: int) -> tuple[int, Row]:
         noise, way, gg = self.asked.noise, self.settings.way, self.apu.gas_generator
         if noise.w1 or noise.w2:
-            self.machines.disturb(self._rng.standard_normal, noise.w1, noise.w2)
+            self.machines.disturb(self.rng.standard_normal, noise.w1, noise.w2)
         t0, N = float(self.asked.grid[k]), float(self.x[0])
         h = float(self.asked.grid[k + 1] - self.asked.grid[k])
         if self._changing:
@@ -243,7 +243,7 @@ class JointRun:
         """Take over the gas generator's step, with state noise and hook before its output."""
         noise, hook = self.asked.noise.N, self.asked.hook
         if noise or hook is not None:
-            x = x + noise * self._rng.standard_normal(1)
+            x = x + noise * self.rng.standard_normal(1)
             if hook is not None:
                 # it may simulate the same unit: views of buffers would change
                 made = [m._replace(w=m.w.copy()) for m in made]

@@ -133,10 +133,9 @@ def simulate_joint(
 
     Nothing moves before the first event.  Factors, speed, and the numbers of loads, faults and the
     day may be profiles (:func:`apu_casadi.core.profiles.profile.varying`), held over each step at
-    their value in its middle; where one jumps, a step begins.  A fault or an unbalanced load given
-    for the start acts from t = 0 on the steady healthy, balanced unit; or, with
-    ``start_from="settled"``, it has been there for long, and the run starts in the periodic state
-    of all generators.
+    their value in its middle; where one jumps, a step begins.  A fault or an unbalanced load from
+    the start acts from t = 0 on the steady healthy, balanced unit; with ``start_from="settled"`` it
+    has been there for long: the run starts in the periodic state of all generators.
 
     Args:
         apu, load, fault: the unit; load and fault from the start, of all generators, or a list with
@@ -144,30 +143,24 @@ def simulate_joint(
         duration, dt: of the run, and exchange step, s.
         ambient, health: day (the default one if not given), and factors by name.
         N_ref: governed rotor speed, rad/s; default the unit's.
-        events: :class:`LoadChange`, :class:`HealthChange`, :class:`FaultChange`,
-            :class:`SpeedChange`.
+        events: changes of load, health, fault and speed (:mod:`apu_casadi.unit.events`).
         exchange: one of ``EXCHANGES``, see the module's text.
-        waveform_dt: sampling of the stored waveforms, s; None stores none.
-        phasors: store fundamental phasors of voltages and currents of each exchange step, too.
+        waveform_dt, phasors: sampling of the stored waveforms, s (None stores none); store
+            fundamental phasors of voltages and currents of each exchange step, too.
         noise, seed: uncertainty and the seed of its random numbers.
         hook: processes the rotor speed between state update and output (Algorithm 2).
         start_from: one of ``STARTS``, as above.
         strict: stop with an error where there would be a warning, at its instant where it shows.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
-        progress: called with (done, total) seconds.
-        attrs: more attributes for the dataset.
+        progress, attrs: called with (done, total) seconds; more attributes for the dataset.
         storage: ``"memory"``, a folder for a temporary file, or ``"auto"``; the module's text.
         warn_exchange: whether an exchange error beyond 1 % of the speed's excursion is warned of.
 
     Returns:
         xarray.Dataset on ``time`` (exchange grid) and ``time_w`` (waveforms), see
-        :mod:`apu_casadi.core.results`; what belongs to a generator also on ``generator`` where
-        they do not stay equal; profiles as they were held.  Attributes: what was asked,
-        ``exchange_error`` (NaN with state noise, a hook or another governed speed), ``validity``
-        and ``warnings``.
-
-    Warns:
-        ValidityWarning, ExchangeWarning: see :mod:`apu_casadi.unit.validity`.
+        :mod:`apu_casadi.core.results`; by ``generator`` where they do not stay equal.  Attributes:
+        what was asked, ``exchange_error`` (NaN with state noise, a hook or another governed speed),
+        ``validity`` and ``warnings``, which are raised too (:mod:`apu_casadi.unit.validity`).
 
     Raises:
         ScenarioError, DataError: impossible times or events; no room in the ``storage`` folder.
@@ -178,34 +171,48 @@ def simulate_joint(
     duration = number("duration", duration, error=ScenarioError)
     settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
     events = in_order(events, duration, generators=len(apu.machines))
-    start = Holding(
-        apu.each("load", load),
-        apu.each_fault(fault),
-        all_factors(health),
-        Ambient() if ambient is None else ambient,
-        None if N_ref is None else SpeedChange(0.0, N_ref).N_ref,
-    )
+    start = _start(apu, load, fault, health, ambient, N_ref)
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
-    asked = Asked(
-        start=start,
-        grid=exchange_grid(duration, settings.dt, stops),
-        phasors=phasors,
-        noise=noise,
-        seed=seed,
-        hook=hook,
-        settled=_settled(start_from),
-    )
-    rng = np.random.default_rng(seed)
-    system = JointRun(apu, asked, settings, rng)
-    samples = system.machines.samples(asked.grid)
-    means = {k: means_of(apu, k, phasors) for k in kinds(apu, system.now, events)}
-    severities = stored_severities(events, *start.faults)
-    record = Recorder(apu.gas_generator, asked.grid, samples, means, storage, severities)
+    grid, settled = exchange_grid(duration, settings.dt, stops), _settled(start_from)
+    asked = Asked(start, grid, phasors, noise, seed, hook, settled)
+    system = JointRun(apu, asked, settings, np.random.default_rng(seed))
+    record = _moved(system, events, stops, storage, strict, progress)
+    how = {"warn_exchange": warn_exchange, "strict": strict}
+    return _concluded(system, record, exchange, events, **how, attrs=attrs or {})
+
+
+def _start(
+    apu: Apu,
+    load: ALoad | Sequence[ALoad],
+    fault: AFault | Sequence[AFault] | Mapping[int, AFault],
+    health: Mapping[str, float | Profile] | None,
+    ambient: Ambient | Varying[Ambient] | None,
+    N_ref: float | Profile | None,
+) -> Holding:
+    """What holds from the start, for each generator, checked."""
+    day = Ambient() if ambient is None else ambient
+    speed = None if N_ref is None else SpeedChange(0.0, N_ref).N_ref
+    return Holding(apu.each("load", load), apu.each_fault(fault), all_factors(health), day, speed)
+
+
+def _moved(
+    system: JointRun,
+    events: Sequence[Event],
+    stops: Sequence[Event | Jump],
+    storage: str | os.PathLike[str],
+    strict: bool,
+    progress: Callable[[float, float], None] | None,
+) -> Recorder:
+    """Run the unit over its grid; return what was recorded."""
+    apu, asked, grid = system.apu, system.asked, system.asked.grid
+    means = {k: means_of(apu, k, asked.phasors) for k in kinds(apu, system.now, events)}
+    severities = stored_severities(events, *asked.start.faults)
+    samples = system.machines.samples(grid)
+    record = Recorder(apu.gas_generator, grid, samples, means, storage, severities)
     record.put(0, 1, system.at_start())
     put = Strict(system, means, record.put) if strict else record.put
-    run(system, asked.grid, stops, record=put, progress=progress)
-    how = {"warn_exchange": warn_exchange, "strict": strict}
-    return _concluded(system, record, rng, exchange, events, **how, attrs=attrs or {})
+    run(system, grid, stops, record=put, progress=progress)
+    return record
 
 
 def _settled(start_from: str) -> bool:
@@ -241,7 +248,6 @@ def _settings(
 def _concluded(
     system: JointRun,
     record: Recorder,
-    rng: np.random.Generator,
     exchange: str,
     events: Sequence[Event],
     *,
@@ -277,7 +283,7 @@ def _concluded(
     )
     told = {"solver": json.dumps(status), **told, "exchange_error": lost, **attrs}
     more, signals = runrecord.followed(asked.start, events, grid)
-    ds = record.collect(apu, {**rows, **more}, asked.noise, rng, told, signals)
+    ds = record.collect(apu, {**rows, **more}, asked.noise, system.rng, told, signals)
     notes = [ApuWarning(words) for words in (*machines.spikes, *record.warnings)]
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
     starved = validity.fuel_limited(apu, grid, N, Wf)
