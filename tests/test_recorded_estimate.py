@@ -217,6 +217,34 @@ def test_a_wrong_sensor_is_doubted(readings):
     assert "NOT TO BE BELIEVED" in e.summary()
 
 
+def test_a_short_circuit_too_small_to_report_is_no_change_of_health():
+    """h = 4.95e-4 is not reported, but neither is the change of health believed."""
+    fault = Ttsc(mu=0.05, k_rf=100.0, phase="b")
+    ds = simulate_joint(
+        APU, duration=0.2, load=SeriesLoad.from_power(100e3), health={"f_eta_c": 0.92},
+        fault=fault, dt=0.005, waveform_dt=1e-4,
+    )  # fmt: skip
+    made = measure_run(ds, APU, SEED, gains=False)
+    arrays = ({"t": d["time"].values, **{n: d[n].values for n in d}} for d in made.values())
+    e = estimate(read_recording(*arrays), backend="vm")
+    assert "f_eta_c" in e.report()["gaspath"]["changed"]
+    assert not e.machines[1]["faulty_phase"].values.any()
+    h, sigma = (e.machines[1][n].values[-1] for n in ("h_b", "h_b_sigma"))
+    assert abs(h - 0.05 / 100.95) < 3 * sigma
+    assert any(d.startswith("a short circuit of h_b") for d in e.doubts)
+
+
+def test_a_filter_that_begins_again_and_again_is_doubted(readings):
+    """All currents jump by 30 % every 25 ms, and nothing else does."""
+    w = readings["electrical"]
+    data = {n: w[n].values.copy() for n in w}
+    t = w["time"].values
+    for p in "abc":
+        data[f"i_{p}"] *= 1 + 0.3 * ((t > 0.03) & (t % 0.05 < 0.025))
+    e = estimate(read_recording({"t": t, **data}), backend="vm")
+    assert any("began anew" in d for d in e.doubts) or "resets" in e.lacking["severity, machine 1"]
+
+
 def test_a_stuck_sensor_is_doubted(readings):
     gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf").items()}
     gas["t"] = 0.02 * np.arange(gas["t"].size)
@@ -307,7 +335,12 @@ def test_commands(run, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     results.save(run, "run.nc")
     assert cli.main(["measure", "run.nc", "--seed", "3", "--out", "r.csv"]) == 0
-    assert "r_electrical.csv: v_a" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "r_electrical.csv: v_a" in said and "note:" not in said
+    coarse = json.loads(run.attrs["solver"]) | {"exchange": "paper", "dt": 0.02}
+    results.save(run.assign_attrs(solver=json.dumps(coarse)), "coarse.nc")
+    assert cli.main(["measure", "coarse.nc", "--out", "c.csv"]) == 0
+    assert "note: exchange 'paper' every 20 ms makes kinks" in capsys.readouterr().out
     assert len(pd.read_csv("r_gaspath.csv")) == 11
     command = ["estimate", "data", "r_gaspath.csv", "--altitude", "100", "--out", "o", "--json"]
     assert cli.main(command) == 0

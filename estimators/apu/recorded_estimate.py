@@ -35,7 +35,15 @@ from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES
 from estimators.apu.gaspath import N_SIGMA, GasPathFilter, gas_path_filter
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import Tracked, track_jumps
-from estimators.apu.joint import ETA_SIGMA, H_GAIN, ElectricalSide, electrical_side, fused, unit_of
+from estimators.apu.joint import (
+    ETA_SIGMA,
+    H_FLOOR,
+    H_GAIN,
+    ElectricalSide,
+    electrical_side,
+    fused,
+    unit_of,
+)
 from estimators.apu.recorded_report import (
     SURE,
     Z95,
@@ -64,6 +72,7 @@ PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
+RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 STILL = 25  # equal readings in a row that noise does not give
 FEWEST = 20  # innovations that a verdict takes
 STEEP = 0.1  # change of a factor beyond which no filter was tried
@@ -150,7 +159,7 @@ def estimate(
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
     table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
     lacking: dict[str, str] = {}
-    notes, doubts = list(m.notes), list(_odd_channels(m))
+    notes, doubts = list(m.notes), list(_odd_channels(m, table))
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     reason = None if only == "electrical" else _no_gas_path(m, table)
@@ -223,9 +232,10 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     return None
 
 
-def _odd_channels(m: Measurements) -> Iterator[str]:
-    """Say which channels stand still while most others move, or are clipped."""
-    sensors = {n: c for n, c in m.items() if n not in CONDITIONS and np.isfinite(c.values).any()}
+def _odd_channels(m: Measurements, table: SensorSet) -> Iterator[str]:
+    """Say which sensors stand still while most others move, or are clipped."""
+    used = (*table.names, *m.electrical)
+    sensors = {n: c for n, c in m.items() if n in used and np.isfinite(c.values).any()}
     for n, c in sensors.items():
         others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
         rows = _still(c.values, others)
@@ -333,7 +343,7 @@ class _Waves:
         # gain errors are taken for noise, so that they are there as offsets
         found = [(v - DT, v + DT) for v in (side.t[0], *side.resets)]
         odd = _unexplained(side.result, found, offset=3.0)
-        doubts += (f"machine {self.number}, {text}" for text in odd)
+        doubts += (f"machine {self.number}, {text}" for text in (*odd, *_restless(side)))
         return side
 
 
@@ -358,8 +368,9 @@ class _GasPath:
         """Filter, with the power of the electrical side where there is one."""
         sides = list(of.values())
         power = bool(sides) or "PW" in self.m
-        keep = [n for n in self.table.names if n in self.m or n in ("N", "Wf", "PW")]
-        sensors = self.table.only(keep)
+        # speed and the measured inputs stay in the table
+        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
+        sensors = self.table.only([n for n in self.table.names if n not in absent])
         inputs = self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
@@ -500,6 +511,24 @@ def _unexplained(
         # white, if the filter is right
         elif abs(z.mean()) > offset + 6 / math.sqrt(z.size):
             yield f"{name}: its innovations have a mean of {z.mean():+.2f} sigma"
+
+
+def _restless(side: ElectricalSide) -> Iterator[str]:
+    """Say where the electrical filter starts again and again, or finds several phases faulty."""
+    often = [v for k, v in enumerate(side.resets[2:]) if v - side.resets[k] <= RESTLESS]
+    if often:
+        yield (
+            f"its filter began anew {len(side.resets)} times up to {side.resets[-1]:g} s, as after "
+            "a step of load or a fault: no model of one step fits, and reports around are doubtful"
+        )
+    h, s = side.severities
+    second = np.sort((h - H_FLOOR) / s, axis=0)[-2]
+    several = np.flatnonzero((side.phase > 0) & (second > 5))
+    if several.size:
+        yield (
+            f"at {side.t[several[0]]:g} s several phases look faulty at once, which is no short "
+            "circuit of one phase"
+        )
 
 
 def _judge_gas(

@@ -155,7 +155,7 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
             f"{100 * Z95 * s['sigma']:.3f})"
         )
         for t in s["alarms"]:
-            yield f"  it changed before {t:g} s; a load, a fault or a sensor does that"
+            yield f"  it changed before {t:.2f} s; a load, a fault or a sensor does that"
         if not s["alarms"]:
             few = f"{s['windows']} windows are too few to look for a change"
             yield "  no change of it" if s["reference_windows"] else f"  {few}"

@@ -64,12 +64,27 @@ def run(args: argparse.Namespace) -> int:
     what = {
         str(p): [str(n) for n in r.data_vars] for p, r in zip(made, readings.values(), strict=True)
     }
+    remarks = _remarks(ds) if "electrical" in readings else []
     if args.json:
-        jsontext.show({"seed": args.seed, "gains": args.gains, "written": what})
+        told = {"seed": args.seed, "gains": args.gains, "written": what, "remarks": remarks}
+        jsontext.show(told)
         return 0
     for path, names in what.items():
         print(f"written: {path}: {', '.join(names)}")
+    print(*(f"note: {r}" for r in remarks), sep="\n", end="\n" * bool(remarks))
     return 0
+
+
+def _remarks(ds: Any) -> list[str]:
+    """Say where the run's exchange is coarser than what electrical filters resolve."""
+    by = json.loads(ds.attrs.get("solver", "{}"))
+    if by.get("exchange") == "corrected" and by.get("dt", 0.0) <= 0.005 + 1e-9:
+        return []
+    return [
+        f"exchange {by.get('exchange')!r} every {1e3 * by.get('dt', 0.0):g} ms makes kinks of speed "
+        "and voltage that an electrical filter takes for changes of the machine; a scenario with "
+        "exchange = 'corrected' and dt = 0.005 has none"
+    ]
 
 
 def _unit(args: argparse.Namespace, ds: Any) -> Apu:
