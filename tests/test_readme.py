@@ -1,6 +1,7 @@
 """README.md tells the truth: examples run, numbers are computed, links lead somewhere."""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -65,7 +66,7 @@ def test_the_commands_of_the_table_exist():
     lines = set(re.findall(r"`apu ([^`]*)`", README)) - {"COMMAND --help"}
     assert len(lines) >= 6
     for line in lines:
-        assert cli.parser().parse_args(line.split())
+        assert cli.parser().parse_args(shlex.split(line))
 
 
 def test_every_subcommand_is_in_the_readme():

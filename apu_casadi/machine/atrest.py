@@ -15,7 +15,7 @@ import numpy as np
 
 from apu_casadi.core.errors import OperatingPointError
 from apu_casadi.core.means import PHASORS, RMS, SEQUENCES, sequences
-from apu_casadi.core.sharing import derived
+from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import Load
@@ -29,7 +29,7 @@ from apu_casadi.machine.wrsg import Windings, saturation
 
 
 @dataclass(frozen=True, eq=False)
-class GeneratorPoint:
+class GeneratorPoint(Parametric):
     """A steady state of the generator.
 
     Args:

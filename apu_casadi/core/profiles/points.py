@@ -29,7 +29,7 @@ from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import PROFILES, Profile, in_run
 from apu_casadi.core.register import Key
-from apu_casadi.core.sharing import derived
+from apu_casadi.core.sharing import Parametric, derived
 
 FILE_KEYS = ("file", "column", "time")
 """Keys of a profile that is read from a file; the last two have defaults."""
@@ -38,7 +38,7 @@ LARGEST_FILE = 1 << 26
 
 
 @dataclass(frozen=True)
-class OfPoints(Profile):
+class OfPoints(Parametric, Profile):
     """Values at times; a base of kinds that say what holds in between.
 
     Args:
