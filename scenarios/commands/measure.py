@@ -80,8 +80,9 @@ def _remarks(ds: Any) -> list[str]:
     by = json.loads(ds.attrs.get("solver", "{}"))
     if by.get("exchange") == "corrected" and by.get("dt", 0.0) <= 0.005 + 1e-9:
         return []
+    ms = 1e3 * by.get("dt", 0.0)
     return [
-        f"exchange {by.get('exchange')!r} every {1e3 * by.get('dt', 0.0):g} ms makes kinks of speed "
+        f"exchange {by.get('exchange')!r} every {ms:g} ms makes kinks of speed "
         "and voltage that an electrical filter takes for changes of the machine; a scenario with "
         "exchange = 'corrected' and dt = 0.005 has none"
     ]
