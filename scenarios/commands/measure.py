@@ -82,9 +82,9 @@ def _remarks(ds: Any) -> list[str]:
         return []
     ms = 1e3 * by.get("dt", 0.0)
     return [
-        f"exchange {by.get('exchange')!r} every {ms:g} ms makes kinks of speed "
-        "and voltage that an electrical filter takes for changes of the machine; a scenario with "
-        "exchange = 'corrected' and dt = 0.005 has none"
+        f"with exchange {by.get('exchange')!r} every {ms:g} ms speed and voltage have kinks, which an "
+        "electrical filter may take for changes of the machine; none were seen with "
+        "exchange = 'corrected' and dt = 0.005 in the scenario"
     ]
 
 
