@@ -82,8 +82,8 @@ def _remarks(ds: Any) -> list[str]:
         return []
     ms = 1e3 * by.get("dt", 0.0)
     return [
-        f"with exchange {by.get('exchange')!r} every {ms:g} ms speed and voltage have kinks, which an "
-        "electrical filter may take for changes of the machine; none were seen with "
+        f"with exchange {by.get('exchange')!r} every {ms:g} ms speed and voltage have kinks, "
+        "which an electrical filter may take for changes of the machine; none were seen with "
         "exchange = 'corrected' and dt = 0.005 in the scenario"
     ]
 
