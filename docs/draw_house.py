@@ -27,6 +27,7 @@ scenarios.figures       0.34 5 0.30 all that draws
 scenarios.validation    0.70 6 0.28 against others
 scenarios.studies       0.34 6 0.30 one file a study
 scenarios.registry      0.00 6 0.30 schema, library, campaigns
+scenarios.export        0.00 7 0.30 C functions, FMUs
 scenarios.pages         0.34 7 0.30 pages and templates
 scenarios.bench         0.70 7 0.28 times and targets
 scenarios.commands      0.00 8 0.98 the command line: parse, call, print
