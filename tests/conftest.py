@@ -2,7 +2,7 @@
 
 Most run in CasADi's virtual machine: the C compiler would take longer than they do, and compiled
 code gives the same numbers.  Marked ``compiled`` are those about compiled code itself.
-``APU_BACKEND=auto pytest`` compiles in all of them; ``.ci/run`` does that once.
+``APU_BACKEND=auto pytest`` compiles in all of them; ``.ci/run`` does in a choice.
 """
 
 import hashlib
