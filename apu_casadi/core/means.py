@@ -225,6 +225,14 @@ def _positive(means: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.array(rows)
 
 
+def fortescue(q: np.ndarray | Sequence[Any]) -> list[Any]:
+    """Return positive, negative and zero sequence of the phasors of phases a, b, c (Fortescue)."""
+    a = np.exp(2j * math.pi / 3)
+    rows = [(1, a, a.conjugate()), (1, a.conjugate(), a), (1, 1, 1)]
+    # no matrix products: their last bits depend on the shape
+    return [sum((c * p for c, p in zip(row, q, strict=True)), 0.0 * q[0]) / 3.0 for row in rows]
+
+
 def sequences(parts: np.ndarray, *, symmetric: bool = False) -> np.ndarray:
     """Return symmetrical components in the order of ``SEQUENCES`` from phasors.
 
@@ -233,12 +241,9 @@ def sequences(parts: np.ndarray, *, symmetric: bool = False) -> np.ndarray:
         symmetric: whether there is a positive sequence only; the others are then zero, and have
             the angle zero.  A ratio is NaN where there is no positive sequence.
     """
-    a = np.exp(2j * math.pi / 3)
-    rows = [(1, a, a.conjugate()), (1, a.conjugate(), a), (1, 1, 1)]
     phasors, found = np.asarray(parts)[0::2] + 1j * np.asarray(parts)[1::2], []
-    for q in (phasors[:3], phasors[3:]):  # no matrix products: their last bits depend on the shape
-        for k, row in enumerate(rows):
-            total = sum((c * p for c, p in zip(row, q, strict=True)), 0.0 * q[0]) / 3.0
+    for q in (phasors[:3], phasors[3:]):
+        for k, total in enumerate(fortescue(q)):
             found.append(np.zeros_like(total) if symmetric and k else total)
     size = np.sqrt([f.real**2 + f.imag**2 for f in found])
     angle = np.arctan2([f.imag for f in found], [f.real for f in found])

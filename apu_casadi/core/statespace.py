@@ -11,7 +11,7 @@ to make, compiled code above all, is made of the family, once, and takes the num
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -111,19 +111,9 @@ class StateSpace(Parametric):
             theta: the entries before them.
             numbers: values of the others.
         """
-        sizes = [len(s) for s in (family.x, family.z, family.u, theta)]
         # calls of the family's functions: written out again they would take longer to make
-        x, z, u, th = (ca.MX.sym(n, k) for n, k in zip(("x", "z", "u", "t"), sizes, strict=True))
-        full = ca.vertcat(th, ca.DM(list(numbers)))
-        made = cls.of(
-            name,
-            (family.x, family.z, family.u, theta, family.y),
-            (x, z, u, th),
-            dae=family.residual(x, z, u, full),
-            f=family.f(x, u, full),
-            g=family.g(x, u, full),
-            z=family.z_of(x, u, full),
-        )
+        tail = ca.DM(list(numbers))
+        made = cls._called(name, family, theta, ca.MX, lambda th: ca.vertcat(th, tail))
         return replace(made, family=family, numbers=tuple(float(n) for n in numbers))
 
     def with_free(self, *names: str) -> StateSpace:
@@ -149,18 +139,26 @@ class StateSpace(Parametric):
         family = self.shared
         last = [n for n in family.theta.names if n in self.held and n not in names]
         theta = Signals([family.theta[n] for n in (*self.theta.names, *names, *last)])
-        sizes = [len(s) for s in (family.x, family.z, family.u, theta)]
         kind = ca.SX if family.f.is_a("SXFunction") else ca.MX
+        order = theta.indices(family.theta.names)
+        return StateSpace._called(family.name, family, theta, kind, lambda th: th[order])
+
+    @classmethod
+    def _called(
+        cls, name: str, family: StateSpace, theta: Signals, kind: Any, full: Callable[[Any], Any]
+    ) -> Self:
+        """Return the family's functions called with its whole theta made of another one."""
+        sizes = [len(s) for s in (family.x, family.z, family.u, theta)]
         x, z, u, th = (kind.sym(n, k) for n, k in zip("xzut", sizes, strict=True))
-        full = th[theta.indices(family.theta.names)]
-        return StateSpace.of(
-            family.name,
+        whole = full(th)
+        return cls.of(
+            name,
             (family.x, family.z, family.u, theta, family.y),
             (x, z, u, th),
-            dae=family.residual(x, z, u, full),
-            f=family.f(x, u, full),
-            g=family.g(x, u, full),
-            z=family.z_of(x, u, full),
+            dae=family.residual(x, z, u, whole),
+            f=family.f(x, u, whole),
+            g=family.g(x, u, whole),
+            z=family.z_of(x, u, whole),
         )
 
     @classmethod

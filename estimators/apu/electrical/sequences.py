@@ -18,6 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.means import fortescue
 
 __all__ = ["WINDOW", "Sequences", "sequences"]
 
@@ -104,9 +105,7 @@ def _phasors(t: np.ndarray, x: np.ndarray, f: float) -> tuple[np.ndarray, float]
     w = 2 * math.pi * f * (t - t[0])
     basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
     c = np.linalg.lstsq(basis, x.T, rcond=None)[0]
-    a, b, z = c[0] + 1j * c[1]
-    # phase b lags by 120 degrees in the positive sequence
-    parts = np.array([a + TURN * b + TURN**2 * z, a + TURN**2 * b + TURN * z, a + b + z]) / 3
+    parts = np.array(fortescue(c[0] + 1j * c[1]))
     return parts, float(np.sqrt(np.mean((x.T - basis @ c) ** 2)))
 
 
