@@ -227,37 +227,22 @@ FMI Status fmi2SetTime(void *c, double time)
 
 FMI Status fmi2SetContinuousStates(void *c, const double x[], size_t n)
 {
-  Unit *u = c;
-  if (n != N_X)
-    return WRONG;
-  memcpy(u->v + AT_X, x, n * sizeof(double));
-  u->stale = 1;
-  return FINE;
-}
-
-static Status give(Unit *u, const double *from, double *to, size_t n, int fresh)
-{
-  const Status status = fresh ? unit_refresh(u) : FINE;
-  if (n != N_X)
-    return WRONG;
-  if (status == FINE)
-    memcpy(to, from, n * sizeof(double));
-  return status;
+  return unit_move(c, x, n);
 }
 
 FMI Status fmi2GetDerivatives(void *c, double rates[], size_t n)
 {
-  return give(c, ((Unit *)c)->v + AT_D, rates, n, 1);
+  return unit_give(c, ((Unit *)c)->v + AT_D, rates, n, 1);
 }
 
 FMI Status fmi2GetContinuousStates(void *c, double x[], size_t n)
 {
-  return give(c, ((Unit *)c)->v + AT_X, x, n, 0);
+  return unit_give(c, ((Unit *)c)->v + AT_X, x, n, 0);
 }
 
 FMI Status fmi2GetNominalsOfContinuousStates(void *c, double nominals[], size_t n)
 {
-  return give(c, X_NOMINAL, nominals, n, 0);
+  return unit_give(c, X_NOMINAL, nominals, n, 0);
 }
 
 FMI Status fmi2GetEventIndicators(void *c, double indicators[], size_t n)

@@ -45,6 +45,25 @@ int unit_get(Unit *u, unsigned int at, double *value)
   return FINE;
 }
 
+int unit_give(Unit *u, const double *from, double *to, size_t n, int fresh)
+{
+  const int status = fresh ? unit_refresh(u) : FINE;
+  if (n != N_X)
+    return WRONG;
+  if (status == FINE)
+    memcpy(to, from, n * sizeof(double));
+  return status;
+}
+
+int unit_move(Unit *u, const double *x, size_t n)
+{
+  if (n != N_X)
+    return WRONG;
+  memcpy(u->v + AT_X, x, n * sizeof(double));
+  u->stale = 1;
+  return FINE;
+}
+
 int unit_set(Unit *u, unsigned int at, double value)
 {
   if (at < AT_U || at >= AT_D)

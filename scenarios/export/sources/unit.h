@@ -6,6 +6,8 @@
 #ifndef UNIT_H
 #define UNIT_H
 
+#include <stddef.h>
+
 #include "model.h"
 
 enum {
@@ -81,6 +83,9 @@ void unit_reset(Unit *u);
 int unit_refresh(Unit *u);
 int unit_get(Unit *u, unsigned int at, double *value);
 int unit_set(Unit *u, unsigned int at, double value);
+/* n values, one a state: rates (fresh), states, magnitudes */
+int unit_give(Unit *u, const double *from, double *to, size_t n, int fresh);
+int unit_move(Unit *u, const double *x, size_t n);
 int unit_advance(Unit *u, double t, double h);
 int unit_call(Unit *u, Function f, const double *const *in, int n_in, double *const *out,
               int n_out);
