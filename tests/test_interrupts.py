@@ -21,8 +21,8 @@ from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.interrupts import watched
 from scenarios.shell import guard
 
-ANSWER = 3.0
-"""Seconds allowed for an answer that takes 0.6 s at most on a machine with nothing else to do."""
+ANSWER = 15.0
+"""Seconds until an answer that takes 0.6 s on a quiet machine; work left alone goes on longer."""
 
 
 @pytest.fixture

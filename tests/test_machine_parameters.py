@@ -2,7 +2,6 @@
 
 import gc
 import math
-import time
 import weakref
 
 import casadi as ca
@@ -128,11 +127,8 @@ def test_a_second_exciter_without_saturation_is_a_structure_of_its_own():
     assert point.y["E_fd"] == pytest.approx(point.ss.x.unpack(point.x)["V_R"], rel=1e-12)
 
 
-def test_units_leave_nothing_behind_and_cost_little():
-    """200 units with a step each: their models are gone, and a unit takes under 60 ms.
-
-    It is 10 ms on a quiet core; before, each was compiled for seconds.
-    """
+def test_units_leave_nothing_behind_and_compile_nothing(asked):
+    """200 units with a step each: their models are gone, and only the first is compiled."""
     gone = []
 
     def step(k: int) -> float:
@@ -144,9 +140,9 @@ def test_units_leave_nothing_behind_and_cost_little():
         return power
 
     first = step(0)
-    began = time.process_time()
+    before = set(asked)
     powers = [step(k) for k in range(1, 200)]
-    assert (time.process_time() - began) / 199 < 0.06
+    assert before and asked == before
     assert all(math.isfinite(p) and p != first for p in powers)
     gc.collect()
     assert sum(r() is not None for r in gone) < 12

@@ -1,6 +1,5 @@
 """Averaged, linear and one-piece models of other units: shared, with exact derivatives."""
 
-import time
 from dataclasses import replace
 
 import casadi as ca
@@ -131,30 +130,22 @@ def test_a_free_parameter_changes_nothing_at_its_own_value(point):
         assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
-def test_another_unit_builds_nothing_and_costs_little():
-    """Linear models and a run of the averaged model: functions are shared, 30 ms over a repeat."""
+def test_another_unit_builds_and_compiles_nothing(asked):
+    """Linear models and a run of the averaged model: functions are shared."""
 
-    def use(unit: Apu) -> tuple[float, object]:
+    def use(unit: Apu) -> object:
         point = unit.steady_state(KW100)
-        t = time.process_time()
         linearise_gas_generator(unit.gas_generator, point.gas)
         linearise_generator(unit.generator, point.generator)
         ss, x, u, theta = joint_vectors(unit, point)
         stepper(ss, 2)(x, u, theta, 0.02)
-        return time.process_time() - t, ss.shared
+        return ss.shared
 
-    made = use(UNIT)[1]
-    first, again = [], []
+    made, before = use(UNIT), set(asked)
     for k in range(5):
-        unit = UNIT.change(
-            {"gas_generator.eta_c": 0.84 + 1e-3 * k, "machine.r_s": 0.004 + 1e-4 * k}
-        )
-        cost, shared = use(unit)
-        assert shared is made
-        first.append(cost)
-        again.append(use(unit)[0])
-    # three models, of which none takes longer than 30 ms
-    assert min(first) < min(again) + 0.09
+        unit = {"gas_generator.eta_c": 0.84 + 1e-3 * k, "machine.r_s": 0.004 + 1e-4 * k}
+        assert use(UNIT.change(unit)) is made
+    assert before and asked == before
 
 
 @pytest.mark.parametrize(("load", "fault"), [(KW100, None), (LAGGING, Ttsc(0.05, 1.0, 1.0))])
