@@ -22,10 +22,10 @@ from estimators.filters.ekf import extended_kalman_filter
 from estimators.filters.filterpy_adapter import filterpy_ekf, filterpy_ukf, run_filterpy
 from estimators.filters.imm import interacting_multiple_models
 from estimators.filters.ukf import unscented_kalman_filter
+from estimators.models.angles import angular
 from estimators.models.filtermodel import (
     FilterModel,
     Unknown,
-    angular,
     augment,
     biases,
     measure,

@@ -14,6 +14,9 @@ What to know of filterpy (2.0.0):
   in a sample is refused here.
 - ``rts_smoother`` of the unscented filter ignores its argument ``Qs``: it takes the last ``Q`` for
   all steps.  Use :func:`estimators.batch.smoother.rts_smoother`.
+- ``FixedLagSmoother`` begins its gains with the covariance after the sample instead of before it,
+  and takes the present gain for all lags: on a random system of three states it is off by standard
+  deviations.  Use :func:`estimators.batch.smoother.fixed_lag_smoother`.
 - ``MMAEFilterBank`` takes single components of the mean for the mean when it forms the covariance;
   ``IMMEstimator`` calls ``update(z)``, which extended filters do not have.  The extended filter
   here does.

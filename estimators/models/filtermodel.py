@@ -8,8 +8,9 @@ taken, then the state goes on to the next sample:
 
 with w(k), xi(k) white and of unit variance, and v(k) of the variances that come with the data.  The
 *same* w(k) enters output and transition: the error of a measured input does so too, and a filter
-that forgets it claims a wrong variance.  An output that :func:`angular` declares is read modulo its
-period: y - g is then taken the short way round, by every estimator alike.
+that forgets it claims a wrong variance.  An output that
+:func:`~estimators.models.angles.angular` declares is read modulo its period: y - g is then taken
+the short way round, by every estimator alike.
 
 :func:`discretise` makes a model from any :class:`~apu_casadi.core.statespace.StateSpace`; the other
 functions return changed models: :func:`measure` (which outputs there are), :func:`noisy_inputs`,
@@ -44,7 +45,6 @@ __all__ = [
     "CHECK_TOL",
     "FilterModel",
     "Unknown",
-    "angular",
     "augment",
     "biases",
     "discretise",
@@ -58,8 +58,6 @@ __all__ = [
 #: Largest residual of eliminated unknowns with which a result of f or g is used.
 CHECK_TOL = 1e-9
 _ERROR = "error of the measured {} over its standard deviation"
-#: A full turn in the units of angles.
-PERIODS = {"rad": 2 * math.pi, "deg": 360.0, "degree": 360.0}
 METHODS = ("midpoint", "rk4", "implicit midpoint")
 _TRANSITION = ["x", "u", "p", "w", "dt"], ["x1", "check"]
 _OUTPUT = ["x", "u", "p", "w"], ["y", "check"]
@@ -107,7 +105,7 @@ class FilterModel(Parametric):
         walk: random-walk standard deviations, unit of x per sqrt(s), shape (nx,).
         lower, upper: bounds of x, shape (nx,).
         consider: states whose mean and variance the measurements do not touch.
-        angles: outputs that are read modulo a period, (name, period in its unit); :func:`angular`.
+        angles: outputs that are read modulo a period, (name, period in its unit).
 
     Raises:
         SignalError: a function's or vector's shape does not match the declared signals; a walk, a
@@ -381,40 +379,6 @@ def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
     output = ca.Function(f"{model.name}_g", [*s[:4]], [y[rows], check], *_OUTPUT)
     kept = Signals([model.y[i] for i in rows])
     return dataclasses.replace(model, y=kept, output=output, angles=_among(model.angles, kept))
-
-
-@remade
-@of_family
-def angular(model: FilterModel, outputs: Sequence[str] | Mapping[str, float | None]) -> FilterModel:
-    """Return the model whose named outputs are angles, read modulo a period.
-
-    A resolver gives 3.1 and then -3.1 rad: an innovation of +0.08, not of -6.2.  What the model
-    gives may count turns or be wrapped itself (``atan2``).  An angle is a number to a filter, with
-    a Gaussian error: it must be known to a small part of a turn before each sample, by prior and
-    rate of samples; a sample that is half a turn off may mean either way.
-
-    Args:
-        outputs: names, whose units give the periods (rad: 2 pi, deg: 360), or periods by name in
-            the output's unit, None for the unit's own.
-
-    Raises:
-        SignalError: unknown output.
-        ParameterError: a unit without a known period, a period that is not finite and > 0.
-    """
-    given = outputs if isinstance(outputs, Mapping) else dict.fromkeys(outputs)
-    angles = dict(model.angles)
-    for name, period in given.items():
-        unit = model.y[model.y.index(name)].unit
-        if period is None and unit not in PERIODS:
-            raise ParameterError(
-                f"{model.name}: {name} in {unit!r}: give the period of a turn; known are those "
-                f"of {', '.join(PERIODS)}"
-            )
-        T = PERIODS[unit] if period is None else number(f"period of {name}", period)
-        if not 0 < T < math.inf:
-            raise ParameterError(f"period of {name} must be finite and > 0, got {period!r}")
-        angles[name] = T
-    return dataclasses.replace(model, angles=tuple(angles.items()))
 
 
 @remade
