@@ -51,6 +51,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
+from estimators.apu.priorfile import Prior
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, StepMaker, run
@@ -140,7 +141,8 @@ def loosened(sensors: SensorSet) -> SensorSet:
     noise = {}
     for s in sensors.sensors:
         size = rated.get(s.name, rated.get(s.name[0])) if s.name != "w_r" else 0.0
-        noise[s.name] = math.hypot(s.noise, s.gain * float(size or 0.0) / math.sqrt(2))
+        gain = s.unsure("gain") * float(size or 0.0) / math.sqrt(2)
+        noise[s.name] = math.hypot(s.noise, gain, s.unsure("bias"))
     return sensors.change(**noise)
 
 
@@ -392,6 +394,7 @@ def fused(
     power: bool = True,
     efficiency_error: float = 0.0,
     prior: Mapping[str, float] | None = None,
+    spread: Prior | None = None,
     inputs: Mapping[str, Any] | None = None,
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
@@ -411,6 +414,7 @@ def fused(
         power: whether the filter gets the shaft power.
         efficiency_error: actual relative error of the generators' efficiency.
         prior: means of the start by state.
+        spread: of which the standard deviations are taken.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
         eta, gain_errors, step, backend: as for :func:`estimate_joint`.
     """
@@ -434,7 +438,9 @@ def fused(
         N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
         N[rows], N_sigma[rows] = speed_from_generators(*speed, speed_sigma, data.t[rows], apu)
         data = better_speed(gas, data, N, N_sigma)
-    start = gas.prior(**(prior or {}))
+    if spread is not None:
+        spread.check(gas.model.x)
+    start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
     return gas, track_jumps(gas, data, test=TEST, prior=start, step=step, backend=backend)
 
 

@@ -15,7 +15,7 @@ believed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +28,7 @@ from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
+from estimators.apu.declared import as_declared, tables
 from estimators.apu.electrical.electricalfilter import window_starts
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
@@ -44,6 +45,7 @@ from estimators.apu.joint import (
     fused,
     unit_of,
 )
+from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
     SURE,
     Z95,
@@ -56,7 +58,8 @@ from estimators.apu.recorded_report import (
 )
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.recordings.plausible import WAVES, clipped, plain
-from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
+from estimators.apu.sensorfile import SensorFile
+from estimators.apu.sensors import ELECTRICAL, SensorSet
 from estimators.filters.filtering import FilterResult
 from estimators.information.consistency import exceeded
 
@@ -131,9 +134,11 @@ def estimate(
     engine: Apu | str | Path | None = None,
     *,
     only: str | None = None,
-    sensors: SensorSet | None = None,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
     electrical_sensors: SensorSet = ELECTRICAL,
     ambient: Mapping[str, float] | None = None,
+    prior: Prior | str | Path | None = None,
+    efficiency_error: float = 0.0,
     backend: str | None = None,
 ) -> RecordedEstimate:
     """Estimate what the channels of a recording suffice for.
@@ -142,11 +147,14 @@ def estimate(
         m: of :func:`estimators.apu.recordings.measured.read_recording`.
         engine: the unit as the filters know it, or its file or name; the paper's by default.
         only: ``"gaspath"`` or ``"electrical"``; both by default.
-        sensors: 1-sigma table of the gas path; default: :func:`gas_path_table` and whatever known
-            sensor was measured besides.
-        electrical_sensors: the same of the generators.
+        sensors: of the gas path, or of all, or their file; default: :func:`gas_path_table` and
+            whatever known sensor was measured besides.
+        electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
+        prior: means and standard deviations of states of the gas-path filter, or their file.
+        efficiency_error: actual relative error of the generators' efficiency, where the shaft power
+            comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
 
     Raises:
@@ -157,9 +165,11 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
     lacking: dict[str, str] = {}
-    notes, doubts = list(m.notes), list(_odd_channels(m, table))
+    ready = as_declared(m, *tables(m, sensors, electrical_sensors))
+    m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
+    notes, doubts = [*m.notes, *ready.notes], list(_odd_channels(m, table, ready.coarse))
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     reason = None if only == "electrical" else _no_gas_path(m, table)
@@ -180,7 +190,8 @@ def estimate(
     e = None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
-        path = _GasPath(m, apu, table, ambient or {}, notes, doubts, backend)
+        told = ambient or {}, notes, doubts, backend, start, efficiency_error
+        path = _GasPath(m, apu, table, *told)
         filt, tracked = path.run(fusable, electrical_sensors)
         e = gas_dataset(filt, tracked)
         _judge_gas(filt, tracked, list(sides.values()), doubts)
@@ -227,18 +238,25 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     """Say why there is no gas-path estimate; None if there is one."""
     if "Wf" not in m or not np.isfinite(m["Wf"].values).any():
         return "the filter takes the fuel flow Wf as an input, which was not measured"
+    if "Wf" not in table:
+        return "the filter takes the fuel flow Wf as an input, which the file of sensors lacks"
     if not [n for n in table.outputs if n in m and n != "N"]:
         return f"none of {', '.join(n for n in table.outputs if n != 'N')} was measured"
     return None
 
 
-def _odd_channels(m: Measurements, table: SensorSet) -> Iterator[str]:
-    """Say which sensors stand still while most others move, or are clipped."""
+def _odd_channels(m: Measurements, table: SensorSet, coarse: Collection[str]) -> Iterator[str]:
+    """Say which sensors stand still while most others move, or are clipped.
+
+    Args:
+        m, table: readings and sensors of the gas path.
+        coarse: sensors whose digits are wider than their noise, which stand still often.
+    """
     used = (*table.names, *m.electrical)
     sensors = {n: c for n, c in m.items() if n in used and np.isfinite(c.values).any()}
     for n, c in sensors.items():
         others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
-        rows = _still(c.values, others)
+        rows = None if n in coarse else _still(c.values, others)
         if rows is not None:
             yield f"{c.source}: {n} stands still from {c.t[rows[0]]:g} to {c.t[rows[1]]:g} s"
         count = clipped(c.values) if plain(n) in WAVES else 0
@@ -311,7 +329,7 @@ class _Waves:
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
         what = f"severity, machine {self.number}"
-        no = self.m.lacking(NEEDED)
+        no = [n for n in NEEDED if n not in self.m or n not in self.sensors]
         if no:
             lacking[what] = f"the electrical filter needs {', '.join(no)} too"
             return None
@@ -361,13 +379,15 @@ class _GasPath:
     notes: list[str]
     doubts: list[str]
     backend: str | None
+    prior: Prior
+    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
     ) -> tuple[GasPathFilter, Tracked]:
         """Filter, with the power of the electrical side where there is one."""
         sides = list(of.values())
-        power = bool(sides) or "PW" in self.m
+        power = bool(sides) or ("PW" in self.m and "PW" in self.table)
         # speed and the measured inputs stay in the table
         absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
         sensors = self.table.only([n for n in self.table.names if n not in absent])
@@ -388,7 +408,9 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors),
+                prior=self._start(readings, sensors) | dict(self.prior.mean),
+                spread=self.prior,
+                efficiency_error=self.efficiency_error,
                 inputs=inputs,
                 backend=self.backend,
                 max_dt=STEP,
@@ -401,7 +423,9 @@ class _GasPath:
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        start = filt.prior(**self._start(readings, sensors))
+        self.prior.check(filt.model.x)
+        means = self._start(readings, sensors) | dict(self.prior.mean)
+        start = filt.prior(self.prior.sigma, **means)
         return filt, track_jumps(filt, data, prior=start, backend=self.backend)
 
     def _inputs(self) -> dict[str, Any]:

@@ -44,7 +44,8 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 {given.UNIT}
 {readingoptions.OPTIONS.strip()}
 --only {{gaspath,electrical}} | one of the two
---sensors FILE | noise and gain of sensors (TOML, as apu measure); default: apu estimate sensors
+--sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
+--prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep estimates, JSON and figure there
 --figures =on  | draw estimates and bands into it (default)
@@ -122,9 +123,9 @@ def _data(args: argparse.Namespace) -> int:
         m,
         apu,
         only=args.only,
-        sensors=sensors.gas_path.including(*m.gaspath),
-        electrical_sensors=sensors.electrical,
+        sensors=sensors,
         ambient=_day(args, m),
+        prior=args.prior,
     )
     report = e.report() | {"files": args.files, **given.own(args), **given.assumed(args)}
     made = []

@@ -51,6 +51,7 @@ from estimators.apu.electrical.tuning import (
     START_SIGMA,
     START_SIGMA_SHUNT,
 )
+from estimators.apu.sensorchain import spread
 from estimators.apu.sensors import ELECTRICAL, SensorSet
 from estimators.filters.belief import Belief
 from estimators.models.filtermodel import FilterModel, Unknown, augment
@@ -121,7 +122,9 @@ class ElectricalFilter(Parametric):
         t = a["t"]
         given = {n: a[n] for n in INPUTS.names}
         v = np.array([a[n] for n in PHASES_V])
-        given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=JUMP), strict=True))
+        # what is white beside the noise for which JUMP is made: jitter, digits
+        floor = max(JUMP, *(10 * self.sensors[n].rest for n in PHASES_V))
+        given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=floor), strict=True))
         jumped = np.any([given[n] > 0 for n in JUMP_SIZES.names], axis=0)
         mid = _middles(t, v, a["w_r"], jumped)
         given |= {n: np.maximum(given[n], off) for n in JUMP_SIZES.names}
@@ -136,8 +139,8 @@ class ElectricalFilter(Parametric):
             given["keep"][window_starts(t, 0.02 if window is None else window, start)] = 0.0
         u = self.model.u.pack(given)
         y = np.array([a[n] for n in MEASURED])
-        sigma = np.array([[self.sensors.sigma(n, 0.0)] for n in MEASURED])
-        variance = np.broadcast_to(sigma**2, y.shape).copy()
+        sigma = np.array([spread(self.sensors[n], t, a[n], wave=True) for n in MEASURED])
+        variance = sigma**2
         return Recording(t, u, y, variance, self.model.p.pack({}))
 
     def _filled(self, a: dict[str, np.ndarray]) -> np.ndarray:
