@@ -64,6 +64,7 @@ __all__ = [
     "ETA_SIGMA",
     "ElectricalSide",
     "JointCase",
+    "beside_truth",
     "better_speed",
     "cross_talk",
     "electrical_samples",
@@ -360,7 +361,7 @@ def estimate_joint(
     """
     apu = Apu() if apu is None else apu
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
-    t, rows = samples(ds)
+    t, _ = samples(ds)
     measured = electrical_samples(ds, apu, rng, sensors=electrical_sensors, gains=electrical_gains)
     how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend}
     also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
@@ -380,7 +381,7 @@ def estimate_joint(
         efficiency_error=(gas_gains or {}).get("PW", 0.0),
         **how,
     )
-    return _as_dataset(ds, t, rows, side, gas, tracked)
+    return beside_truth(ds, side, gas, tracked)
 
 
 def fused(
@@ -459,16 +460,18 @@ def _gas_filter(
     )
 
 
-def _as_dataset(
-    ds: xr.Dataset,
-    t: np.ndarray,
-    rows: np.ndarray,
-    side: ElectricalSide,
-    gas: GasPathFilter,
-    tracked: Tracked,
+def beside_truth(
+    ds: xr.Dataset, side: ElectricalSide, gas: GasPathFilter, tracked: Tracked
 ) -> xr.Dataset:
-    """Put estimates beside the truth."""
-    r = tracked.result
+    """Put estimates beside the truth of a run, as :func:`estimate_joint` returns them.
+
+    Args:
+        ds: the run.
+        side: of one machine; its instants are those of the result.
+        gas, tracked: filter and result of the gas path.
+    """
+    r, t = tracked.result, side.t
+    rows, k = (np.searchsorted(v, t + 1e-7) - 1 for v in (ds["time"].values, r.t))
     values: dict[str, Any] = {}
     signals: list[Signal] = []
 
@@ -479,7 +482,8 @@ def _as_dataset(
 
     for name in ("N", *HEALTH):
         x = gas.model.x[name]
-        put(name, x.unit, x.doc, *r[name], ds[name].values[rows])
+        mean, sigma = r[name]
+        put(name, x.unit, x.doc, mean[k], sigma[k], ds[name].values[rows])
     true_phase = _phase_of(ds)
     h, h_sigma = side.severities
     for i, phase in enumerate(PHASES):
@@ -494,11 +498,11 @@ def _as_dataset(
         Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c"),
         Signal("nis", "1", "normalised innovation squared of the gas-path filter"),
     ]
-    values |= {"faulty_phase": side.phase, "nis": r.nis}
+    values |= {"faulty_phase": side.phase, "nis": r.nis[k]}
     at = {
         "resets": side.resets,
-        "alarms": [float(t[i]) for i in tracked.alarms],
-        "onsets": [float(t[i]) for i in tracked.onsets],
+        "alarms": [float(r.t[i]) for i in tracked.alarms],
+        "onsets": [float(r.t[i]) for i in tracked.onsets],
     }
     attrs = {n: json.dumps(v) for n, v in at.items()}
     return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)

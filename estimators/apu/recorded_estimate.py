@@ -57,7 +57,6 @@ from estimators.apu.recorded_report import (
     words,
 )
 from estimators.apu.recordings.measured import Measurements
-from estimators.apu.recordings.plausible import WAVES, clipped, plain
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
 from estimators.filters.filtering import FilterResult
@@ -94,6 +93,8 @@ class RecordedEstimate:
         notes: how the recording was understood, and what was assumed.
         doubts: why the estimates are not to be believed.
         result: of the gas-path filter; None: not estimated.
+        path: the gas-path filter and its result with the jumps that it found.
+        sides: what the electrical filters say, by machine.
     """
 
     gaspath: xr.Dataset | None
@@ -104,6 +105,8 @@ class RecordedEstimate:
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
     result: FilterResult | None = field(default=None, repr=False)
+    path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
+    sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -169,7 +172,8 @@ def estimate(
     lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
-    notes, doubts = [*m.notes, *ready.notes], list(_odd_channels(m, table, ready.coarse))
+    notes = [*m.notes, *ready.notes]
+    doubts = [*ready.doubts, *_odd_channels(m, table, ready.coarse)]
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     reason = None if only == "electrical" else _no_gas_path(m, table)
@@ -186,13 +190,13 @@ def estimate(
                 sides[k] = side
     elif only == "electrical":
         lacking["generators"] = "nothing of them was measured"
-    tracked: Tracked | None = None
-    e = None
+    result, found_by, e = None, None, None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
         told = ambient or {}, notes, doubts, backend, start, efficiency_error
         path = _GasPath(m, apu, table, *told)
-        filt, tracked = path.run(fusable, electrical_sensors)
+        filt, tracked = found_by = path.run(fusable, electrical_sensors)
+        result = tracked.result
         e = gas_dataset(filt, tracked)
         _judge_gas(filt, tracked, list(sides.values()), doubts)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
@@ -206,9 +210,9 @@ def estimate(
             f"{len(apu.machines)} equal ones"
         )
     machines = {k: side_dataset(s) for k, s in sides.items()}
-    result = None if tracked is None else tracked.result
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, result)
+    more: dict[str, Any] = {"result": result, "path": found_by, "sides": sides}
+    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, **more)
 
 
 def _fusable(
@@ -246,7 +250,7 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
 
 
 def _odd_channels(m: Measurements, table: SensorSet, coarse: Collection[str]) -> Iterator[str]:
-    """Say which sensors stand still while most others move, or are clipped.
+    """Say which sensors stand still while most others move.
 
     Args:
         m, table: readings and sensors of the gas path.
@@ -259,9 +263,6 @@ def _odd_channels(m: Measurements, table: SensorSet, coarse: Collection[str]) ->
         rows = None if n in coarse else _still(c.values, others)
         if rows is not None:
             yield f"{c.source}: {n} stands still from {c.t[rows[0]]:g} to {c.t[rows[1]]:g} s"
-        count = clipped(c.values) if plain(n) in WAVES else 0
-        if count:
-            yield f"{c.source}: {count} samples of {n} are clipped"
 
 
 def _still(values: np.ndarray, others: Sequence[np.ndarray]) -> tuple[int, int] | None:

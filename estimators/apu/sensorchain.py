@@ -57,7 +57,9 @@ def sampled_wave(s: Sensor, t: np.ndarray, v: np.ndarray, of: Draws) -> np.ndarr
     if not (s.delay or s.jitter):
         return v
     at = t - s.delay + s.jitter * of.normal(s.name, "jitter", t.size)
-    return interpolated(t, v, np.clip(at, t[0], t[-1]))[0]
+    shown = interpolated(t, v, at)[0]
+    shown[(at < 2 * t[0] - t[1]) | (at > 2 * t[-1] - t[-2])] = np.nan  # nothing was there yet
+    return shown
 
 
 def _followed(t: np.ndarray, v: np.ndarray, tau: float) -> np.ndarray:
