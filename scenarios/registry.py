@@ -123,6 +123,8 @@ def run(
         ScenarioError, ParameterError: a wrong description; OperatingPointError, SimulationError :
             the unit cannot run so; DataError : ``out`` cannot be written.
     """
+    from apu_casadi.unit.departures import name_phases
+
     s = scenario if isinstance(scenario, Scenario) else get(scenario)
     if overrides:
         s = s.change(**overrides)
@@ -135,6 +137,7 @@ def run(
         raise ValidityError(f"in phase {inside[-1]!r}: {error.words}", error.t) from None
     ds.attrs["scenario"] = s.to_json()
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
+    name_phases(ds)
     if strange := implausible(s):
         ds.attrs["implausible"] = json.dumps(strange, ensure_ascii=False)
     if s.engine:
@@ -179,6 +182,7 @@ def _simulate(
         solver=solver,
         phasors=phasors,
         strict=strict,
+        limits=engine_file(s.engine).limits,
         progress=progress,
     )
 
@@ -205,7 +209,8 @@ _TOLD = {"assumed": "assumed_engine", "implausible": "implausible"}
 def summary(ds: xr.Dataset) -> dict[str, Any]:
     """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
     from apu_casadi.core.results import phase_summary
-    from apu_casadi.unit.validity import by_phase, found_in
+    from apu_casadi.unit.departures import by_phase, rows_of
+    from apu_casadi.unit.validity import found_in
 
     scenario, rows = _table(ds, "scenario"), phase_summary(ds)
     return {
@@ -217,7 +222,7 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
         **conditions(ds),
         "profiles": profiles(ds),
         "phases": [r | {"beyond": b} for r, b in zip(rows, by_phase(ds), strict=True)],
-        "validity": json.loads(ds.attrs.get("validity", "[]")),
+        "validity": rows_of(ds),
         "warnings": found_in(ds),
     }
 

@@ -31,6 +31,7 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.departures import departures
 from apu_casadi.unit.events import Ambient, Event, Holding, SpeedChange, all_factors, in_order
 from apu_casadi.unit.exchange import coupled
 from apu_casadi.unit.jointfamily import JointFamily
@@ -196,8 +197,8 @@ def simulate_monolithic(
     ds = dataset({"time": grid}, {"time": values}, signals=gg.Y, attrs=attrs)
     starved = validity.fuel_limited(apu, grid, values["N"], values["Wf"])
     unserved = validity.unserved(load, events, grid, values["P_e"])
-    notes = [ValidityWarning(words) for words in (starved, unserved) if words]
-    return validity.conclude(ds, validity.departures(gg, grid, values), notes)
+    notes = [d.warning(ValidityWarning) for d in (starved, unserved) if d]
+    return validity.conclude(ds, departures(gg, grid, values), notes)
 
 
 class _OneModel:
