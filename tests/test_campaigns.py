@@ -73,6 +73,7 @@ def test_a_base_without_faults_is_refused():
         random_faults(0)
 
 
+@pytest.mark.long
 def test_summaries_are_those_of_single_runs(base, tmp_path):
     runs = random_faults(2, 1, base=base)
     ds = run_campaign(runs, workers=1, out=tmp_path)
@@ -169,6 +170,7 @@ def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path, caplog):
         run_campaign([run], summary_only=False)
 
 
+@pytest.mark.long
 def test_processes_give_the_same_and_one_that_dies_is_told(base, monkeypatch):
     """Three workers' worth of tasks over two processes; one kills its process."""
     before = (dict(os.environ), sys.modules["__main__"].__dict__.get("__file__"))

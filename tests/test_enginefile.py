@@ -269,6 +269,7 @@ def test_figures_that_were_not_put_in_are_predicted(tpe):
     assert {a.name.split(".")[0] for a in tpe.assumed} >= {"machine", "exciter", "limits"}
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 def test_the_second_unit_compiles_nothing(tpe, monkeypatch):
     """Trim, deck and a joint run with load step and both faults, on what the default unit made."""
@@ -315,6 +316,7 @@ def test_its_faults_are_estimated(tpe):
 # ------------------------------------------------------------------------------ commands
 
 
+@pytest.mark.long
 def test_every_command_takes_a_unit(work, capsys, tpe):
     """Each runs with the shipped unit and tells once, on stderr or in JSON, what is assumed."""
     gg = tpe.unit.gas_generator
@@ -378,6 +380,7 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
     assert "the published points are those of the default unit" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_estimate_takes_a_unit(work, capsys):
     (work / "still.toml").write_text(RUN.partition('[[phase]]\nname = "ill"')[0])
     assert main(["estimate", "joint", "--scenario", "still.toml", "--json", "--figures"]) == 0

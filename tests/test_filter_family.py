@@ -70,6 +70,7 @@ def slopes(model: FilterModel, x, u, w, dt, first: int) -> np.ndarray:
 # ------------------------------------------------------------------------------ gas path
 
 
+@pytest.mark.long
 def test_derivatives_of_the_gas_path_filter_by_every_parameter_are_exact():
     """Transition and output by all parameters of the engine, against units made with them.
 
@@ -108,6 +109,7 @@ def truth():
     return simulate_joint(Apu(), duration=0.5, load=KW100, waveform_dt=None)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [None, ukf_step])
 def test_another_engine_builds_and_compiles_nothing(truth, step, asked, monkeypatch):
     """The block of the second engine's filter is the first one's; its beliefs are its own."""

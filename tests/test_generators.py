@@ -239,6 +239,7 @@ def test_shaft_power_is_the_sum_over_the_generators(n):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("waveform_dt", [None, 5e-5])
 @pytest.mark.parametrize("phase", "abc")
 def test_different_generators_by_blocks_equal_cvodes(waveform_dt, phase):
@@ -319,6 +320,7 @@ def test_different_generators_in_a_file_have_the_same_bits(piece, tmp_path, monk
 # -- what takes part, and what refuses ----------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [

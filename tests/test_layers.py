@@ -103,9 +103,8 @@ def imports(path: Path) -> list[tuple[int, str]]:
         elif isinstance(node, ast.ImportFrom):
             module = "." * node.level + (node.module or "")
             for a in node.names:
-                inner = ROOT.joinpath(*module.split("."), a.name)
-                is_module = inner.with_suffix(".py").exists() or (inner / "__init__.py").exists()
-                found.append((node.lineno, f"{module}.{a.name}" if is_module else module))
+                inner = f"{module}.{a.name}"
+                found.append((node.lineno, inner if inner in modules() else module))
     return sorted(set(found))
 
 

@@ -42,6 +42,7 @@ def propagated(ds):
     return json.loads(ds.attrs["solver"])["steps_propagated"] / (ds.sizes["time"] - 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("given", "least"),
     [
@@ -230,6 +231,7 @@ def test_wrong_values_in_a_file_are_told_with_their_place(tmp_path, old, new, me
     assert message in str(e.value)
 
 
+@pytest.mark.long
 def test_library_scenarios_campaign_and_figures(tmp_path):
     """Two short ones in a campaign; every figure of one, its profiles among them."""
     from scenarios.campaigns import run_campaign

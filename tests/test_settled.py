@@ -40,6 +40,7 @@ def run(apu=APU, **how):
     return simulate_joint(apu, **{"duration": 0.6, "waveform_dt": None, **how})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["auto", "cvodes"])
 @pytest.mark.parametrize(
     ("load", "fault"), [(UNEVEN, None), (KW100, FAULT), (UNEVEN, {2: FAULT})],
@@ -56,6 +57,7 @@ def test_nothing_moves_after_a_settled_start(load, fault, solver):
     assert json.loads(ds.attrs["warnings"]) == []
 
 
+@pytest.mark.long
 def test_it_is_where_a_run_from_the_balanced_start_ends():
     """After 6 s; the governor is the slowest."""
     late = run(duration=6.0, load=UNEVEN, fault=FAULT)

@@ -119,6 +119,7 @@ def test_within_the_limits_nothing_is_said(apu):
 # ------------------------------------------------------------------------------ overload
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["propagator", "cvodes", "predicted", "monolithic"])
 @pytest.mark.parametrize("load", [SeriesLoad.from_power(450e3), ConstantPowerLoad(400e3)])
 def test_an_overload_is_told_as_one(apu, way, load):
@@ -197,6 +198,7 @@ def truths(apu):
     }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["load step", "gas-path fault"])
 @pytest.mark.parametrize("exchange", ["paper", "predicted", "corrected"])
 def test_the_estimate_is_the_error(apu, truths, case, exchange):
@@ -346,6 +348,7 @@ def test_the_command_prints_each_warning_once_and_keeps_it(tmp_path, capsys):
         assert part in out
 
 
+@pytest.mark.long
 def test_the_command_takes_an_exchange(tmp_path, capsys):
     file = tmp_path / "surge.toml"
     file.write_text(SURGE.replace("exchange =", "# exchange ="), encoding="utf-8")
