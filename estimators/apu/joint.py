@@ -279,7 +279,7 @@ def electrical_side(
     for k in changes:
         begin = max([v for v in resets if v <= t[k] + 1e-9] + [float(t[0])])
         # whole windows: from the beginning of the one in which the machine changed
-        first = int(np.floor((begin - t[0]) / DT + 1e-6))
+        first = min(int(np.floor((begin - t[0]) / DT + 1e-6)), k - 1)
         _, P_k, var_k, _ = windows((PHASES[phase[k] - 1],), float(t[first]))
         last = k
         while last + 1 < K and phase[last + 1] == phase[k]:
@@ -396,6 +396,7 @@ def fused(
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
     step: StepMaker | None = None,
+    test: JumpTest = TEST,
     backend: str | None = None,
     max_dt: float = math.inf,
 ) -> tuple[GasPathFilter, Tracked]:
@@ -412,6 +413,7 @@ def fused(
         efficiency_error: actual relative error of the generators' efficiency.
         prior: means of the start by state.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
+        test: of jumps of the health.
         eta, gain_errors, step, backend: as for :func:`estimate_joint`.
     """
     gas = _gas_filter(apu, sensors, power, gain_errors, eta)
@@ -435,7 +437,7 @@ def fused(
         N[rows], N_sigma[rows] = speed_from_generators(*speed, speed_sigma, data.t[rows], apu)
         data = better_speed(gas, data, N, N_sigma)
     start = gas.prior(**(prior or {}))
-    return gas, track_jumps(gas, data, test=TEST, prior=start, step=step, backend=backend)
+    return gas, track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
 
 
 def _gas_filter(

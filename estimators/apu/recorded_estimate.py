@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +32,16 @@ from estimators.apu.electrical.electricalfilter import window_starts
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
 from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES_V, VOLTAGES
-from estimators.apu.gaspath import N_SIGMA, GasPathFilter, gas_path_filter
+from estimators.apu.electrical.wild import wild_samples
+from estimators.apu.gaspath import (
+    ITERATED,
+    ITERATIONS,
+    N_SIGMA,
+    GasPathFilter,
+    gas_path_filter,
+)
 from estimators.apu.gaspathmodel import DT
-from estimators.apu.healthjumps import Tracked, track_jumps
+from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.joint import (
     ETA_SIGMA,
     ElectricalSide,
@@ -52,6 +60,7 @@ from estimators.apu.recorded_report import (
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
 from estimators.filters.filtering import FilterResult
+from estimators.filters.robust import limit_of, robust_ekf_step
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -66,6 +75,9 @@ SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
 FEWEST = 20  # innovations that a verdict takes
+#: The gas path's filter step, and its test of jumps, that single wild readings do not reach.
+ROBUST = partial(robust_ekf_step, iterations=ITERATIONS, iterated=ITERATED)
+JUMPS = JumpTest(limit=limit_of())
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +173,7 @@ def estimate(
         for k in _machines(m):
             waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
             found |= waves.sequences(lacking)
-            side = waves.side(begin, lacking, doubts)
+            side = waves.side(begin, lacking, doubts, notes)
             if side is not None:
                 sides[k] = side
     elif only == "electrical":
@@ -270,7 +282,7 @@ class _Waves:
             )
 
     def side(
-        self, begin: float, lacking: dict[str, str], doubts: list[str]
+        self, begin: float, lacking: dict[str, str], doubts: list[str], notes: list[str]
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
         what = f"severity, machine {self.number}"
@@ -297,6 +309,7 @@ class _Waves:
             a = {n: v[a["t"] >= begin - 1e-9] for n, v in a.items()}
             if a["t"].size < 2 or a["t"][-1] - a["t"][0] < DT:
                 raise DataError(f"the waveforms hold no window of {DT * 1e3:g} ms")
+            a = self._tame(a, notes)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
             side = electrical_side(self.apu, self.sensors, a, t, backend=self.backend)
@@ -306,6 +319,17 @@ class _Waves:
         odd = machine_doubts(side, self.apu.generator.machine, self.sensors, a)
         doubts += (d.of(f"machine {self.number}") for d in odd)
         return side
+
+    def _tame(self, a: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
+        """Take single wild samples of the waveforms for missing."""
+        names = (*PHASES_V, *PHASES_I)
+        sigma = {n: self.sensors.sigma(n, 0.0) for n in names}
+        w = float(np.nanmedian(a["w_r"]))
+        wild = wild_samples(a["t"], {n: a[n] for n in names}, w, sigma)
+        told = ", ".join(f"{int(v.sum())} of {n}" for n, v in wild.items() if v.any())
+        if told:
+            notes.append(f"machine {self.number}: single wild samples are taken for gaps: {told}")
+        return a | {n: np.where(v, np.nan, a[n]) for n, v in wild.items() if v.any()}
 
 
 # ------------------------------------------------------------------------------ gas path
@@ -351,6 +375,8 @@ class _GasPath:
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
                 prior=self._start(readings, sensors),
                 inputs=inputs,
+                step=ROBUST,
+                test=JUMPS,
                 backend=self.backend,
                 max_dt=STEP,
             )
@@ -363,7 +389,8 @@ class _GasPath:
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
         start = filt.prior(**self._start(readings, sensors))
-        return filt, track_jumps(filt, data, prior=start, backend=self.backend)
+        how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
+        return filt, track_jumps(filt, data, prior=start, **how)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""
