@@ -25,7 +25,7 @@ level.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +37,6 @@ from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.gaspathmodel import engine_function
 from estimators.apu.joint import H_GAIN
 from estimators.apu.recorded_report import SURE, Z95
-from estimators.apu.recordings.plausible import WAVES, clipped, plain
 from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
@@ -98,19 +97,23 @@ class Doubt(str):
 # ------------------------------------------------------------------------------ channels
 
 
-def channel_doubts(m: Measurements, table: SensorSet) -> Iterator[Doubt]:
-    """Say which sensors stand still while most others move, or are clipped."""
+def channel_doubts(
+    m: Measurements, table: SensorSet, coarse: Collection[str] = ()
+) -> Iterator[Doubt]:
+    """Say which sensors stand still while most others move.
+
+    Args:
+        m, table: readings and sensors of the gas path.
+        coarse: sensors whose digits are wider than their noise, which stand still often.
+    """
     used = (*table.names, *m.electrical)
     sensors = {n: c for n, c in m.items() if n in used and np.isfinite(c.values).any()}
     for n, c in sensors.items():
         others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
-        rows = standing_still(c.values, others)
+        rows = None if n in coarse else standing_still(c.values, others)
         if rows is not None:
             a, b = (c.t[k] for k in rows)
             yield Doubt("sensor", f"{c.source}: {n} stands still from {a:g} to {b:g} s")
-        count = clipped(c.values) if plain(n) in WAVES else 0
-        if count:
-            yield Doubt("sensor", f"{c.source}: {count} samples of {n} are clipped")
 
 
 def standing_still(

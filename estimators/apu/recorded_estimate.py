@@ -28,6 +28,7 @@ from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
 from estimators.apu.believable import channel_doubts, gas_doubts, machine_doubts
+from estimators.apu.declared import as_declared, tables
 from estimators.apu.electrical.electricalfilter import window_starts
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
@@ -49,6 +50,7 @@ from estimators.apu.joint import (
     fused,
     unit_of,
 )
+from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
     gas_dataset,
     gas_report,
@@ -58,7 +60,8 @@ from estimators.apu.recorded_report import (
     words,
 )
 from estimators.apu.recordings.measured import Measurements
-from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
+from estimators.apu.sensorfile import SensorFile
+from estimators.apu.sensors import ELECTRICAL, SensorSet
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
 
@@ -93,6 +96,8 @@ class RecordedEstimate:
         notes: how the recording was understood, and what was assumed.
         doubts: why the estimates are not to be believed.
         result: of the gas-path filter; None: not estimated.
+        path: the gas-path filter and its result with the jumps that it found.
+        sides: what the electrical filters say, by machine.
     """
 
     gaspath: xr.Dataset | None
@@ -103,6 +108,8 @@ class RecordedEstimate:
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
     result: FilterResult | None = field(default=None, repr=False)
+    path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
+    sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -133,9 +140,11 @@ def estimate(
     engine: Apu | str | Path | None = None,
     *,
     only: str | None = None,
-    sensors: SensorSet | None = None,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
     electrical_sensors: SensorSet = ELECTRICAL,
     ambient: Mapping[str, float] | None = None,
+    prior: Prior | str | Path | None = None,
+    efficiency_error: float = 0.0,
     backend: str | None = None,
 ) -> RecordedEstimate:
     """Estimate what the channels of a recording suffice for.
@@ -144,11 +153,14 @@ def estimate(
         m: of :func:`estimators.apu.recordings.measured.read_recording`.
         engine: the unit as the filters know it, or its file or name; the paper's by default.
         only: ``"gaspath"`` or ``"electrical"``; both by default.
-        sensors: 1-sigma table of the gas path; default: :func:`gas_path_table` and whatever known
-            sensor was measured besides.
-        electrical_sensors: the same of the generators.
+        sensors: of the gas path, or of all, or their file; default: :func:`gas_path_table` and
+            whatever known sensor was measured besides.
+        electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
+        prior: means and standard deviations of states of the gas-path filter, or their file.
+        efficiency_error: actual relative error of the generators' efficiency, where the shaft power
+            comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
 
     Raises:
@@ -159,9 +171,12 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
     lacking: dict[str, str] = {}
-    notes, doubts = list(m.notes), list[str](channel_doubts(m, table))
+    ready = as_declared(m, *tables(m, sensors, electrical_sensors))
+    m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
+    notes = [*m.notes, *ready.notes]
+    doubts = [*ready.doubts, *channel_doubts(m, table, ready.coarse)]
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     reason = None if only == "electrical" else _no_gas_path(m, table)
@@ -178,12 +193,13 @@ def estimate(
                 sides[k] = side
     elif only == "electrical":
         lacking["generators"] = "nothing of them was measured"
-    tracked: Tracked | None = None
-    e = None
+    result, found_by, e = None, None, None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
-        path = _GasPath(m, apu, table, ambient or {}, notes, doubts, backend)
-        filt, tracked = path.run(fusable, electrical_sensors)
+        told = ambient or {}, notes, doubts, backend, start, efficiency_error
+        path = _GasPath(m, apu, table, *told)
+        filt, tracked = found_by = path.run(fusable, electrical_sensors)
+        result = tracked.result
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
@@ -197,9 +213,9 @@ def estimate(
             f"{len(apu.machines)} equal ones"
         )
     machines = {k: side_dataset(s) for k, s in sides.items()}
-    result = None if tracked is None else tracked.result
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, result)
+    more: dict[str, Any] = {"result": result, "path": found_by, "sides": sides}
+    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, **more)
 
 
 def _fusable(
@@ -229,6 +245,8 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     """Say why there is no gas-path estimate; None if there is one."""
     if "Wf" not in m or not np.isfinite(m["Wf"].values).any():
         return "the filter takes the fuel flow Wf as an input, which was not measured"
+    if "Wf" not in table:
+        return "the filter takes the fuel flow Wf as an input, which the file of sensors lacks"
     if not [n for n in table.outputs if n in m and n != "N"]:
         return f"none of {', '.join(n for n in table.outputs if n != 'N')} was measured"
     return None
@@ -286,7 +304,7 @@ class _Waves:
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
         what = f"severity, machine {self.number}"
-        no = self.m.lacking(NEEDED)
+        no = [n for n in NEEDED if n not in self.m or n not in self.sensors]
         if no:
             lacking[what] = f"the electrical filter needs {', '.join(no)} too"
             return None
@@ -346,13 +364,15 @@ class _GasPath:
     notes: list[str]
     doubts: list[str]
     backend: str | None
+    prior: Prior
+    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
     ) -> tuple[GasPathFilter, Tracked]:
         """Filter, with the power of the electrical side where there is one."""
         sides = list(of.values())
-        power = bool(sides) or "PW" in self.m
+        power = bool(sides) or ("PW" in self.m and "PW" in self.table)
         # speed and the measured inputs stay in the table
         absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
         sensors = self.table.only([n for n in self.table.names if n not in absent])
@@ -373,7 +393,9 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors),
+                prior=self._start(readings, sensors) | dict(self.prior.mean),
+                spread=self.prior,
+                efficiency_error=self.efficiency_error,
                 inputs=inputs,
                 step=ROBUST,
                 test=JUMPS,
@@ -388,7 +410,9 @@ class _GasPath:
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        start = filt.prior(**self._start(readings, sensors))
+        self.prior.check(filt.model.x)
+        means = self._start(readings, sensors) | dict(self.prior.mean)
+        start = filt.prior(self.prior.sigma, **means)
         how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
         return filt, track_jumps(filt, data, prior=start, **how)
 

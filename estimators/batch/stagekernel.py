@@ -66,7 +66,7 @@ def kernel(lifted: Lifted, names: tuple[str, ...]) -> Kernel:
         spread[i, j] = model.walk[i]
     if moving:
         x1 = x1 + ca.sqrt(dt) * ca.mtimes(spread, xi)
-    e = ca.vertcat((y - g) * weight, w, xi)
+    e = ca.vertcat(model.innovation(y, g) * weight, w, xi)
     c = ca.vertcat(x1 / model.x.nominals, c)
     J_e, J_c = ca.jacobian(e, q), ca.jacobian(c, q)
     le, lc = kind.sym("le"), kind.sym("lc", c.shape[0])

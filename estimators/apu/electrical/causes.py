@@ -6,7 +6,7 @@ likelihoods compare, and with prior odds give probabilities.
 
 =================== ============================================================================
 healthy             nothing that the filter does not know
-short circuit a     one phase has a severity (b, c)
+short circuit a     one phase has a severity, which comes with the change (b, c)
 hot winding         field and stator have other resistances
 sensor i_a          that current says nothing from the change on, stuck, biased or noisy (i_b, ...)
 voltage sensors     the same of the voltages, whose errors act as unknown steps
@@ -33,7 +33,9 @@ from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.terminalsignals import JUMP_SIZES, MEASURED
+from estimators.apu.electrical.tuning import RESET_SIGMA
 from estimators.apu.sensors import SensorSet
+from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, run
 from estimators.models.filtermodel import Unknown
@@ -111,7 +113,7 @@ class _Piece:
 
     def filter(self, **how: Any) -> tuple[ElectricalFilter, Recording]:
         """Return a filter and its recording."""
-        filt = electrical_filter(self.machine, sensors=self.sensors, **how)
+        filt = electrical_filter(self.machine, sensors=self.sensors, gains="estimate", **how)
         return filt, filt.recording(self.samples)
 
     def run(
@@ -122,6 +124,22 @@ class _Piece:
         data = data if change is None else change(data, filt)
         prior = filt.prior(self.samples)
         return run(ekf_step(filt.model), prior, data, backend=self.backend), data
+
+    def shorted(self, phase: str) -> float:
+        """Log-likelihood of a short circuit that comes with the change, or was there before."""
+        filt, data = self.filter(phases=(phase,))
+        prior, step = filt.prior(self.samples), ekf_step(filt.model)
+        cut = int(np.searchsorted(data.t, self.change - 1e-9))
+        if cut < 1:
+            return float(run(step, prior, data, backend=self.backend).loglik)
+        upto = data.part(0, cut + 1)
+        y = upto.y.copy()
+        y[:, -1] = np.nan  # the sample of the change is of what follows
+        first = run(step, prior, replace(upto, y=y), backend=self.backend)
+        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in filt.model.x.names]
+        then = Belief(filt.model.x, first.final.mean, first.final.cov + np.diag(wide))
+        rest = run(step, then, data.part(cut, data.size), backend=self.backend)
+        return float(first.loglik + rest.loglik)
 
     def late(self, data: Recording) -> np.ndarray:
         """Samples after the change."""
@@ -152,12 +170,10 @@ class _Piece:
 
         def off(size: float) -> Callable[[Recording, ElectricalFilter], Recording]:
             def change(data: Recording, filt: ElectricalFilter) -> Recording:
-                u = data.u.copy()
-                rows = [filt.model.u.index(n) for n in JUMP_SIZES.names]
-                late = self.late(data)
-                u[np.ix_(rows, np.flatnonzero(late))] = np.maximum(
-                    u[np.ix_(rows, np.flatnonzero(late))], size
-                )
+                u, late = data.u.copy(), self.late(data)
+                for n in JUMP_SIZES.names:
+                    i = filt.model.u.index(n)
+                    u[i] = np.where(late, np.maximum(u[i], size), u[i])
                 return replace(data, u=u)
 
             return change
@@ -212,7 +228,7 @@ def causes_of_change(
 
     judge("healthy", lambda: piece.healthy().loglik)
     for p in PHASES:
-        judge(f"short circuit {p}", lambda p=p: piece.run(phases=(p,))[0].loglik)  # type: ignore[misc]
+        judge(f"short circuit {p}", lambda p=p: piece.shorted(p))  # type: ignore[misc]
     warm = {f"machine.{n}": Unknown() for n in ("r_fd", "r_s")}
     judge("hot winding", lambda: piece.run(phases=(), free=warm)[0].loglik)
     for k, n in enumerate(MEASURED):
