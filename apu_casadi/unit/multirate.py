@@ -41,8 +41,10 @@ from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityWarning, n
 from apu_casadi.core.means import RMS
 from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, run
+from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.departures import departures
 from apu_casadi.unit.events import (
     STARTS,
     Ambient,
@@ -122,6 +124,7 @@ def simulate_joint(
     solver: str = "auto",
     start_from: str = "balanced",
     strict: bool = False,
+    limits: Limits | None = None,
     rtol: float = 1e-8,
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
@@ -151,6 +154,7 @@ def simulate_joint(
         hook: processes the rotor speed between state update and output (Algorithm 2).
         start_from: one of ``STARTS``, as above.
         strict: stop with an error where there would be a warning, at its instant where it shows.
+        limits: of the steady points of the unit, which the run is judged by; default the trim's.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
         progress, attrs: called with (done, total) seconds; more attributes for the dataset.
         storage: ``"memory"``, a folder for a temporary file, or ``"auto"``; the module's text.
@@ -171,17 +175,18 @@ def simulate_joint(
     duration = number("duration", duration, error=ScenarioError)
     settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
     events = in_order(events, duration, generators=len(apu.machines))
-    start = _start(apu, load, fault, health, ambient, N_ref)
+    start = start_of(apu, load, fault, health, ambient, N_ref)
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
-    grid, settled = exchange_grid(duration, settings.dt, stops), _settled(start_from)
+    grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(start_from)
     asked = Asked(start, grid, phasors, noise, seed, hook, settled)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
-    record = _moved(system, events, stops, storage, strict, progress)
-    how = {"warn_exchange": warn_exchange, "strict": strict}
+    judged = (limits or Limits()) if strict else None
+    record = _moved(system, events, stops, storage, judged, progress)
+    how: dict[str, Any] = {"warn_exchange": warn_exchange, "strict": strict, "limits": limits}
     return _concluded(system, record, exchange, events, **how, attrs=attrs or {})
 
 
-def _start(
+def start_of(
     apu: Apu,
     load: ALoad | Sequence[ALoad],
     fault: AFault | Sequence[AFault] | Mapping[int, AFault],
@@ -189,7 +194,7 @@ def _start(
     ambient: Ambient | Varying[Ambient] | None,
     N_ref: float | Profile | None,
 ) -> Holding:
-    """What holds from the start, for each generator, checked."""
+    """Return what holds from the start, for each generator, checked."""
     day = Ambient() if ambient is None else ambient
     speed = None if N_ref is None else SpeedChange(0.0, N_ref).N_ref
     return Holding(apu.each("load", load), apu.each_fault(fault), all_factors(health), day, speed)
@@ -200,22 +205,25 @@ def _moved(
     events: Sequence[Event],
     stops: Sequence[Event | Jump],
     storage: str | os.PathLike[str],
-    strict: bool,
+    strict: Limits | None,
     progress: Callable[[float, float], None] | None,
 ) -> Recorder:
-    """Run the unit over its grid; return what was recorded."""
+    """Run the unit over its grid, strictly within limits if given; return what was recorded."""
     apu, asked, grid = system.apu, system.asked, system.asked.grid
     means = {k: means_of(apu, k, asked.phasors) for k in kinds(apu, system.now, events)}
     severities = stored_severities(events, *asked.start.faults)
     samples = system.machines.samples(grid)
     record = Recorder(apu.gas_generator, grid, samples, means, storage, severities)
-    record.put(0, 1, system.at_start())
-    put = Strict(system, means, record.put) if strict else record.put
+    put = record.put
+    if strict is not None:
+        put = Strict(system, means, record.put, strict, events)
+    put(0, 1, system.at_start())
     run(system, grid, stops, record=put, progress=progress)
     return record
 
 
-def _settled(start_from: str) -> bool:
+def settled_start(start_from: str) -> bool:
+    """Return whether a run starts from what has been there for long; see ``STARTS``."""
     if start_from not in STARTS:
         raise ScenarioError(f"start_from {start_from!r} {nearest(str(start_from), STARTS)}")
     return start_from == "settled"
@@ -253,6 +261,7 @@ def _concluded(
     *,
     warn_exchange: bool,
     strict: bool,
+    limits: Limits | None,
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
     """Make the dataset of a run, with what must be known of it in attributes and warnings."""
@@ -284,15 +293,33 @@ def _concluded(
     told = {"solver": json.dumps(status), **told, "exchange_error": lost, **attrs}
     more, signals = runrecord.followed(asked.start, events, grid)
     ds = record.collect(apu, {**rows, **more}, asked.noise, system.rng, told, signals)
-    notes = [ApuWarning(words) for words in (*machines.spikes, *record.warnings)]
+    notes = [d.warning() for d in (*machines.spikes, *record.warnings)]
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
-    starved = validity.fuel_limited(apu, grid, N, Wf)
+    notes += load_notes(apu, record, asked.start, events, rows, system.shaft.N_ref)
+    found = departures(apu.gas_generator, grid, rows, limits)
+    return validity.conclude(ds, found, notes, stacklevel=4, strict=strict)
+
+
+def load_notes(
+    apu: Apu,
+    record: Recorder,
+    start: Holding,
+    events: Sequence[Event],
+    rows: Mapping[str, Any],
+    N_ref: float | None = None,
+) -> list[ApuWarning]:
+    """Return the warnings of a run that got less fuel or power than it asked for.
+
+    Args:
+        record, rows: of the run, and what its instants gave.
+        start, events: what held.
+        N_ref: governed rotor speed at the end, rad/s; None for the unit's own.
+    """
+    N, Wf = (np.asarray(rows[n]) for n in ("N", "Wf"))
+    starved = validity.fuel_limited(apu, record.grid, N, Wf, N_ref)
+    one = len(record.of) == 1
     unserved = [
-        validity.unserved(
-            asked.start.loads[k[0] - 1], events, grid, P_e, k, of_all=len(record.of) == 1
-        )
+        validity.unserved(start.loads[k[0] - 1], events, record.grid, P_e, k, of_all=one)
         for k, P_e in record.of_each("P_e", rows).items()
     ]
-    notes += [ValidityWarning(words) for words in (starved, *unserved) if words]
-    found = validity.departures(apu.gas_generator, grid, rows)
-    return validity.conclude(ds, found, notes, stacklevel=4, strict=strict)
+    return [d.warning(ValidityWarning) for d in (starved, *unserved) if d]

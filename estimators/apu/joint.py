@@ -282,7 +282,7 @@ def electrical_side(
     for k in changes:
         begin = max([v for v in resets if v <= t[k] + 1e-9] + [float(t[0])])
         # whole windows: from the beginning of the one in which the machine changed
-        first = int(np.floor((begin - t[0]) / DT + 1e-6))
+        first = min(int(np.floor((begin - t[0]) / DT + 1e-6)), k - 1)
         _, P_k, var_k, _ = windows((PHASES[phase[k] - 1],), float(t[first]))
         last = k
         while last + 1 < K and phase[last + 1] == phase[k]:
@@ -400,6 +400,7 @@ def fused(
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
     step: StepMaker | None = None,
+    test: JumpTest = TEST,
     backend: str | None = None,
     max_dt: float = math.inf,
 ) -> tuple[GasPathFilter, Tracked]:
@@ -417,6 +418,7 @@ def fused(
         prior: means of the start by state.
         spread: of which the standard deviations are taken.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
+        test: of jumps of the health.
         eta, gain_errors, step, backend: as for :func:`estimate_joint`.
     """
     gas = _gas_filter(apu, sensors, power, gain_errors, eta)
@@ -442,7 +444,7 @@ def fused(
     if spread is not None:
         spread.check(gas.model.x)
     start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
-    return gas, track_jumps(gas, data, test=TEST, prior=start, step=step, backend=backend)
+    return gas, track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
 
 
 def _gas_filter(

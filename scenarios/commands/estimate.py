@@ -56,6 +56,8 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 _STUDY = f"""
 study NAME    | all, or one of {", ".join(names())}
 --seeds int N | fresh seeds (default: the study's own)
+--first-seed int N | the first of them (default: the study's own)
+--only WORDS  | parts whose names contain one of these words, as realistic,large; default: all
 {_OUT}
 --again       | also run what is kept
 --json        | print the claims as JSON
@@ -217,17 +219,21 @@ def _study(args: argparse.Namespace) -> int:
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
     usage.count("--seeds", args.seeds, least=2)
+    usage.count("--first-seed", args.first_seed, least=0, most=2**31)
     folder = registry.prepare(args.out)
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
     for name in chosen:
-        study = catalogue.get(name)
+        study = catalogue.from_seed(catalogue.get(name), args.first_seed)
         n = args.seeds or study.seeds
-        todo = list(study.parts) if args.again else catalogue.pending(study, folder, n)
+        how = {"seed0": args.first_seed, "only": args.only, "again": args.again}
+        todo = catalogue.parts_with(study, args.only)
+        if not args.again:
+            todo = [p for p in catalogue.pending(study, folder, n) if p in todo]
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
-            record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
+            record = catalogue.run(name, folder, n_seeds=n, progress=progress, **how)
         with understood(name):
             found[name] = study.report.claims(catalogue.results(record))
         if not args.json:
