@@ -125,6 +125,7 @@ _OF_EACH = {
 def made_with(report: dict[str, Any]) -> list[str]:
     """Return the lines that tell what a run was made with, and whether the model holds."""
     from apu_casadi.gaspath.conditions import CONDITIONS, day_words
+    from apu_casadi.unit.departures import of_generators
     from apu_casadi.unit.validity import exchange_words
 
     solver, error = report["solver"] or {}, report["exchange_error"]
@@ -145,7 +146,8 @@ def made_with(report: dict[str, Any]) -> list[str]:
     if error is not None:
         lines.append(exchange_words(error, report["exchange"], report["dt"]))
     left = ", ".join(
-        f"{d['quantity']} for {d['duration']:.4g} s from t = {d['first']:.6g} s in {p['name']!r}"
+        f"{d['quantity']}{of_generators(d.get('generators'))} for {d['duration']:.4g} s from t = "
+        f"{d['first']:.6g} s in {p['name']!r}"
         for p in report["phases"]
         for d in p["beyond"]
     )
