@@ -247,7 +247,7 @@ def hoisted(
     """Take out of a loop what follows from its fixed inputs alone.
 
     Returns:
-        Function (*varying, d) -> outputs, and Function fixed -> d.
+        ``Function(*varying, d)`` -> outputs, and Function fixed -> d.
     """
     new, d, by = ca.extract_parametric(ca.cse(list(outputs)), fixed, {"extract_trivial": True})
     inner = ca.Function(name, [*varying, ca.vertcat(*d)], new, {"cse": True})

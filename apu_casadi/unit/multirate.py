@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.checked import number
-from apu_casadi.core.errors import ScenarioError, ValidityWarning, nearest
+from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityWarning, nearest
 from apu_casadi.core.means import RMS
 from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, run
@@ -175,9 +175,9 @@ def simulate_joint(
     duration = number("duration", duration, error=ScenarioError)
     settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
     events = in_order(events, duration, generators=len(apu.machines))
-    start = _start(apu, load, fault, health, ambient, N_ref)
+    start = start_of(apu, load, fault, health, ambient, N_ref)
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
-    grid, settled = exchange_grid(duration, settings.dt, stops), _settled(start_from)
+    grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(start_from)
     asked = Asked(start, grid, phasors, noise, seed, hook, settled)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
     judged = (limits or Limits()) if strict else None
@@ -186,7 +186,7 @@ def simulate_joint(
     return _concluded(system, record, exchange, events, **how, attrs=attrs or {})
 
 
-def _start(
+def start_of(
     apu: Apu,
     load: ALoad | Sequence[ALoad],
     fault: AFault | Sequence[AFault] | Mapping[int, AFault],
@@ -194,7 +194,7 @@ def _start(
     ambient: Ambient | Varying[Ambient] | None,
     N_ref: float | Profile | None,
 ) -> Holding:
-    """What holds from the start, for each generator, checked."""
+    """Return what holds from the start, for each generator, checked."""
     day = Ambient() if ambient is None else ambient
     speed = None if N_ref is None else SpeedChange(0.0, N_ref).N_ref
     return Holding(apu.each("load", load), apu.each_fault(fault), all_factors(health), day, speed)
@@ -222,7 +222,8 @@ def _moved(
     return record
 
 
-def _settled(start_from: str) -> bool:
+def settled_start(start_from: str) -> bool:
+    """Return whether a run starts from what has been there for long; see ``STARTS``."""
     if start_from not in STARTS:
         raise ScenarioError(f"start_from {start_from!r} {nearest(str(start_from), STARTS)}")
     return start_from == "settled"
@@ -294,13 +295,31 @@ def _concluded(
     ds = record.collect(apu, {**rows, **more}, asked.noise, system.rng, told, signals)
     notes = [d.warning() for d in (*machines.spikes, *record.warnings)]
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
-    starved = validity.fuel_limited(apu, grid, N, Wf, system.shaft.N_ref)
-    unserved = [
-        validity.unserved(
-            asked.start.loads[k[0] - 1], events, grid, P_e, k, of_all=len(record.of) == 1
-        )
-        for k, P_e in record.of_each("P_e", rows).items()
-    ]
-    notes += [d.warning(ValidityWarning) for d in (starved, *unserved) if d]
+    notes += load_notes(apu, record, asked.start, events, rows, system.shaft.N_ref)
     found = departures(apu.gas_generator, grid, rows, limits)
     return validity.conclude(ds, found, notes, stacklevel=4, strict=strict)
+
+
+def load_notes(
+    apu: Apu,
+    record: Recorder,
+    start: Holding,
+    events: Sequence[Event],
+    rows: Mapping[str, Any],
+    N_ref: float | None = None,
+) -> list[ApuWarning]:
+    """Return the warnings of a run that got less fuel or power than it asked for.
+
+    Args:
+        record, rows: of the run, and what its instants gave.
+        start, events: what held.
+        N_ref: governed rotor speed at the end, rad/s; None for the unit's own.
+    """
+    N, Wf = (np.asarray(rows[n]) for n in ("N", "Wf"))
+    starved = validity.fuel_limited(apu, record.grid, N, Wf, N_ref)
+    one = len(record.of) == 1
+    unserved = [
+        validity.unserved(start.loads[k[0] - 1], events, record.grid, P_e, k, of_all=one)
+        for k, P_e in record.of_each("P_e", rows).items()
+    ]
+    return [d.warning(ValidityWarning) for d in (starved, *unserved) if d]

@@ -345,7 +345,11 @@ class FitProblem(Rebuilt):
     def _fitted(self, s: Solution, recordings: Sequence[Recording]) -> tuple[FittedRecording, ...]:
         return tuple(
             FittedRecording(
-                r.t, l.x, l.w, l.y, (r.y - l.y) / np.where(np.isnan(r.y), 1.0, np.sqrt(r.variance))
+                r.t,
+                l.x,
+                l.w,
+                l.y,
+                self.model.innovation(r.y, l.y) / np.where(np.isnan(r.y), 1.0, np.sqrt(r.variance)),
             )
             for r, l in zip(recordings, self.program.locals_of(s), strict=True)
         )

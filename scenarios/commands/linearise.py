@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from apu_casadi.machine.loads.load import Load
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.events import Ambient
-    from apu_casadi.unit.linearisation import LinearModel
+    from apu_casadi.unit.linearmodel import LinearModel
 
 NAME = "linearise"
 HELP = "print and draw the eigenvalues at a steady point"
