@@ -75,7 +75,7 @@ def engine_schema() -> Table:
         _object({"kind": {"const": kind}, **_set(law())}, () if kind == "PI" else ("kind",))
         for kind, law in ((kind, GOVERNORS[kind]) for kind in GOVERNORS)
     ]
-    table = {n: {"type": "string"} for n in HEAD} | {
+    table: Table = {n: {"type": "string"} for n in HEAD} | {
         "gas_generator": gas,
         "limits": _object(limits),
     }

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.errors import ApuWarning, ParameterError
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
+from apu_casadi.unit.usual import LOAD_SHARE
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -193,7 +195,16 @@ def power_load(unit: Apu, P: float, power_factor: float = 1.0) -> Load:
     from apu_casadi.machine.loads.series import SeriesLoad
 
     m = unit.generator.machine
+    lo, hi = (s * m.P_rated for s in LOAD_SHARE)
+    usual(f"load = {P:g} W", P, lo, hi, f"a generator is rated {m.P_rated:g} W")
     return SeriesLoad.from_power(P, power_factor, V_rms=m.V_rated_rms, f=m.f_rated)
+
+
+def usual(what: str, value: float, lo: float, hi: float, why: str) -> None:
+    """Warn of a number that is possible and most often one of another unit."""
+    if not lo <= value <= hi:
+        words = f"{what} is outside {lo:.4g} to {hi:.4g}, {why}; is the unit of the number right?"
+        warnings.warn(ApuWarning(words), stacklevel=3)
 
 
 def load_words(load: Load) -> str:
