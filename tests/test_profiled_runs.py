@@ -284,10 +284,25 @@ def test_library_scenarios_campaign_and_figures(tmp_path):
     assert words == ["fault mu, from 1 s: on-off 0.05 and 0 at 5 Hz, 40 % of the time"]
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (dict(load=RAMP), r"load: P ramp .* changes in time, and a steady state is of one instant"),
+        (dict(fault={2: varying(Ttsc, 0.05, Ramp(90.0, 20.0, over=2.0))}), "fault: k_rf .*t = 2 s"),
+        (dict(health={"f_W_c": Ramp(1.0, 0.9, over=3.0)}), "f_W_c: .*1 at t = 0 s, 0.9 at t = 3 s"),
+        (dict(N_ref=Ramp(3775.0, 3700.0, over=1.0)), "N_ref: .*3700 at t = 1 s"),
+        (dict(ambient=varying(Ambient, altitude=Ramp(0.0, 9e3, over=60.0))), "ambient: altitude"),
+    ],
+)
+def test_a_steady_point_is_of_one_instant(given, words):
+    with pytest.raises(ScenarioError, match=words):
+        UNIT.steady_state(**{"load": KW100, **given})
+
+
 def test_a_load_of_a_command_must_not_change(tmp_path, capsys):
     from scenarios.cli import main
 
     path = tmp_path / "power.csv"
     path.write_text("time,power_kW\n0,100\n1,200\n")
     assert main(["trim", "--load", f'kind = "R", power_kW = {{ file = "{path}" }}']) != 0
-    assert "must not change in time here" in capsys.readouterr().err
+    assert "changes in time, and a steady state is of one instant" in capsys.readouterr().err

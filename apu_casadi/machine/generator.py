@@ -22,6 +22,7 @@ import numpy as np
 from apu_casadi.core import simulation
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import OperatingPointError, ParameterError, nearest
+from apu_casadi.core.profiles.profile import fixed
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
@@ -290,8 +291,10 @@ class Generator(Parametric):
             OperatingPointError: two voltages given, a regulator limit with a balanced load, a load
                 that the field cannot carry, or a residual above 1e-6 1/s (of a periodic state
                 1e-7 per rad).
+            ScenarioError: a load or fault that changes in time.
         """
         p = self.machine
+        load, fault = (fixed(x, n, "a steady state") for n, x in (("load", load), ("fault", fault)))
         w_r = p.w_rated if w_r is None else number("w_r", w_r, error=OperatingPointError)
         theta_e = number("theta_e", theta_e, error=OperatingPointError)
         voltages = {"V_t": V_t, "V_ref": V_ref, "V_fd": V_fd}
