@@ -78,8 +78,8 @@ def stepped(seed, K=700):
 @pytest.mark.parametrize("step", [None, ukf_step])
 def test_a_noise_that_grows_is_followed_within_what_is_claimed(step):
     """Factor 1, then 16, to a few of its standard deviations; that of the other output stays 1; the
-    likelihood is near that of a filter that knows (some ten samples are met too sure of themselves),
-    far above that of one that does not."""
+    likelihood is near that of a filter that knows (the first samples after the change cost most of
+    the rest), far above that of one that does not."""
     model, prior, data = stepped(1)
     how = {} if step is None else {"step": step}
     r = adaptive_filter(model, prior, data, memory=10.0, backend="vm", **how)
