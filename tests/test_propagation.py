@@ -155,6 +155,7 @@ def test_a_series_that_does_not_converge_is_refused(monkeypatch):
     with pytest.raises(SimulationError, match=r"over \d+ harmonics"):
         transition.transition_table(ss, u, theta, W, h=50e-6)
     monkeypatch.setattr(transition, "STAGES", 1)
+    monkeypatch.setattr(transition, "FEW", 1)
     with pytest.raises(SimulationError, match="do not converge"):
         transition.transition_table(ss, u, theta, W, h=50e-6)
 
