@@ -105,8 +105,8 @@ def _transition(
     """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Radau collocation.
 
     All three arrays have the shape (angles,).  There are ``steps`` of the method in h, of order
-    2 stages - 1 (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch that settles
-    within nanoseconds, or an open generator, needs no smaller steps.
+    2 stages - 1 (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch
+    that settles within nanoseconds, or an open generator, needs no smaller steps.
 
     Returns:
         One array for each leap, shape (angles, n, n + EXTRA): the rows of the windings.
