@@ -15,7 +15,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,24 @@ CHOICES = {"neutral": NEUTRALS, "excitation": EXCITATIONS, "power": POWERS}
 #: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to
 #: less than half of it makes 2.3.
 SPIKE = 3.0
+
+
+class Spike(NamedTuple):
+    """A voltage spike just after a switch.
+
+    Args:
+        words: what is told of it.
+        t: instant, s.
+        name: of the voltage.
+        V, limit: its height, and what is warned of, V.
+    """
+
+    words: str
+    t: float
+    name: str
+    V: float
+    limit: float
+
 
 #: Mean phase voltage of Table 7's reference column at 225 kW, V rms: sets the default V_ref.
 V_TABLE_7 = (229.6704 + 229.6903 + 229.6704) / 3.0
@@ -185,8 +203,8 @@ class Generator(Parametric):
 
     def spike(
         self, ss: StateSpace, x: Any, u: Any, theta: Any, *, t: float, load: Load
-    ) -> str | None:
-        """Return a warning of a voltage spike just after a switch; None without one.
+    ) -> Spike | None:
+        """Return what must be known of a voltage spike just after a switch; None without one.
 
         The flux linkages stay at a switch, hence also the currents, and a load of large resistance
         gets R times the current that flowed before.  The model lets that current die away within
@@ -204,12 +222,13 @@ class Generator(Parametric):
         v, rated = abs(y[f"v_{k}"]), math.sqrt(2.0) * self.machine.V_rated_rms
         if v <= SPIKE * rated:
             return None
-        return (
+        words = (
             f"at t = {t:.6g} s a switch to {load!r} drives the {abs(y[f'i_{k}']):.4g} A of phase "
             f"{k} through it: the model's voltage jumps to {v:.3g} V there, {v / rated:.3g} times "
             "the rated peak, until that current has died away; a real switch arcs instead. Rms "
             "values and phasors leave the spike out, single samples may not"
         )
+        return Spike(words, t, f"v_{k}", v, SPIKE * rated)
 
     # -- steady state -----------------------------------------------------------------------
 
@@ -496,11 +515,11 @@ class _Transfer:
         after = self.generator.transfer(
             x, self.source, self.target, u=self.u, theta=self.theta, **now
         )
-        text = self.generator.spike(
+        spike = self.generator.spike(
             self.target, after, self.u_target, self.theta_target, t=self.t, load=self.load
         )
-        if text is not None:
-            self.told.append(text)
+        if spike is not None:
+            self.told.append(spike.words)
         return after
 
 

@@ -19,15 +19,16 @@ from pathlib import Path
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from estimators.apu.electrical.terminalsignals import PHASES_V
+from estimators.apu.electrical.terminalsignals import PHASES_V, VOLTAGES
 from estimators.apu.recordings.measured import Channel, Measurements
-from estimators.apu.recordings.plausible import WAVES, plain
+from estimators.apu.recordings.plausible import WAVES, clipped, plain
 from estimators.apu.sensorchain import interpolated, slopes
 from estimators.apu.sensorfile import SensorFile, read_sensors
 from estimators.apu.sensors import Sensor, SensorSet, gas_path_table
 
 __all__ = ["Declared", "as_declared", "tables"]
 
+FILLED = 0.01  # share of a voltage, an input of the electrical filter, that may be filled
 BESIDE = {True: 1, False: 5}  # samples beside one at the end of the range, of waveforms or not
 
 
@@ -39,6 +40,7 @@ class Declared:
         m: the readings to be used.
         gas_path, electrical: the sensors, with what jitter and undoing a lag add to their noise.
         notes: what was done, one sentence each.
+        doubts: what looks wrong.
         late: s, after which what is said of an instant is known.
         coarse: channels of which the digits are wider than the noise.
     """
@@ -47,6 +49,7 @@ class Declared:
     gas_path: SensorSet
     electrical: SensorSet
     notes: tuple[str, ...]
+    doubts: tuple[str, ...]
     late: float
     coarse: tuple[str, ...]
 
@@ -82,13 +85,18 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     Raises:
         DataError: nothing is left of a channel.
     """
-    notes: list[str] = []
+    notes, doubts = list[str](), list[str]()
     channels: dict[str, Channel] = dict(m.channels)
     waves = {n: electrical[plain(n)] for n in m.electrical if plain(n) in electrical}
     slow = {n: gas_path[n] for n in m.gaspath if n in gas_path}
     every = slow | waves
     for n, s in every.items():
-        channels[n] = _kept(channels[n], s, notes, wave=plain(n) in WAVES)
+        channels[n] = _kept(channels[n], s, notes, doubts, wave=plain(n) in WAVES)
+        lost = 1 - np.isfinite(channels[n].values).sum() / max(np.isfinite(m[n].values).sum(), 1)
+        if plain(n) in VOLTAGES and lost > FILLED:
+            notes.append(f"{n}: {100 * lost:.0f} % are too many to be filled, none is used")
+            del channels[n]
+    waves = {n: s for n, s in waves.items() if n in channels}
     for n, s in slow.items():
         if s.delay:
             c = channels[n]
@@ -102,32 +110,44 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     ready = dataclasses.replace(m, channels=channels)
     wide = {n: np.nanmedian(s.white(m[n].values)) for n, s in every.items() if s.quantum}
     coarse = tuple(n for n, v in wide.items() if every[n].quantum > v)
-    return Declared(ready, gas_path, SensorSet(tuple(changed)), tuple(notes), late, coarse)
+    return Declared(
+        ready, gas_path, SensorSet(tuple(changed)), tuple(notes), tuple(doubts), late, coarse
+    )
 
 
-def _kept(c: Channel, s: Sensor, notes: list[str], *, wave: bool) -> Channel:
+def _kept(c: Channel, s: Sensor, notes: list[str], doubts: list[str], *, wave: bool) -> Channel:
     """Return the channel without what is at the end of the range, and without expected errors."""
-    v = c.values
-    if s.limits is not None and np.isfinite(v).any():
-        tiny = 1e-9 * (s.limits[1] - s.limits[0])
-        low, high = v <= s.limits[0] + tiny, v >= s.limits[1] - tiny
-        at = np.flatnonzero(low | high)
-        if at.size:
-            n = BESIDE[wave]
-            near = np.convolve(low | high, np.ones(2 * n + 1), mode="same")[: v.size] > 0.5
-            ends = " and ".join(
-                f"{x:g}" for x, there in zip(s.limits, (low, high), strict=True) if there.any()
-            )
-            if np.isfinite(v[~near]).sum() < 2:
-                raise DataError(f"{c.source}: {c.name} is at the end of its range, {ends} {c.unit}")
-            notes.append(
-                f"{c.name} is at the end of its range, {ends} {c.unit}, in {at.size} samples from "
-                f"{c.t[at[0]]:g} to {c.t[at[-1]]:g} s: they and those beside them are not used"
-            )
-            v = np.where(near, np.nan, v)
+    limits = s.limits
+    if limits is None and wave and np.isfinite(c.values).any() and (count := clipped(c.values)):
+        limits = float(np.nanmin(c.values)), float(np.nanmax(c.values))
+        doubts.append(
+            f"{c.source}: {count} samples of {c.name} are clipped; declare its range in a file of "
+            "sensors if that is what it can show"
+        )
+    v = c.values if limits is None else _inside(c, limits, notes, BESIDE[wave])
     if s.bias_mean or s.gain_mean:
         v = (v - s.bias_mean) / (1.0 + s.gain_mean)
     return c if v is c.values else dataclasses.replace(c, values=v)
+
+
+def _inside(c: Channel, limits: tuple[float, float], notes: list[str], beside: int) -> np.ndarray:
+    """Return the readings that are not at the end of the range, nor beside one that is."""
+    v = c.values
+    tiny = 1e-9 * (limits[1] - limits[0])
+    ends = v <= limits[0] + tiny, v >= limits[1] - tiny
+    at = np.flatnonzero(ends[0] | ends[1])
+    if not at.size:
+        return v
+    near = np.convolve(ends[0] | ends[1], np.ones(2 * beside + 1), mode="full") > 0.5
+    left = np.where(near[beside : beside + v.size], np.nan, v)
+    where = " and ".join(f"{x:g}" for x, e in zip(limits, ends, strict=True) if e.any())
+    if np.isfinite(left).sum() < 2:
+        raise DataError(f"{c.source}: {c.name} is at the end of its range, {where} {c.unit}")
+    notes.append(
+        f"{c.name} is at the end of its range, {where} {c.unit}, in {at.size} samples from "
+        f"{c.t[at[0]]:g} to {c.t[at[-1]]:g} s: they and those beside them are not used"
+    )
+    return left
 
 
 def _undone(
@@ -143,7 +163,8 @@ def _undone(
         if rest or s.tau:
             values, more = interpolated(c.t, c.values, c.t + rest, more=s.tau)
             values[c.t + rest > c.t[-1]] = np.nan
-            grown[plain(n)] = float(np.median(more))
+            # between samples it is less, but no longer white: at the signal's frequency the same
+            grown[plain(n)] = max(1.0, float(np.median(more)))
         if common:
             moved.setdefault(id(c.t), c.t - common)
         t = moved.get(id(c.t), c.t)

@@ -199,6 +199,17 @@ class Sensor:
         noise = self.white(reading)
         return np.hypot(noise, self.rest) if self.rest else noise
 
+    def more(self) -> dict[str, str]:
+        """Return in words what it declares beside noise and gain, by name."""
+        units = {"tau": "s", "rate": "Hz", "delay": "s", "jitter": "s", "bias": self.unit}
+        units |= {"drift": f"{self.unit}/sqrt(s)", "quantum": self.unit, "bias_mean": self.unit}
+        out = {n: f"{getattr(self, n):g} {u}" for n, u in units.items() if getattr(self, n)}
+        out |= {"gain_mean": f"{self.gain_mean:g}"} if self.gain_mean else {}
+        if self.limits is not None:
+            out["range"] = f"{self.limits[0]:g} to {self.limits[1]:g} {self.unit}"
+        ways = {n: getattr(self, n) for n in ("gain_as", "bias_as")}
+        return out | {n: way for n, way in ways.items() if way != WAYS[0]}
+
     def model(self) -> Sensor:
         """Return the sensor with what its equations hang on, its errors left out."""
         kept = {n: getattr(self, n) for n in ("reads", "value", "tau", "factor")}
@@ -289,7 +300,7 @@ class SensorSet:
     def table(self) -> list[dict[str, Any]]:
         """Return one row for each sensor, for printing."""
         shown = ("name", "noise", "relative", "gain", "unit", "source")
-        return [{n: getattr(s, n) for n in shown} for s in self.sensors]
+        return [{n: getattr(s, n) for n in shown} | s.more() for s in self.sensors]
 
     def true(self, t: np.ndarray, y: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Return what the sensors would read without errors.
@@ -460,8 +471,9 @@ def known(sensor: Sensor) -> Sensor:
 
 
 def unregister(name: str) -> None:
-    """Forget a sensor that was registered; one of the tables stays."""
-    if _registered.pop(name, None) is not None:
+    """Forget a sensor that was registered or named; one of the tables stays."""
+    if _registered.pop(name, None) is not None or name in _named:
+        _named.discard(name)
         del KNOWN[name]
         RANGES.pop(name, None)
 

@@ -132,7 +132,7 @@ def profile_from_table(
         return PROFILES[table["kind"]].from_table(rest, name, os.fspath(folder))
     found = next((cls for cls in PROFILES.classes if cls.told_by(table)), None)
     if found is None:
-        known = {k.name for cls in PROFILES.classes for k in cls.keys}
+        known = dict.fromkeys(k.name for cls in PROFILES.classes for k in cls.keys) | {"file": None}
         wrong = next((str(k) for k in table if k not in known), None)
         if wrong is not None:
             raise ScenarioError(f"{wrong}: unknown key of a profile {nearest(wrong, known)}")
