@@ -123,6 +123,15 @@ class GasPathFilter(Parametric):
         """Sensors whose gain error is a state."""
         return tuple(n[5:] for n in self.model.x.names if n.startswith("gain_"))
 
+    def considered(self, name: str) -> float:
+        """Return the standard deviation of what considered errors add to a reading, its unit.
+
+        It stays in the innovations of that sensor, as an offset.
+        """
+        of = {n: self.sigma[n] for n in self.model.consider if n[5:] == name}
+        bias, gain = (of.get(f"{error}_{name}", 0.0) for error in ("bias", "gain"))
+        return math.hypot(bias, gain * self.model.y[name].nominal) if of else 0.0
+
     def prior(self, spread: Mapping[str, float] | None = None, /, **mean: float) -> Belief:
         """Return the belief before the first sample: healthy, at governed speed.
 
