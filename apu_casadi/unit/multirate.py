@@ -31,16 +31,17 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityWarning, nearest
+from apu_casadi.core.lanes.together import Question, by_itself
 from apu_casadi.core.means import RMS
 from apu_casadi.core.profiles.profile import Profile, Varying
-from apu_casadi.core.runloop import SAME_INSTANT, run
+from apu_casadi.core.runloop import SAME_INSTANT, steps
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
@@ -171,19 +172,40 @@ def simulate_joint(
         OperatingPointError, SimulationError: no steady start; a step failed: when and why.
         ValidityError: a strict run left the model (:mod:`apu_casadi.unit.strictness`).
     """
-    noise = Noise() if noise is None else noise
-    duration = number("duration", duration, error=ScenarioError)
-    settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
-    events = in_order(events, duration, generators=len(apu.machines))
-    start = start_of(apu, load, fault, health, ambient, N_ref)
+    return alone(joint_course(**locals()))
+
+
+def joint_course(apu: Apu, **how: Any) -> Generator[Question, None, xr.Dataset]:
+    """Do what :func:`simulate_joint` does, whose arguments these are, and pause at questions.
+
+    An ensemble answers them (:mod:`apu_casadi.unit.ensemble`); a single run asks none.
+    """
+    noise = Noise() if how["noise"] is None else how["noise"]
+    duration = number("duration", how["duration"], error=ScenarioError)
+    given = {n: how[n] for n in ("exchange", "dt", "waveform_dt", "solver", "rtol", "atol")}
+    settings = _settings(**given, noise=noise)
+    events = in_order(how["events"], duration, generators=len(apu.machines))
+    start = start_of(apu, *(how[n] for n in ("load", "fault", "health", "ambient", "N_ref")))
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
-    grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(start_from)
-    asked = Asked(start, grid, phasors, noise, seed, hook, settled)
+    grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(how["start_from"])
+    seed, strict = how["seed"], how["strict"]
+    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
+    limits = how["limits"]
     judged = (limits or Limits()) if strict else None
-    record = _moved(system, events, stops, storage, judged, progress)
-    how: dict[str, Any] = {"warn_exchange": warn_exchange, "strict": strict, "limits": limits}
-    return _concluded(system, record, exchange, events, **how, attrs=attrs or {})
+    record = yield from _moved(system, events, stops, how["storage"], judged, how["progress"])
+    told = {"warn_exchange": how["warn_exchange"], "strict": strict, "limits": limits}
+    return _concluded(system, record, how["exchange"], events, **told, attrs=how["attrs"] or {})
+
+
+def alone(course: Generator[Question, None, xr.Dataset]) -> xr.Dataset:
+    """Run a course that asks nobody, though it may be inside of a member of an ensemble."""
+    try:
+        with by_itself():
+            raise next(course)
+    except StopIteration as end:
+        made: xr.Dataset = end.value
+        return made
 
 
 def start_of(
@@ -207,7 +229,7 @@ def _moved(
     storage: str | os.PathLike[str],
     strict: Limits | None,
     progress: Callable[[float, float], None] | None,
-) -> Recorder:
+) -> Generator[Question, None, Recorder]:
     """Run the unit over its grid, strictly within limits if given; return what was recorded."""
     apu, asked, grid = system.apu, system.asked, system.asked.grid
     means = {k: means_of(apu, k, asked.phasors) for k in kinds(apu, system.now, events)}
@@ -218,7 +240,7 @@ def _moved(
     if strict is not None:
         put = Strict(system, means, record.put, strict, events)
     put(0, 1, system.at_start())
-    run(system, grid, stops, record=put, progress=progress)
+    yield from steps(system, grid, stops, record=put, progress=progress)
     return record
 
 
@@ -297,7 +319,7 @@ def _concluded(
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
     notes += load_notes(apu, record, asked.start, events, rows, system.shaft.N_ref)
     found = departures(apu.gas_generator, grid, rows, limits)
-    return validity.conclude(ds, found, notes, stacklevel=4, strict=strict)
+    return validity.conclude(ds, found, notes, stacklevel=6, strict=strict)
 
 
 def load_notes(

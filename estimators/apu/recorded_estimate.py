@@ -15,8 +15,8 @@ believed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +27,16 @@ from apu_casadi.core.errors import DataError, EstimationError, ParameterError, n
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
-from estimators.apu.believable import channel_doubts, gas_doubts, machine_doubts
+from estimators.apu.believable import (
+    Doubt,
+    channel_doubts,
+    gas_causes,
+    gas_doubts,
+    machine_causes,
+    machine_doubts,
+)
 from estimators.apu.declared import as_declared, tables
+from estimators.apu.electrical.causes import Causes
 from estimators.apu.electrical.electricalfilter import window_starts
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
@@ -98,6 +106,7 @@ class RecordedEstimate:
         result: of the gas-path filter; None: not estimated.
         path: the gas-path filter and its result with the jumps that it found.
         sides: what the electrical filters say, by machine.
+        causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
     """
 
     gaspath: xr.Dataset | None
@@ -110,6 +119,7 @@ class RecordedEstimate:
     result: FilterResult | None = field(default=None, repr=False)
     path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
     sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
+    causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -128,6 +138,7 @@ class RecordedEstimate:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
+        out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
         return out | {"lacking": dict(self.lacking), "notes": list(self.notes)}
 
     def summary(self) -> str:
@@ -179,43 +190,49 @@ def estimate(
     doubts = list[str]([*ready.doubts, *channel_doubts(m, table, ready.coarse)])
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
-    reason = None if only == "electrical" else _no_gas_path(m, table)
-    gas = reason is None and only != "electrical"
+    causes: dict[str, tuple[Causes, ...]] = {}
+    reason = _no_gas_path(m, table) if only != "electrical" else "it was not asked for"
+    gas = reason is None
     if only != "electrical" and reason is not None and (m.gaspath or only):
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
-    if only != "gaspath" and m.electrical:
-        for k in _machines(m):
-            waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
-            found |= waves.sequences(lacking)
-            side = waves.side(begin, lacking, doubts, notes)
-            if side is not None:
-                sides[k] = side
-    elif only == "electrical":
+    for k in _machines(m) if only != "gaspath" and m.electrical else ():
+        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
+        found |= waves.sequences(lacking)
+        side = waves.side(begin, lacking, doubts, notes, causes)
+        if side is not None:
+            sides[k] = side
+    if only == "electrical" and not m.electrical:
         lacking["generators"] = "nothing of them was measured"
-    result, found_by, e = None, None, None
+    found_by, e = None, None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
-        told = ambient or {}, notes, doubts, backend, start, efficiency_error
-        path = _GasPath(m, apu, table, *told)
-        filt, tracked = found_by = path.run(fusable, electrical_sensors)
-        result = tracked.result
+        given = ambient or {}, notes, doubts, backend, start, efficiency_error
+        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
+        causes["gas path"], odd = _told(gas_causes(filt, tracked))
+        doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
-    if apu.alike and 0 < len(sides) < len(apu.machines):
-        notes.append(
-            f"only machine {', '.join(map(str, sides))} is estimated; power is that of "
-            f"{len(apu.machines)} equal ones"
-        )
+    if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
+        some = ", ".join(map(str, sides))
+        notes.append(f"only machine {some} is estimated; power is that of {n} equal ones")
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    more: dict[str, Any] = {"result": result, "path": found_by, "sides": sides}
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, **more)
+    end: Any = found_by and found_by[1].result, found_by, sides, causes
+    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
+
+
+def _told(
+    found: Iterable[tuple[Causes, Doubt | None]],
+) -> tuple[tuple[Causes, ...], list[Doubt]]:
+    """Part causes from the doubts that they raise."""
+    both = list(found)
+    return tuple(c for c, _ in both), [d for _, d in both if d is not None]
 
 
 def _fusable(
@@ -300,7 +317,12 @@ class _Waves:
             )
 
     def side(
-        self, begin: float, lacking: dict[str, str], doubts: list[str], notes: list[str]
+        self,
+        begin: float,
+        lacking: dict[str, str],
+        doubts: list[str],
+        notes: list[str],
+        causes: dict[str, tuple[Causes, ...]],
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
         what = f"severity, machine {self.number}"
@@ -334,8 +356,9 @@ class _Waves:
         except (DataError, EstimationError) as e:
             lacking[what] = str(e)
             return None
-        odd = machine_doubts(side, self.apu.generator.machine, self.sensors, a)
-        doubts += (d.of(f"machine {self.number}") for d in odd)
+        how, name = (side, self.apu.generator.machine, self.sensors, a), f"machine {self.number}"
+        causes[name], odd = _told(machine_causes(*how))
+        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
         return side
 
     def _tame(self, a: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:

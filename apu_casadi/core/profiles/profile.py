@@ -311,6 +311,33 @@ def at(value: Any, t: Any) -> Any:
     return value(t) if isinstance(value, Profile) else value
 
 
+def fixed(value: Any, what: str, use: str) -> Any:
+    """Return a value that does not change in time, for a use that is of one instant.
+
+    Args:
+        what, use: for the message, as ``"load"`` and ``"a steady state"``.
+
+    Raises:
+        ScenarioError: it changes; the text says what it is at its beginning and at its last corner.
+    """
+    if not isinstance(value, Varying | Profile):
+        return value
+    corners = value.corners(_LONG)
+    times = (0.0, *corners[-1:])
+    ends = ", ".join(f"{_words(at(value, t))} at t = {t:g} s" for t in times)
+    raise ScenarioError(
+        f"{what}: {value.label} changes in time, and {use} is of one instant: give what it is "
+        f"then, {ends}"
+    )
+
+
+_LONG = 3600.0  # s; the longest run
+
+
+def _words(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float | int) else getattr(value, "label", str(value))
+
+
 def held(
     signals: Signals, values: Mapping[str, Any], start: np.ndarray, middles: np.ndarray
 ) -> np.ndarray:
