@@ -189,7 +189,7 @@ def estimate(
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
     notes = [*m.notes, *ready.notes]
-    doubts = [*ready.doubts, *channel_doubts(m, table, ready.coarse)]
+    doubts = list[str]([*ready.doubts, *channel_doubts(m, table, ready.coarse)])
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     causes: dict[str, tuple[Causes, ...]] = {}
