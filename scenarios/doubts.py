@@ -16,7 +16,7 @@ from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.results import RPM
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.load import Branches
-from apu_casadi.unit.usual import beyond, unusual
+from apu_casadi.unit.usual import LOAD_SHARE, beyond, unusual
 from scenarios.phases import Changing
 from scenarios.reading import inside
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from apu_casadi.unit.apu import Apu
     from scenarios.schema import Scenario
 
-_POWER = (0.002, 1.6)
-"""Load of a generator over its rated power."""
 _HEALTH = (0.8, 1.1)
 _FACTOR = 30.0
 """Most that a parameter usually differs from the unit's own."""
@@ -139,7 +137,7 @@ def _of_speed(speed: Any, unit: Apu) -> Iterator[tuple[str, str]]:
 def _of_load(at: str, load: Any, unit: Apu) -> Iterator[tuple[str, str]]:
     m = unit.generator.machine
     rated = m.P_rated / 1e3
-    span = _POWER[0] * rated, _POWER[1] * rated
+    span = LOAD_SHARE[0] * rated, LOAD_SHARE[1] * rated
     why = f"; a generator is rated {rated:g} kW"
     if isinstance(load, Varying):
         table = dict(load.values)

@@ -198,6 +198,10 @@ gear = 3.2
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (
+            "# nothing",
+            r"engine\.toml: empty: an engine has at least one of the tables gas_generator",
+        ),
         ("[governer]\nKp = 1", r"unknown 'governer' \(did you mean 'governor'\?\)"),
         ("[governor]\nKP = 1", r"\[governor\]: unknown 'KP' \(did you mean 'Kp'\?\)"),
         ("[governor]\nkind = 'PIX'", r"\[governor\]: unknown kind 'PIX' .*'PI'"),

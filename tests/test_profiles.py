@@ -119,6 +119,7 @@ def test_a_file_gives_a_column(tmp_path):
         ("time,altitude\n0,1\n1,x\n", "row 3, column 'altitude': a number is expected, got 'x'"),
         ("time,altitude\n0,1\n1,nan\n", "row 3, column 'altitude': must be finite, got 'nan'"),
         ("time,altitude\n\n0,1\n1\n", "row 4: 1 cells, the header has 2 columns"),
+        ('time,altitude\n0,"' + 200_000 * "1", "row 2: no cells with commas between: field larger"),
         ("time,altitude\n-5,1\n0,2\n", "row 2, column 'time': -5 s is before the profile begins"),
         ("time,altitude\n0,1\n1,2\n1,3\n1,4\n", "row 5, column 'time': 1 s stands there three"),
         ("time,altitude\n1,1\n0,2\n", "row 3, column 'time': 0 s is before 1 s in the row before"),

@@ -57,6 +57,8 @@ USUAL: Mapping[str, tuple[float, float]] = {
     for name, lo, hi in (part.split() for part in _TABLE.replace("|", "\n").strip().splitlines())
 }
 """Lowest and highest usual value of a unit's parameters by dotted name, SI."""
+LOAD_SHARE = (0.002, 1.6)
+"""Lowest and highest usual load of a generator, over its rated power."""
 _OFF = 0.3  # of the rated frequency, by which that at governed speed may differ
 
 

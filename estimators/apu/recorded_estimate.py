@@ -429,8 +429,6 @@ class _GasPath:
         sensors, inputs = self._there(), self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
-        if not power:
-            self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
             own = self.m.machine(next(iter(of))).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
@@ -474,6 +472,8 @@ class _GasPath:
     def _ready(
         self, sensors: SensorSet, readings: Streams, inputs: Mapping[str, Any], power: bool
     ) -> tuple[GasPathFilter, Recording, Belief]:
+        if not power:
+            self.notes.append("no shaft power was measured: it is a random walk")
         filt = gas_path_filter(
             self.apu.gas_generator,
             sensors,

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from apu_casadi.core.errors import ParameterError, nearest
+from apu_casadi.core.errors import ApuWarning, ParameterError, nearest
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
+from apu_casadi.unit.usual import LOAD_SHARE
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -218,8 +220,17 @@ def power_load(machine: MachineParameters, P: float, power_factor: float = 1.0) 
     """Return the load that draws P, W, from the rated voltage of a machine."""
     from apu_casadi.machine.loads.series import SeriesLoad
 
-    V_rms, f = machine.V_rated_rms, machine.f_rated
+    V_rms, f, rated = machine.V_rated_rms, machine.f_rated, machine.P_rated
+    lo, hi = (s * rated for s in LOAD_SHARE)
+    usual(f"load = {P:g} W", P, lo, hi, f"a generator is rated {rated:g} W")
     return SeriesLoad.from_power(P, power_factor, V_rms=V_rms, f=f)
+
+
+def usual(what: str, value: float, lo: float, hi: float, why: str) -> None:
+    """Warn of a number that is possible and most often one of another unit."""
+    if not lo <= value <= hi:
+        words = f"{what} is outside {lo:.4g} to {hi:.4g}, {why}; is the unit of the number right?"
+        warnings.warn(ApuWarning(words), stacklevel=3)
 
 
 def load_words(load: Load) -> str:

@@ -151,6 +151,16 @@ def _alone(
 
     gg = given.engine(args, given.LIMITED)
     N = gg.parameters.N if args.speed is None else args.speed * RPM
+    if args.speed is not None:
+        lines, own = gg.compressor_map, gg.parameters.N / RPM
+        lo, hi = (float(lines.table.N[k]) / lines.N_map_des * own for k in (0, -1))
+        why = f"the speeds of the compressor map, design {own:.0f} r/min"
+        given.usual(f"--speed = {args.speed:g} r/min", args.speed, lo, hi, why)
+    if mode == "--power" and args.power:
+        own = gg.design.values["P_turb"]
+        given.usual(
+            f"--power = {args.power:g} W", abs(args.power), 1e-3 * own, own, "the turbine's"
+        )
     how: dict[str, Any] = {"theta": health, "limits": limits, **given.ambient_of(args)}
     if mode == "--max-power":
         values = given.numbers([args.max_power], "--max-power")
@@ -194,7 +204,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
     print(_table(values, list(values) if args.all else ["N_rpm", *SHOWN]))
     for k, own in enumerate(extra, 1):
         head = "each generator" if len(extra) == 1 else f"generator {k}"
-        print(f"\n{head}\n{_table(own, list(own))}")
+        print(f"\n{head}\n{_table(own, list(own), _electrical())}")
     print(f"\nresidual {point.residual:.1e}, {point.iterations} Newton steps")
     if point.second is not None:
         print(_second(point.second))
@@ -234,7 +244,7 @@ def _generator(args: argparse.Namespace) -> int:
         report |= {"apu_casadi_version": installed(), **given.own(args), **given.assumed(args)}
         jsontext.show(report)
         return 0
-    print(_table(values, list(values)))
+    print(_table(values, list(values), _electrical()))
     print(f"\nresidual {point.residual:.1e} 1/s" + (f"; {point.note}" if point.note else ""))
     print(f"{_load_words(args)}{given.program(args)}")
     return 0
@@ -281,13 +291,31 @@ def _values(point: GeneratorPoint) -> dict[str, float]:
     return {"V_t": point.V_t, "V_ref": point.V_ref, **point.summary}
 
 
-def _table(values: Mapping[str, float], names: list[str]) -> str:
+def _electrical() -> dict[str, tuple[str, str]]:
+    """Unit and meaning of a generator's outputs by name."""
+    from apu_casadi.machine.generator import Generator
+    from apu_casadi.unit.stepmeans import phasor_signals
+
+    model = Generator().state_space()
+    told = {s.name: (s.unit, s.doc) for s in (*model.u, *model.y, *phasor_signals())}
+    for q, what in (("v", "voltage"), ("i", "current")):
+        rms = ((p, told[f"{q}_{p}"][0]) for p in "abc")
+        told |= {f"{q.upper()}_{p}_rms": (u, f"phase {p} {what}, rms over a turn") for p, u in rms}
+    return told | {"i_fault_rms": ("A", "current of the fault branch, rms over a turn")}
+
+
+def _table(
+    values: Mapping[str, float],
+    names: list[str],
+    electrical: Mapping[str, tuple[str, str]] | None = None,
+) -> str:
     from apu_casadi.gaspath.stations import Y
 
+    told = {"N_rpm": ("r/min", "rotor speed"), **{s.name: (s.unit, s.doc) for s in Y}}
+    told = told if electrical is None else dict(electrical)
+    width = max(8, *map(len, names))
     rows = []
     for n in (n for n in names if n in values):
-        unit, doc = (Y[n].unit, Y[n].doc) if n in Y else ("", "")
-        if n == "N_rpm":
-            unit, doc = "r/min", "rotor speed"
-        rows.append(f"{n:<8} {values[n]:>14.6g}  {unit:<8} {doc}".rstrip())
+        unit, doc = told.get(n, ("", ""))
+        rows.append(f"{n:<{width}} {values[n]:>14.6g}  {unit:<8} {doc}".rstrip())
     return "\n".join(rows)

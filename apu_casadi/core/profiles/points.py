@@ -17,7 +17,7 @@ import csv
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -162,9 +162,8 @@ class OfPoints(Parametric, Profile):
 def _read(path: str | os.PathLike[str], wanted: tuple[str, str]) -> list[tuple[int, list[float]]]:
     """Return two columns of a file, each row with its number in the file."""
     text = files.read_text(path, "profile", LARGEST_FILE)
-    lines = csv.reader(text.split("\n"))
     header, rows = None, []
-    for row, cells in enumerate(lines, 1):
+    for row, cells in _cells(path, text):
         cells = [c.strip() for c in cells]
         if not any(cells) or cells[0].startswith("#"):
             continue
@@ -182,6 +181,16 @@ def _read(path: str | os.PathLike[str], wanted: tuple[str, str]) -> list[tuple[i
     if not rows:
         raise DataError(f"{path}: no rows: a header with {' and '.join(wanted)}, then numbers")
     return rows
+
+
+def _cells(path: Any, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of each row."""
+    row = 0
+    try:
+        for row, cells in enumerate(csv.reader(text.split("\n")), 1):
+            yield row, cells
+    except csv.Error as e:
+        raise DataError(f"{path}: row {row + 1}: no cells with commas between: {e}") from None
 
 
 def _column(path: Any, row: int, header: list[str], name: str) -> int:
