@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError, SignalError
-from apu_casadi.core.sharing import Parametric, building, remade
+from apu_casadi.core.sharing import Parametric, building, of_family, remade
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from estimators.models.filtermodel import FilterModel, discretise
@@ -65,12 +65,40 @@ class Lifted(Parametric):
             )
 
     @property
+    def family(self) -> Lifted | None:
+        """The same of the model's family, of which programs are made; None if it has none."""
+        return self.__dict__.get("_family")
+
+    @property
+    def shared(self) -> Lifted:
+        """The family's, or this one if it has none."""
+        return self if self.family is None else self.family
+
+    def unit(self, like: FilterModel) -> Lifted:
+        """Return the lifted form of a model of this one's family."""
+        x, u, p, w, dt = like.symbols()
+        s, k = ca.MX.sym("s", len(self.s)), ca.MX.sym("k", self.frozen.size1_out(0))
+        full, at = like.full(p), [x, s, u]
+        stage = self.stage.call([*at, full, w, dt, k])
+        made = Lifted(
+            like,
+            self.s,
+            ca.Function(self.stage.name(), [*at, p, w, dt, k], stage, *_STAGE),
+            ca.Function(self.frozen.name(), [*at, p, w, dt], [self.frozen(*at, full, w, dt)]),
+            ca.Function(self.start.name(), [x, u, p], [self.start(x, u, full)]),
+            self.steady,
+        )
+        made.__dict__["_family"] = self
+        return made
+
+    @property
     def n_c(self) -> int:
         """Number of constraints of a stage."""
         return int(self.stage.size1_out(2))
 
 
 @remade
+@of_family
 def plain(model: FilterModel) -> Lifted:
     """Return a filter's model as it is, nothing lifted."""
     model = model.expanded()
