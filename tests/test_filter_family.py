@@ -16,6 +16,7 @@ from apu_casadi.machine.terminals import terminal_model
 from apu_casadi.unit.control import GovernorParameters
 from estimators.apu.electrical.electricalfilter import electrical_filter
 from estimators.apu.electrical.machinemodel import electrical_model
+from estimators.apu.fitting import engine_model
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.gaspathmodel import gas_path_model
 from estimators.apu.joint import electrical_samples
@@ -340,6 +341,7 @@ def test_interacting_models_of_another_engine_compile_nothing(truth, asked):
     assert np.abs(probabilities[0] - probabilities[1]).max() > 1e-6
 
 
+@pytest.mark.long
 def test_horizons_fits_and_signatures_of_another_engine_compile_nothing(truth, asked):
     """Moving horizon, batch fit and the Jacobians of jumps: made of the family, once."""
     before, found = set(asked), []
@@ -361,3 +363,26 @@ def test_horizons_fits_and_signatures_of_another_engine_compile_nothing(truth, a
             before = set(asked)
     assert before and asked == before
     assert (np.abs(np.subtract(*found)) > 1e-6).all()
+
+
+def test_a_fit_of_another_engine_compiles_nothing(asked):
+    """The lifted model and the program are the family's; the numbers are among the data."""
+    before, found = set(asked), []
+    t = np.arange(3) * 0.02
+    read = {"N": 3775.0, "P3": 8.1e5, "T3": 552.0, "T5": 748.0}
+    held = {"Wf": 0.0485, "PW": 4.95e5, "altitude": 0.0, "Mach": 0.0, "dT_isa": 5.0, "war": 0.0}
+    for eta in (0.85, 0.84):
+        unit = Apu().change({"gas_generator.eta_c": eta}).gas_generator
+        lifted = engine_model(unit, ("N", "P3", "T3", "T5"))
+        data = record(
+            lifted.model,
+            outputs={n: (t, np.full(3, v)) for n, v in read.items()},
+            sigma={n: 2e-3 * v for n, v in read.items()},
+            inputs=held | {"sigma_Wf": 3e-4, "sigma_PW": 2e3},
+            p=dict.fromkeys(HEALTH, 1.0),
+        )
+        found.append(fit(lifted, data, ["f_eta_c"], prior={"f_eta_c": (1.0, 0.02)}).estimate[0])
+        if not before:
+            before = set(asked)
+    assert before and asked == before
+    assert abs(found[1] / found[0] - 0.85 / 0.84) < 3e-3

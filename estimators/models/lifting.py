@@ -316,20 +316,31 @@ def _split(equations: ca.Function) -> tuple[ca.Function, ca.Function]:
     if (
         smooth != [True] * 4 + [False] * (n - 4)
         or not inner.is_a("SXFunction")
-        or not all(ca.is_equal(call.dep(i), args[i]) for i in range(4))
+        or not all(ca.is_equal(call.dep(i), args[i]) for i in range(3))
+        or not _only(call.dep(3), args[3])
         or not all(o.which_output() == i for i, o in enumerate(out) if o.is_output())
     ):
         return whole
-    more = [call.dep(i) for i in range(4, n)]
-    found = [d for d in more if not d.is_constant()]  # the numbers of a unit are no part of k
+    # numbers of the unit, and theta's parts, are no part of k
+    deps = [call.dep(i) for i in range(3, n)]
+    held = [_only(d, args[3]) for d in deps]
+    found = [d for d, h in zip(deps, held, strict=True) if not h]
     k = ca.SX.sym("k", sum(d.size1() for d in found))
     given = [ca.SX.sym("q", m) for m in sizes]
     pieces = iter(ca.vertsplit(k, [0, *np.cumsum([d.size1() for d in found]).tolist()]))
-    rest = [ca.SX(d.to_DM()) if d.is_constant() else next(pieces) for d in more]
+    of_theta = ca.Function("theta", args[3:], [d for d, h in zip(deps, held, strict=True) if h])
+    known = of_theta.expand().call(given[3:], True, False)
+    parts = iter(known)
+    rest = [next(parts) if h else next(pieces) for h in held]
     return (
-        ca.Function("smooth", [*given, k], inner.call([*given, *rest], True, False)),
+        ca.Function("smooth", [*given, k], inner.call([*given[:3], *rest], True, False)),
         ca.Function("cells", args, [ca.vertcat(*found)]),
     )
+
+
+def _only(expression: ca.MX, symbol: ca.MX) -> bool:
+    """Whether an expression has no other symbol, be it differentiated by it or not."""
+    return all(ca.is_equal(v, symbol) for v in ca.symvar(expression))
 
 
 def _sorted(
