@@ -32,9 +32,10 @@ import numpy as np
 from scipy.special import ndtri
 
 from apu_casadi.gaspath.health import HEALTH
-from apu_casadi.machine.park import PHASES
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
+from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import engine_function
 from estimators.apu.joint import H_GAIN
@@ -76,6 +77,8 @@ STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
 SETTLED = 0.1  # s after a report, in which its innovations are explained
+SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
+FEWEST_SAMPLES = 100
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
 SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
@@ -194,6 +197,26 @@ def machine_doubts(
             "a step of load or a fault: no model of one step fits, and reports around are doubtful",
         )
     yield from _severity_doubts(side)
+    slip = _slip(samples)
+    if abs(slip) > SLIP:
+        yield Doubt(
+            "time",
+            f"the voltages turn by {slip:+.1f} rad against the speed, where no load turns them by "
+            f"{SLIP:g}: a wrong rate of samples, or the speed of another machine",
+        )
+
+
+def _slip(samples: Mapping[str, np.ndarray]) -> float:
+    """Angle that the voltage's space vector gains on the rotor from beginning to end, rad."""
+    a = np.array([samples[n] for n in (*PHASES_V, "w_r", "t")])
+    *v, w, t = a[:, np.isfinite(a).all(0)]
+    if t.size < FEWEST_SAMPLES:
+        return 0.0
+    turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+    rotor = np.concatenate([[0.0], np.cumsum(w[:-1] * np.diff(t))])
+    angle = np.unwrap(np.angle((turn @ np.array(v)) * np.exp(-1j * rotor)))
+    ends = max(t.size // 20, 1)
+    return float(angle[-ends:].mean() - angle[:ends].mean())
 
 
 def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
