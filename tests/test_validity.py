@@ -181,7 +181,10 @@ def test_a_constant_power_load_without_its_power_is_told(apu):
     P_e = np.full(101, 100e3)
     t = np.linspace(0.0, 1.0, 101)
     assert v.unserved(ConstantPowerLoad(100e3), [], t, P_e) is None
-    assert "at t = 0.5 s" in v.unserved(ConstantPowerLoad(2e5), [LoadChange(0.5, KW100)], t, P_e)
+    late = v.unserved(ConstantPowerLoad(2e5), [LoadChange(0.5, KW100)], t, P_e)
+    assert "at t = 0.5 s" in late.text()
+    assert (late.quantity, late.limit, late.worst, late.at) == ("P_e", 2e5, 1e5, 0.5)
+    assert (late.first, late.duration) == (pytest.approx(0.1), pytest.approx(0.41))
 
 
 # ------------------------------------------------------------------------------ exchange error

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.errors import ApuWarning, SimulationError
+from apu_casadi.core.errors import SimulationError
 from apu_casadi.core.means import Term
 from apu_casadi.core.runloop import SAME_INSTANT, run
 from apu_casadi.core.sharing import kept
@@ -33,6 +33,7 @@ from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu, JointPoint, groups
+from apu_casadi.unit.departures import departures
 from apu_casadi.unit.events import Event, Holding, Jump, SpeedChange, in_order, jumps
 from apu_casadi.unit.exchange import coupled
 from apu_casadi.unit.integrators import WAVEFORMS
@@ -236,9 +237,9 @@ def simulate_monolithic(
     more, signals = runrecord.followed(start, events, grid)
     rng = np.random.default_rng(0)  # of no noise
     ds = record.collect(apu, {**rows, **more}, Noise(), rng, attrs, signals)
-    notes = [ApuWarning(words) for words in record.warnings]
+    notes = [d.warning() for d in record.warnings]
     notes += load_notes(apu, record, start, events, rows)
-    return validity.conclude(ds, validity.departures(apu.gas_generator, grid, rows), notes)
+    return validity.conclude(ds, departures(apu.gas_generator, grid, rows), notes)
 
 
 class _Variant(NamedTuple):

@@ -163,7 +163,8 @@ def _undone(
         if rest or s.tau:
             values, more = interpolated(c.t, c.values, c.t + rest, more=s.tau)
             values[c.t + rest > c.t[-1]] = np.nan
-            grown[plain(n)] = float(np.median(more))
+            # between samples it is less, but no longer white: at the signal's frequency the same
+            grown[plain(n)] = max(1.0, float(np.median(more)))
         if common:
             moved.setdefault(id(c.t), c.t - common)
         t = moved.get(id(c.t), c.t)

@@ -69,14 +69,16 @@ from estimators.apu.recorded_report import (
 )
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
-from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
+from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
+from estimators.models.recording import Recording
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["PARTS", "RecordedEstimate", "estimate"]
+__all__ = ["PARTS", "RecordedEstimate", "estimate", "gas_path_data"]
 
 PARTS = ("gaspath", "electrical")
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -233,6 +235,31 @@ def _told(
     """Part causes from the doubts that they raise."""
     both = list(found)
     return tuple(c for c, _ in both), [d for _, d in both if d is not None]
+
+
+def gas_path_data(
+    m: Measurements,
+    engine: Apu | str | Path | None = None,
+    *,
+    sensors: SensorSet | None = None,
+    ambient: Mapping[str, float] | None = None,
+) -> tuple[GasPathFilter, Recording, Belief, tuple[str, ...]]:
+    """Return the gas-path filter that a recording suffices for, its data, its prior, and notes.
+
+    Args:
+        m, engine, sensors, ambient: as of :func:`estimate`.
+
+    Raises:
+        ParameterError, DataError: as of :func:`estimate`; the recording has no gas path.
+    """
+    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
+    table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
+    if reason := _no_gas_path(m, table):
+        raise DataError(f"no gas path: {reason}")
+    notes = list(m.notes)
+    path = _GasPath(m, apu, table, ambient or {}, notes, [], None, Prior(), ETA_SIGMA)
+    filt, data, prior = path.ready()
+    return filt, data, prior, tuple(dict.fromkeys(notes))
 
 
 def _fusable(
@@ -402,7 +429,6 @@ class _GasPath:
         inputs = self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
-        gg = self.apu.gas_generator
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
@@ -425,8 +451,24 @@ class _GasPath:
                 backend=self.backend,
                 max_dt=STEP,
             )
+        filt, data, start = self._ready(sensors, readings, inputs, power)
+        how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
+        return filt, track_jumps(filt, data, prior=start, **how)
+
+    def ready(self) -> tuple[GasPathFilter, Recording, Belief]:
+        """The filter without electrical side, its recording, and its prior."""
+        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
+        sensors = self.table.only([n for n in self.table.names if n not in absent])
+        power, inputs = "PW" in self.m, self._inputs()
+        span = (-math.inf, math.inf)
+        readings = self._readings(sensors, inputs, span, known_power=power)
+        return self._ready(sensors, readings, inputs, power)
+
+    def _ready(
+        self, sensors: SensorSet, readings: Streams, inputs: Mapping[str, Any], power: bool
+    ) -> tuple[GasPathFilter, Recording, Belief]:
         filt = gas_path_filter(
-            gg,
+            self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
             eta=ETA_SIGMA if power else None,
@@ -435,9 +477,7 @@ class _GasPath:
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
         self.prior.check(filt.model.x)
         means = self._start(readings, sensors) | dict(self.prior.mean)
-        start = filt.prior(self.prior.sigma, **means)
-        how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
-        return filt, track_jumps(filt, data, prior=start, **how)
+        return filt, data, filt.prior(self.prior.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""

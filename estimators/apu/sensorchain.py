@@ -52,8 +52,7 @@ def sampled(s: Sensor, time: np.ndarray, v: np.ndarray, t: np.ndarray, of: Draws
 def sampled_wave(s: Sensor, t: np.ndarray, v: np.ndarray, of: Draws) -> np.ndarray:
     """Return what it shows at the instants of a waveform, evenly sampled, its lag included."""
     if s.tau:
-        fine = np.linspace(t[0], t[-1], (t.size - 1) * FINER + 1)
-        v = _followed(fine, interpolated(t, v, fine)[0], s.tau)[::FINER]
+        v = _followed(t, v, s.tau)
     if not (s.delay or s.jitter):
         return v
     at = t - s.delay + s.jitter * of.normal(s.name, "jitter", t.size)
@@ -63,14 +62,20 @@ def sampled_wave(s: Sensor, t: np.ndarray, v: np.ndarray, of: Draws) -> np.ndarr
 
 
 def _followed(t: np.ndarray, v: np.ndarray, tau: float) -> np.ndarray:
-    """Return :func:`~estimators.apu.sensors.respond` for even steps, faster."""
-    from scipy.signal import lfilter
+    """Return the response of a lag at instants, the input between them by local polynomials.
 
-    dt = float(t[1] - t[0])
-    keep = math.exp(-dt / tau)
-    late = tau / dt * (1 - keep)  # what a ramp's value lacks at the end of a step
-    b = [1 - late, late - keep]
-    return np.asarray(lfilter(b, [1.0, -keep], v, zi=[v[0] * (1 - b[0])])[0])
+    As :func:`~estimators.apu.sensors.respond` over ``FINER`` even parts of each step.
+    """
+    part = (t[-1] - t[0]) / (t.size - 1) / FINER
+    keep = math.exp(-part / tau)
+    late = tau / part * (1 - keep)  # what a ramp's value lacks at the end of a part
+    fine, _ = interpolated(t, v, np.linspace(t[0], t[-1], (t.size - 1) * FINER + 1))
+    given = (1 - late) * fine[1:] + (late - keep) * fine[:-1]
+    driven = given.reshape(-1, FINER) @ keep ** np.arange(FINER)[::-1]
+    x, whole = np.array(v, float), keep**FINER
+    for k, more in enumerate(driven.tolist()):
+        x[k + 1] = whole * x[k] + more
+    return x
 
 
 def disturbed(

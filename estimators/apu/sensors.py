@@ -471,8 +471,9 @@ def known(sensor: Sensor) -> Sensor:
 
 
 def unregister(name: str) -> None:
-    """Forget a sensor that was registered; one of the tables stays."""
-    if _registered.pop(name, None) is not None:
+    """Forget a sensor that was registered or named; one of the tables stays."""
+    if _registered.pop(name, None) is not None or name in _named:
+        _named.discard(name)
         del KNOWN[name]
         RANGES.pop(name, None)
 

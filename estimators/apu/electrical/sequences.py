@@ -111,6 +111,17 @@ def _phasors(t: np.ndarray, x: np.ndarray, f: float) -> tuple[np.ndarray, float]
     return parts, float(np.sqrt(np.nanmean((x.T - basis @ c) ** 2)))
 
 
+def _share(t: np.ndarray, x: np.ndarray, f: float) -> float:
+    """Standard deviation of either part of a sequence over that of a sample."""
+    there = np.isfinite(x)
+    if there.all():
+        return math.sqrt(2 / x.size)
+    w = 2 * math.pi * f * (t - t[0])
+    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+    each = [np.linalg.inv(basis[r].T @ basis[r]) for r in there]
+    return math.sqrt(sum(c[0, 0] + c[1, 1] for c in each) / 2) / 3
+
+
 def fitted(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the least-squares coefficients of each column, of the rows that it has."""
     there = np.isfinite(columns)
@@ -138,8 +149,7 @@ def _window(t: np.ndarray, x: np.ndarray, f: float) -> tuple[float, np.ndarray, 
     parts, rest = _phasors(t, x, f)
     if abs(parts[1]) > abs(parts[0]):
         parts = parts[[1, 0, 2]]
-    n = np.isfinite(x).sum()
-    return f, parts, rest * math.sqrt(2 / n) / max(abs(parts[0]), 1e-300)
+    return f, parts, rest * _share(t, x, f) / max(abs(parts[0]), 1e-300)
 
 
 def _changes(ratio: np.ndarray, sigma: np.ndarray, allowed: float) -> tuple[int, list[int]]:
