@@ -44,6 +44,7 @@ from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
     from apu_casadi.machine.machinedata import MachineParameters
+    from estimators.apu.fitting import EngineFit
     from estimators.apu.gaspath import GasPathFilter
     from estimators.apu.healthjumps import Tracked
     from estimators.apu.joint import ElectricalSide
@@ -55,6 +56,7 @@ __all__ = [
     "LEVEL",
     "Doubt",
     "channel_doubts",
+    "fit_doubts",
     "gas_causes",
     "gas_doubts",
     "machine_causes",
@@ -73,6 +75,7 @@ MARGIN = (
     1.1  # on the variance of the gas path's innovations, for maps and gas data of another engine
 )
 STEEP = 0.1  # change of a factor beyond which no filter was tried
+STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
@@ -385,3 +388,34 @@ def _map_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     for n, v in zip(("compressor", "turbine"), y, strict=True):
         if not v <= 0:
             yield Doubt("maps", f"at the end the {n} runs off its map (by {v:.2g})")
+
+
+# ------------------------------------------------------------------------------ fits
+
+
+def fit_doubts(fit: EngineFit) -> Iterator[Doubt]:
+    """Say why the parameters of a fit are not to be believed, by residuals and bounds.
+
+    The residuals of a fit are smaller than those of the truth, so that the level is kept.
+
+    Args:
+        fit: of :func:`estimators.apu.fitting.fit_engine`.
+    """
+    r = fit.result
+    if r.freedom > 0 and r.p_value < LEVEL:
+        yield Doubt(
+            "innovations",
+            f"chi2 = {r.chi2:.4g} with {r.freedom} degrees of freedom: more than noise gives",
+        )
+    for k, name in enumerate(fit.names):
+        rest = {n: e for n, (_, _, e) in fit.series(k).items() if n in fit.lifted.model.y.names}
+        t = r.recordings[k].t
+        for f in least(findings(rest), LEVEL):
+            text = _GAS[f.test].format(v=f.value, t=float(t[f.at]))
+            text = text.replace("innovations", "residuals")
+            yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{name}: {f.sensor}: {text}")
+    for n in r.at_bound:
+        yield Doubt("linearisation", f"{n} is at its bound, where no interval holds")
+    for n, v in r.values.items():
+        if n.partition("[")[0] in HEALTH and abs(v - 1) > STEEP_FIT:
+            yield Doubt("linearisation", f"{n} = {v:.3f} is farther from 1 than any that was tried")
