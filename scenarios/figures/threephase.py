@@ -115,7 +115,10 @@ def _three_phase(
             for name, p in zip(rms, "abc", strict=True):
                 ax.plot(ds["time"].values, ds[name].values, color=fs.ABC[p], lw=fs.NESTED[p])
             ax.set_ylabel(f"{label}, rms")
-        ax.margins(y=0.06)
+        if waves:
+            ax.margins(y=0.06)
+        else:
+            fs.roomy(ax, np.concatenate([ds[name].values for name in rms]), 0.06)
         ax.set_xlabel("Time [s]", labelpad=2)
         fs.abc_legend(ax, "below")
         for row, draw in enumerate(drawn, 1):
@@ -172,7 +175,7 @@ def _event_row(
     """Draw the waveforms around the beginning of some later phases."""
     from matplotlib.ticker import MultipleLocator
 
-    grid = spec.subgridspec(1, len(events), wspace=0.23)
+    grid = spec.subgridspec(1, len(events), wspace=0.3)
     for i, k in enumerate(events):
         p = rows[k]
         ax = fig.add_subplot(grid[i])
@@ -199,7 +202,7 @@ def _rms_row(
     events: Sequence[int],
 ) -> None:
     """Draw the rms values around the beginning of some later phases, each on its own scale."""
-    grid = spec.subgridspec(1, len(events), wspace=0.23)
+    grid = spec.subgridspec(1, len(events), wspace=0.3)
     t = ds["time"].values
     for i, k in enumerate(events):
         p = rows[k]
