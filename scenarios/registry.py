@@ -11,7 +11,7 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -135,7 +135,7 @@ def run(
     except ValidityError as error:
         inside = [p["name"] for p in s.phase_table() if p["start"] < error.t + 1e-9]
         raise ValidityError(f"in phase {inside[-1]!r}: {error.words}", error.t) from None
-    ds.attrs["scenario"] = s.to_json()
+    ds.attrs |= {"title": s.title or s.name, "scenario": s.to_json()}
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     name_phases(ds)
     if strange := implausible(s):
@@ -271,17 +271,31 @@ def _table(ds: xr.Dataset, name: str) -> dict[str, Any]:
 
 
 def write(
-    ds: xr.Dataset, out: str | os.PathLike[str], *, figures: bool = True, name: str | None = None
+    ds: xr.Dataset,
+    out: str | os.PathLike[str],
+    *,
+    figures: bool = True,
+    name: str | None = None,
+    formats: Sequence[str] = ("nc",),
 ) -> list[Path]:
-    """Write ``NAME.nc``, ``summary.json`` and the figures into a folder; return the paths.
+    """Write data, ``summary.json`` and the figures into a folder; return the paths.
+
+    Args:
+        ds: what a run gave.
+        out: the folder.
+        figures: whether they are drawn.
+        name: of the data, without ending; that of the scenario by default.
+        formats: of the data (:data:`apu_casadi.core.resultformats.FORMATS`).
 
     Raises:
+        ParameterError: an unknown format.
         DataError: the folder or a file cannot be written.
     """
-    from apu_casadi.core import files, results
+    from apu_casadi.core import files
+    from apu_casadi.core.resultformats import save_as
 
     folder = prepare(out)
-    made = [results.save(ds, folder / f"{name or name_of(ds)}.nc")]
+    made = [p for form in formats for p in save_as(ds, folder / (name or name_of(ds)), form)]
     text = jsontext.dumps(summary(ds))
     made.append(files.write_text(folder / "summary.json", text + "\n"))
     if figures:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from apu_casadi.core.errors import ScenarioError
+from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.profiles.points import Points, Steps
 from apu_casadi.core.profiles.profile import varying
 from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
@@ -282,6 +282,54 @@ def test_library_scenarios_campaign_and_figures(tmp_path):
     assert made[-1] == "profiles.png" and len(made) == 7
     words = registry.summary(ds)["profiles"]
     assert words == ["fault mu, from 1 s: on-off 0.05 and 0 at 5 Hz, 40 % of the time"]
+
+
+@pytest.mark.ci  # CVODES in the virtual machine
+def test_a_generator_alone_follows_as_in_the_joint_run():
+    """On a shaft that does not move: held over steps of 20 ms in their middles, 1e-7 of peak."""
+    unit = UNIT.change({"gas_generator.J": 1e6})
+    load = varying(SeriesLoad.from_power, Ramp(100e3, 140e3, over=0.05))
+    grow = varying(Ttsc, 0.05, Ramp(200.0, 40.0, over=0.06))
+    joint = simulate_joint(
+        unit,
+        duration=0.06,
+        load=load,
+        events=[FaultChange(0.02, grow)],
+        waveform_dt=1e-3,
+        solver="cvodes",
+        rtol=1e-9,
+        atol=1e-11,
+    )
+    w_r = unit.w_r(unit.N_ref)
+    alone = unit.generator.simulate(
+        load, 0.06, switches=[(0.02, grow)], w_r=w_r, dt_out=1e-3, rtol=1e-9, atol=1e-11
+    )
+    inside = [k for k in range(61) if k % 20]  # at an edge: before it, or after
+    for n in ("v_a", "i_b", "i_fd", "i_fault"):
+        off = np.abs(alone[n].values[inside] - joint[n].values[inside]).max()
+        assert off < 2e-7 * np.abs(joint[n]).values.max(), n
+
+
+def test_speed_and_jumps_of_a_generator_alone():
+    """A speed along a ramp in fine steps; a fault that jumps in and out is that of two switches."""
+    gen, times = UNIT.generator, (0.01, 0.0325)
+    jumps = varying(Ttsc, mu=Steps((0.0, *times), (0.0, 0.05, 0.0)), k_rf=20.0)
+    a = gen.simulate(KW100, 0.04, fault=jumps, dt_out=1e-3)
+    b = gen.simulate(
+        KW100, 0.04, switches=[(times[0], Ttsc(0.05, 20.0)), (times[1], None)], dt_out=1e-3
+    )
+    for n in ("v_a", "i_fd", "P_loss_fault"):
+        x, y = (ds[n].sel(time=np.arange(1, 40) * 1e-3, method="nearest") for ds in (a, b))
+        assert_allclose(x, y, rtol=1e-5, atol=1e-5 * float(np.abs(y).max()))
+    w = 2500.0
+    ds = gen.simulate(KW100, 0.02, w_r=Ramp(w, w + 100.0, over=0.02), dt_out=1e-3, hold=5e-4)
+    turned = np.unwrap(ds["theta_e"].values)
+    assert turned[-1] == pytest.approx((w + 50.0) * 0.02, rel=1e-9)
+    for wrong in (0.0, -1.0, "x"):
+        with pytest.raises(ParameterError, match="hold"):
+            gen.simulate(KW100, 0.02, hold=wrong)
+    with pytest.raises(ParameterError, match="two different changes of the fault"):
+        gen.simulate(KW100, 0.02, switches=[(0.01, jumps), (0.01, None)])
 
 
 @pytest.mark.parametrize(

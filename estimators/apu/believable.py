@@ -33,7 +33,9 @@ from scipy.special import ndtri
 
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
+from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
+from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import engine_function
 from estimators.apu.joint import H_GAIN
 from estimators.apu.recorded_report import SURE, Z95
@@ -52,7 +54,9 @@ __all__ = [
     "LEVEL",
     "Doubt",
     "channel_doubts",
+    "gas_causes",
     "gas_doubts",
+    "machine_causes",
     "machine_doubts",
     "standing_still",
 ]
@@ -72,6 +76,8 @@ STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
 SETTLED = 0.1  # s after a report, in which its innovations are explained
+MOST_CAUSES = 3  # changes of a generator of which the cause is told
+SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
 
 
@@ -173,9 +179,7 @@ def machine_doubts(
         machine, sensors: as the filter knows them; the sensors with their own noise.
         samples: as the filter took them.
     """
-    now = side.phase
-    new = 1 + np.flatnonzero((now[1:] > 0) & (now[1:] != now[:-1]))
-    found = [float(t) for t in side.t[new]]
+    found = [t for t, _ in _reports(side)]
     resets = [float(t) for t in side.resets]
     waves = unexplained_waves(
         machine, sensors, samples, side.result, resets=resets, faults=found, level=LEVEL
@@ -214,6 +218,42 @@ def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
             "linearisation",
             f"h_{PHASES[best]} = {h[best, -1]:.2e} is larger than any that the filter was tried on",
         )
+
+
+def _reports(side: ElectricalSide) -> list[tuple[float, str]]:
+    """Instants at which a short circuit was reported, s, and the phases."""
+    now = side.phase
+    new = 1 + np.flatnonzero((now[1:] > 0) & (now[1:] != now[:-1]))
+    return [(float(side.t[k]), PHASES[int(now[k]) - 1]) for k in new]
+
+
+def machine_causes(
+    side: ElectricalSide,
+    machine: MachineParameters,
+    sensors: SensorSet,
+    samples: Mapping[str, np.ndarray],
+) -> Iterator[tuple[Causes, Doubt | None]]:
+    """Tell what the first changes of a generator are, and where the report says something else.
+
+    A change is a reported short circuit, or a new beginning of the filter without a report.
+
+    Args:
+        side, machine, sensors, samples: as of :func:`machine_doubts`.
+    """
+    reports, resets = _reports(side), [float(t) for t in side.resets]
+    known = [t for t, _ in reports]
+    begins = {t: max([r for r in resets if r <= t + 1e-9], default=float(side.t[0])) for t in known}
+    changes = [(begins[t], f"short circuit {p}") for t, p in reports]
+    changes += [(t, "") for t in resets if t not in begins.values()]
+    for t, said in sorted(changes)[:MOST_CAUSES]:
+        found = causes_of_change(machine, sensors, samples, t)
+        if found is None:
+            continue
+        doubt = None
+        if said and found.probability[said] < SURELY:
+            text = f"{found.best} ({100 * found.probability[found.best]:.0f} %)"
+            doubt = Doubt("sensor", f"what is reported as a {said} at {t:g} s is rather: {text}")
+        yield found, doubt
 
 
 # ------------------------------------------------------------------------------ gas path
@@ -265,6 +305,20 @@ def gas_doubts(
         abs(v - 1) > SURE * float(r[n][1][-1]) for n, v in x.items()
     )
     yield from (d for side in sides if changed for d in _hidden(side))
+
+
+def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:
+    """Tell of each reported change of health what it is, and where it is rather something else.
+
+    Args:
+        filt, tracked: the filter and what it said.
+    """
+    for found in causes_of_alarms(filt, tracked):
+        doubt = None
+        if found.probability["gas path"] < SURELY:
+            text = f"{found.best} ({100 * found.probability[found.best]:.0f} %)"
+            doubt = Doubt("sensor", f"the change reported at {found.t:g} s is rather: {text}")
+        yield found, doubt
 
 
 def _hidden(side: ElectricalSide) -> Iterator[Doubt]:

@@ -51,13 +51,12 @@ def _jumps(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str], 
 
 
 def causes_of_alarms(
-    filt: GasPathFilter, tracked: Tracked, prior: Belief | None = None, backend: str | None = None
+    filt: GasPathFilter, tracked: Tracked, *, backend: str | None = "vm"
 ) -> list[Causes]:
     """Tell of each reported change of health what it is.
 
     Args:
         filt, tracked: the filter and what it said.
-        prior: belief before the first sample, as the filter had it.
         backend: see :func:`apu_casadi.core.backend.compiled`.
     """
     out = []
@@ -68,7 +67,7 @@ def causes_of_alarms(
         u[row, onset:] = 0.0
         stop = min(k + ON, tracked.data.size)
         data = _part(replace(tracked.data, u=u), stop)
-        out.append(Causes(float(data.t[k]), _weighed(filt, data, k, prior, backend)))
+        out.append(Causes(float(data.t[k]), _weighed(filt, data, k, tracked.prior, backend)))
     return out
 
 

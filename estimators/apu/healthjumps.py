@@ -97,13 +97,14 @@ class Tracked:
         result: every sample's belief is what was known then: before an alarm from the run without
             that jump.
         alarms, onsets: samples of the alarms, and the last samples before the jumps they report.
-        data: what the filter was run on, with the jumps.
+        data, prior: what the filter was run on, with the jumps, and began with; None: its own.
     """
 
     result: FilterResult
     alarms: tuple[int, ...]
     onsets: tuple[int, ...]
     data: Recording
+    prior: Belief | None = None
 
 
 def track_jumps(
@@ -145,7 +146,7 @@ def track_jumps(
         data = Recording(data.t, u, data.y, data.variance, data.p)
         result = _spliced(result, filt.run(data, prior=prior, step=step, backend=backend), k)
         start = k + test.hold
-    return Tracked(result, tuple(alarms), tuple(onsets), data)
+    return Tracked(result, tuple(alarms), tuple(onsets), data, prior)
 
 
 def _spliced(before: FilterResult, after: FilterResult, k: int) -> FilterResult:

@@ -13,12 +13,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, ParameterError, nearest
+from apu_casadi.core.resultformats import frames, save_frame
 from apu_casadi.core.results import GENERATOR, generators_of, of_generator, save
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.unit.apu import Apu
@@ -181,15 +181,5 @@ def write_recording(readings: Mapping[str, xr.Dataset], path: str | Path) -> lis
         if ending == ".nc":
             made.append(save(ds, target))
             continue
-        named: dict[Any, str] = {n: f"{n} [{ds[n].attrs['units']}]" for n in ("time", *ds)}
-        frame = ds.to_dataframe().reset_index().rename(columns=named)
-        if ending == ".csv":
-            made.append(files.write_text(target, frame.to_csv(index=False, float_format="%.12g")))
-            continue
-        with files.whole(target) as part:
-            try:
-                frame.to_parquet(part, index=False)
-            except ImportError as e:
-                raise DataError(f"{target}: Parquet needs pyarrow: {e}") from None
-        made.append(target)
+        made.append(save_frame(frames(ds)["time"], target))
     return made

@@ -15,8 +15,8 @@ believed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +27,16 @@ from apu_casadi.core.errors import DataError, EstimationError, ParameterError, n
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
-from estimators.apu.believable import channel_doubts, gas_doubts, machine_doubts
+from estimators.apu.believable import (
+    Doubt,
+    channel_doubts,
+    gas_causes,
+    gas_doubts,
+    machine_causes,
+    machine_doubts,
+)
 from estimators.apu.declared import as_declared, tables
+from estimators.apu.electrical.causes import Causes
 from estimators.apu.electrical.electricalfilter import window_starts
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
@@ -61,14 +69,16 @@ from estimators.apu.recorded_report import (
 )
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
-from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
+from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
+from estimators.models.recording import Recording
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["PARTS", "RecordedEstimate", "estimate"]
+__all__ = ["PARTS", "RecordedEstimate", "estimate", "gas_path_data"]
 
 PARTS = ("gaspath", "electrical")
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -98,6 +108,7 @@ class RecordedEstimate:
         result: of the gas-path filter; None: not estimated.
         path: the gas-path filter and its result with the jumps that it found.
         sides: what the electrical filters say, by machine.
+        causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
     """
 
     gaspath: xr.Dataset | None
@@ -110,6 +121,7 @@ class RecordedEstimate:
     result: FilterResult | None = field(default=None, repr=False)
     path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
     sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
+    causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -128,6 +140,7 @@ class RecordedEstimate:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
+        out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
         return out | {"lacking": dict(self.lacking), "notes": list(self.notes)}
 
     def summary(self) -> str:
@@ -179,43 +192,74 @@ def estimate(
     doubts = [*ready.doubts, *channel_doubts(m, table, ready.coarse)]
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
-    reason = None if only == "electrical" else _no_gas_path(m, table)
-    gas = reason is None and only != "electrical"
+    causes: dict[str, tuple[Causes, ...]] = {}
+    reason = _no_gas_path(m, table) if only != "electrical" else "it was not asked for"
+    gas = reason is None
     if only != "electrical" and reason is not None and (m.gaspath or only):
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
-    if only != "gaspath" and m.electrical:
-        for k in _machines(m):
-            waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
-            found |= waves.sequences(lacking)
-            side = waves.side(begin, lacking, doubts, notes)
-            if side is not None:
-                sides[k] = side
-    elif only == "electrical":
+    for k in _machines(m) if only != "gaspath" and m.electrical else ():
+        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
+        found |= waves.sequences(lacking)
+        side = waves.side(begin, lacking, doubts, notes, causes)
+        if side is not None:
+            sides[k] = side
+    if only == "electrical" and not m.electrical:
         lacking["generators"] = "nothing of them was measured"
-    result, found_by, e = None, None, None
+    found_by, e = None, None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
-        told = ambient or {}, notes, doubts, backend, start, efficiency_error
-        path = _GasPath(m, apu, table, *told)
-        filt, tracked = found_by = path.run(fusable, electrical_sensors)
-        result = tracked.result
+        given = ambient or {}, notes, doubts, backend, start, efficiency_error
+        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
+        causes["gas path"], odd = _told(gas_causes(filt, tracked))
+        doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
-    if apu.alike and 0 < len(sides) < len(apu.machines):
-        notes.append(
-            f"only machine {', '.join(map(str, sides))} is estimated; power is that of "
-            f"{len(apu.machines)} equal ones"
-        )
+    if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
+        some = ", ".join(map(str, sides))
+        notes.append(f"only machine {some} is estimated; power is that of {n} equal ones")
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    more: dict[str, Any] = {"result": result, "path": found_by, "sides": sides}
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, **more)
+    end: Any = found_by and found_by[1].result, found_by, sides, causes
+    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
+
+
+def _told(
+    found: Iterable[tuple[Causes, Doubt | None]],
+) -> tuple[tuple[Causes, ...], list[Doubt]]:
+    """Part causes from the doubts that they raise."""
+    both = list(found)
+    return tuple(c for c, _ in both), [d for _, d in both if d is not None]
+
+
+def gas_path_data(
+    m: Measurements,
+    engine: Apu | str | Path | None = None,
+    *,
+    sensors: SensorSet | None = None,
+    ambient: Mapping[str, float] | None = None,
+) -> tuple[GasPathFilter, Recording, Belief, tuple[str, ...]]:
+    """Return the gas-path filter that a recording suffices for, its data, its prior, and notes.
+
+    Args:
+        m, engine, sensors, ambient: as of :func:`estimate`.
+
+    Raises:
+        ParameterError, DataError: as of :func:`estimate`; the recording has no gas path.
+    """
+    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
+    table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
+    if reason := _no_gas_path(m, table):
+        raise DataError(f"no gas path: {reason}")
+    notes = list(m.notes)
+    path = _GasPath(m, apu, table, ambient or {}, notes, [], None, Prior(), ETA_SIGMA)
+    filt, data, prior = path.ready()
+    return filt, data, prior, tuple(dict.fromkeys(notes))
 
 
 def _fusable(
@@ -300,7 +344,12 @@ class _Waves:
             )
 
     def side(
-        self, begin: float, lacking: dict[str, str], doubts: list[str], notes: list[str]
+        self,
+        begin: float,
+        lacking: dict[str, str],
+        doubts: list[str],
+        notes: list[str],
+        causes: dict[str, tuple[Causes, ...]],
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
         what = f"severity, machine {self.number}"
@@ -334,8 +383,9 @@ class _Waves:
         except (DataError, EstimationError) as e:
             lacking[what] = str(e)
             return None
-        odd = machine_doubts(side, self.apu.generator.machine, self.sensors, a)
-        doubts += (d.of(f"machine {self.number}") for d in odd)
+        how, name = (side, self.apu.generator.machine, self.sensors, a), f"machine {self.number}"
+        causes[name], odd = _told(machine_causes(*how))
+        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
         return side
 
     def _tame(self, a: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
@@ -379,7 +429,6 @@ class _GasPath:
         inputs = self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
-        gg = self.apu.gas_generator
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
@@ -402,8 +451,24 @@ class _GasPath:
                 backend=self.backend,
                 max_dt=STEP,
             )
+        filt, data, start = self._ready(sensors, readings, inputs, power)
+        how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
+        return filt, track_jumps(filt, data, prior=start, **how)
+
+    def ready(self) -> tuple[GasPathFilter, Recording, Belief]:
+        """The filter without electrical side, its recording, and its prior."""
+        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
+        sensors = self.table.only([n for n in self.table.names if n not in absent])
+        power, inputs = "PW" in self.m, self._inputs()
+        span = (-math.inf, math.inf)
+        readings = self._readings(sensors, inputs, span, known_power=power)
+        return self._ready(sensors, readings, inputs, power)
+
+    def _ready(
+        self, sensors: SensorSet, readings: Streams, inputs: Mapping[str, Any], power: bool
+    ) -> tuple[GasPathFilter, Recording, Belief]:
         filt = gas_path_filter(
-            gg,
+            self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
             eta=ETA_SIGMA if power else None,
@@ -412,9 +477,7 @@ class _GasPath:
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
         self.prior.check(filt.model.x)
         means = self._start(readings, sensors) | dict(self.prior.mean)
-        start = filt.prior(self.prior.sigma, **means)
-        how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
-        return filt, track_jumps(filt, data, prior=start, **how)
+        return filt, data, filt.prior(self.prior.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from apu_casadi.core.errors import ApuWarning, ParameterError
+from apu_casadi.core.errors import ApuWarning, ParameterError, nearest
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
 from apu_casadi.unit.usual import LOAD_SHARE
@@ -316,3 +316,18 @@ def pairs(items: Iterable[str], option: str, form: str = "NAME=VALUE") -> Iterat
 def numbers(items: Iterable[str], option: str) -> dict[str, float]:
     """Return the numbers of ``NAME=VALUE`` by name; errors as :func:`pairs` and :func:`number`."""
     return {p.name: number(p.value, option, p.item) for p in pairs(items, option)}
+
+
+def formats(text: str) -> tuple[str, ...]:
+    """Return the formats that results are asked for in, before they are computed.
+
+    Raises:
+        ParameterError: an unknown one.
+    """
+    from apu_casadi.core.resultformats import FORMATS
+
+    names = tuple(dict.fromkeys(n.strip() for n in text.split(",")))
+    for name in names:
+        if name not in FORMATS:
+            raise ParameterError(f"--format: unknown format {name!r} {nearest(name, FORMATS)}")
+    return names

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import casadi as ca
 
@@ -121,6 +121,10 @@ __attribute__((unused)) EACH(ceil)
 """
 
 
+Fixed: TypeAlias = tuple[int, ...]
+Maker: TypeAlias = "Callable[[Writer, ca.Function, bool, str, Fixed], int]"
+
+
 class Written(NamedTuple):
     """A C function ``name(arg, res, w)``: pointers to inputs and outputs, and work.
 
@@ -143,23 +147,27 @@ class Writer:
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
         self._text: list[str] = []
-        self._known: dict[tuple[int, bool], Written] = {}
+        self._known: dict[tuple[int, bool, Fixed], Written] = {}
         self._held: list[ca.Function] = []  # hashes are of objects that live
         self._tables: dict[str, str] = {}
-        self._makers: dict[str, Callable[[Writer, ca.Function, bool, str], int]] = {}
+        self._makers: dict[str, Maker] = {}
         self.add("SXFunction", _straight_line)
 
-    def add(self, kind: str, make: Callable[[Writer, ca.Function, bool, str], int]) -> None:
-        """Say who writes functions of a kind: (writer, function, wide, name) -> work."""
+    def add(self, kind: str, make: Maker) -> None:
+        """Say who writes functions of a kind: (writer, function, wide, name, fixed) -> work."""
         self._makers[kind] = make
 
-    def function(self, fun: ca.Function, wide: bool) -> Written:
+    def function(self, fun: ca.Function, wide: bool, fixed: Fixed = ()) -> Written:
         """Write a function, or find it written.
+
+        Args:
+            fun, wide: the function, and whether on vectors.
+            fixed: inputs of a map that are the same for all its columns, and come once.
 
         Raises:
             BackendError: it holds something that has no form in lanes; the message names it.
         """
-        key = (hash(fun), wide)
+        key = (hash(fun), wide, fixed)
         if key not in self._known:
             make = self._makers.get(fun.class_name())
             if make is None:
@@ -169,8 +177,8 @@ class Writer:
                     "function of scalar operations where that is possible)"
                 )
             self._held.append(fun)
-            name = f"f{len(self._held)}_{'v' if wide else 's'}"
-            self._known[key] = Written(name, make(self, fun, wide, name))
+            name = f"f{len(self._known)}_{len(self._held)}_{'v' if wide else 's'}"
+            self._known[key] = Written(name, make(self, fun, wide, name, fixed))
         return self._known[key]
 
     def put(self, text: str) -> None:
@@ -217,7 +225,7 @@ def refused(fun: ca.Function, op: int) -> BackendError:
     )
 
 
-def _straight_line(writer: Writer, fun: ca.Function, wide: bool, name: str) -> int:
+def _straight_line(writer: Writer, fun: ca.Function, wide: bool, name: str, _: Fixed) -> int:
     """Write an SX function; it needs no work: compilers choose what stays in registers."""
     p, T = ("v_", "V") if wide else ("s_", "S")
     body = []

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import BackendError
-from apu_casadi.core.lanes.lanecode import BINARY, UNARY, Writer, Written, number, refused
+from apu_casadi.core.lanes.lanecode import BINARY, UNARY, Fixed, Writer, Written, number, refused
 
 _MOVES = {ca.OP_RESHAPE, ca.OP_SPARSITY_CAST, ca.OP_TRANSPOSE, ca.OP_PROJECT, ca.OP_GETNONZEROS}
 _MOVES |= {ca.OP_HORZREPMAT}
@@ -38,7 +38,7 @@ _SUMS = {
 def graph_writer(lanes: int) -> Writer:
     """Return a writer of all kinds of functions that have a form in lanes."""
     writer = Writer(lanes)
-    writer.add("MXFunction", lambda *given: _Graph(*given).write())
+    writer.add("MXFunction", lambda *given: _Graph(*given[:4]).write())
     writer.add("Map", _mapped)
     writer.add("FastNewton", _newton)
     return writer
@@ -85,7 +85,14 @@ class _Graph:
         for i in sorted(sizes):
             self.at[i] = at
             at += sizes[i]
+        #: where the one column stands that a map takes again and again, by instruction
+        self.repeated: dict[int, int] = {}
+        for k in range(self.n):
+            if self.op[k] == ca.OP_HORZREPMAT and self._for_maps(k):
+                self.repeated[k] = at
+                at += self.nodes[k].dep(0).nnz()
         self.own = at
+        self.alias: dict[int, str] = {}  # work that is a part of an input
         self.tables: dict[int, str] = {}  # work that is a constant table
 
     def _sizes(self, k: int) -> list[int]:
@@ -98,6 +105,21 @@ class _Graph:
             parts = node.info()["output"]
             return [parts.nnz_out(j) for j in range(parts.n_out())]
         return [node.nnz()]
+
+    def _for_maps(self, k: int) -> bool:
+        """Whether a column that is repeated goes to maps of as many columns, and nowhere else."""
+        node, o = self.nodes[k], self.outs[k][0]
+        times = node.nnz() // max(1, node.dep(0).nnz())
+        used = False
+        for later in range(k + 1, self.n):
+            if o in self.ins[later]:
+                g = self.nodes[later].which_function() if self.op[later] == ca.OP_CALL else None
+                if g is None or g.class_name() != "Map" or _columns(g)[1] != times:
+                    return False
+                used = True
+            if o in self.outs[later] and self.op[later] != ca.OP_OUTPUT:
+                break
+        return used
 
     def write(self) -> int:
         for k in range(self.n):
@@ -113,6 +135,22 @@ class _Graph:
         """Where work is; a part of scratch that holds zeros if there is none."""
         return f"(w+{self.at[i]})" if i >= 0 else "x"
 
+    def _get(self, i: int) -> str:
+        """Where work is read: a part of an input itself, as long as that is all it is."""
+        return self.alias.get(i, self._w(i))
+
+    def _stands(self, k: int) -> str:
+        """Where the output of an instruction stands already, in an input; "" if it does not."""
+        op, node = self.op[k], self.nodes[k]
+        if op == ca.OP_INPUT:
+            info = node.info()
+            return f"(a[{info['ind']}]+{info['offset']})"
+        if op in _MOVES and self.ins[k][0] in self.alias and k not in self.repeated:
+            which = self._from(k)
+            if which and which == [*range(which[0], which[0] + len(which))]:
+                return f"({self.alias[self.ins[k][0]]}+{which[0]})"
+        return ""
+
     def _each(self, n: int, statement: str) -> None:
         self.body.append(f"for(int k=0;k<{n};k++){statement};" if n else ";")
 
@@ -120,31 +158,53 @@ class _Graph:
         self.scratch = max(self.scratch, n)
 
     def _instruction(self, k: int) -> None:
+        op, o = self.op[k], self.outs[k]
+        here = self._stands(k)
+        fresh = {o[0]: here} if here else self._split(k)
+        if not fresh:
+            self._written(k)
+        if op != ca.OP_OUTPUT:
+            for j in o:
+                self.alias.pop(j, None)
+            self.alias |= fresh
+
+    def _split(self, k: int) -> dict[int, str]:
+        """Parts of an input, which stand where they are."""
+        if self.op[k] not in _SPLITS or self.ins[k][0] not in self.alias:
+            return {}
+        at, found = 0, {}
+        for target, n in zip(self.outs[k], self._sizes(k), strict=True):
+            found[target] = f"({self.alias[self.ins[k][0]]}+{at})"
+            at += n
+        found.pop(-1, None)
+        return found
+
+    def _written(self, k: int) -> None:
         op, node, i, o = self.op[k], self.nodes[k], self.ins[k], self.outs[k]
-        if op == ca.OP_INPUT:
-            info = node.info()
-            self._each(node.nnz(), f"{self._w(o[0])}[k]=a[{info['ind']}][{info['offset']}+k]")
-        elif op == ca.OP_OUTPUT:
+        if op == ca.OP_OUTPUT:
             info = node.info()
             n = node.dep(0).nnz()
-            self._each(n, f"r[{info['ind']}][{info['offset']}+k]={self._w(i[0])}[k]")
+            self._each(n, f"r[{info['ind']}][{info['offset']}+k]={self._get(i[0])}[k]")
         elif op == ca.OP_CONST:
             self._constant(k)
         elif op in UNARY or op in BINARY:
             self._elementwise(k)
+        elif k in self.repeated:
+            n = node.dep(0).nnz()
+            self._each(n, f"w[{self.repeated[k]}+k]={self._get(i[0])}[k]")
         elif op in _MOVES:
-            self._move(self._w(o[0]), self._w(i[0]), self._from(k))
+            self._move(self._w(o[0]), self._get(i[0]), self._from(k))
         elif op in _JOINS:
             at = 0
             for j, source in enumerate(i):
                 n = node.dep(j).nnz()
-                self._each(n, f"{self._w(o[0])}[{at}+k]={self._w(source)}[k]")
+                self._each(n, f"{self._w(o[0])}[{at}+k]={self._get(source)}[k]")
                 at += n
         elif op in _SPLITS:
             at = 0
             for target, n in zip(o, self._sizes(k), strict=True):
                 if target >= 0:
-                    self._each(n, f"{self._w(target)}[k]={self._w(i[0])}[{at}+k]")
+                    self._each(n, f"{self._w(target)}[k]={self._get(i[0])}[{at}+k]")
                 at += n
         elif op in _SETS:
             self._set(k)
@@ -177,20 +237,23 @@ class _Graph:
             if i in self.outs[later] and self.op[later] != ca.OP_OUTPUT:
                 return
 
+    def _made_by(self, k: int, i: int) -> int:
+        """Return which instruction before another one made a work vector; -1: none."""
+        for before in range(k - 1, -1, -1):
+            if i >= 0 and self.op[before] != ca.OP_OUTPUT and i in self.outs[before]:
+                return before
+        return -1
+
     def _table_of(self, k: int) -> str | None:
         """Return the table that the first input of an instruction is; None where it varies."""
-        i = self.ins[k][0]
-        for before in range(k - 1, -1, -1):
-            if self.op[before] != ca.OP_OUTPUT and i in self.outs[before]:
-                return self.tables.get(before)
-        return None
+        return self.tables.get(self._made_by(k, self.ins[k][0]))
 
     def _elementwise(self, k: int) -> None:
         op, node, n = self.op[k], self.nodes[k], self.nodes[k].nnz()
         terms = []
         for j, i in enumerate(self.ins[k]):
             one = node.dep(j).nnz() == 1 and n != 1
-            terms.append(f"{self._w(i)}[0]" if one else f"{self._w(i)}[k]")
+            terms.append(f"{self._get(i)}[0]" if one else f"{self._get(i)}[k]")
         code = BINARY[op] if op in BINARY else UNARY[op]
         code = code.format(p=self.p, a=terms[0], b=terms[-1])
         self._each(n, f"{self._w(self.outs[k][0])}[k]={code}")
@@ -237,11 +300,11 @@ class _Graph:
     def _set(self, k: int) -> None:
         (base, values), to = self.ins[k], self._w(self.outs[k][0])
         which, how = _indices(self.nodes[k].info()), _SETS[self.op[k]]
-        if self._w(base) != to:
-            self._each(self.nodes[k].nnz(), f"{to}[k]={self._w(base)}[k]")
+        if self._get(base) != to:
+            self._each(self.nodes[k].nnz(), f"{to}[k]={self._get(base)}[k]")
         kept = [j for j, at in enumerate(which) if at >= 0]
         source, target = self._at(kept), self._at([which[j] for j in kept])
-        self._each(len(kept), f"{to}[{target}]{how}{self._w(values)}[{source}]")
+        self._each(len(kept), f"{to}[{target}]{how}{self._get(values)}[{source}]")
 
     # -------------------------------------------------------------------------- sums
 
@@ -249,7 +312,7 @@ class _Graph:
         node, i = self.nodes[k], self.ins[k]
         x = node.dep(0)
         edge = "-INFINITY" if x.is_dense() else "0.0"
-        given = {"p": self.p, "x": self._w(i[0]), "y": self._w(i[-1]), "edge": edge}
+        given = {"p": self.p, "x": self._get(i[0]), "y": self._get(i[-1]), "edge": edge}
         start, add, end = (text.format(**given) for text in _SUMS[self.op[k]])
         to = self._w(self.outs[k][0])
         loop = f"for(int k=0;k<{x.nnz()};k++){add};"
@@ -259,9 +322,9 @@ class _Graph:
         """z + x y; each entry summed in the order of the inner index."""
         node, (_, ix, iy), to = self.nodes[k], self.ins[k], self._w(self.outs[k][0])
         z, x, y = (node.dep(j).sparsity() for j in range(3))
-        if self._w(self.ins[k][0]) != to:
-            self._each(z.nnz(), f"{to}[k]={self._w(self.ins[k][0])}[k]")
-        X, Y = self._w(ix), self._w(iy)
+        if self._get(self.ins[k][0]) != to:
+            self._each(z.nnz(), f"{to}[k]={self._get(self.ins[k][0])}[k]")
+        X, Y = self._get(ix), self._get(iy)
         if x.is_dense() and y.is_dense() and z.is_dense():
             (n, m), q = x.shape, y.shape[1]
             self.body.append(
@@ -289,7 +352,7 @@ class _Graph:
             what = "a grid that is computed" if table is None else "lookup_mode exact"
             raise BackendError(f"{self.fun.name()}: LOW with {what} has no form in lanes")
         n = node.dep(0).nnz()
-        to, x = self._w(self.outs[k][0]), self._w(self.ins[k][1])
+        to, x = self._w(self.outs[k][0]), self._get(self.ins[k][1])
         # intervals begun, one after the other: what is not a number counts as beyond them all
         count = f"for(int g=1;g<{n}-1;g++)s=s+{self.p}sel(b<{table}[g],zero,one);"
         ones = f"const {self.T} zero={self.p}all(0.0),one={self.p}all(1.0);"
@@ -299,7 +362,7 @@ class _Graph:
     def _gather(self, k: int) -> None:
         """Entries of a vector at places that are computed, each lane's own."""
         node, info = self.nodes[k], self.nodes[k].info()
-        to, at = self._w(self.outs[k][0]), self._w(self.ins[k][1])
+        to, at = self._w(self.outs[k][0]), self._get(self.ins[k][1])
         if "inner" not in info or node.dep(1).nnz() != 1:
             raise BackendError(
                 f"{self.fun.name()}: the operation GETNONZEROS_PARAM has a form in lanes only "
@@ -309,12 +372,12 @@ class _Graph:
         which = f"({s['start']}+k*{s['step']})"
         n = node.nnz()
         if not self.wide:
-            source = table or self._w(self.ins[k][0])
+            source = table or self._get(self.ins[k][0])
             self.body.append(f"{{const int q=(int){at}[0];")
             self._each(n, f"{to}[k]={source}[q+{which}]")
             self.body.append("}")
             return
-        source = f"{table}[q+{which}]" if table else f"{self._w(self.ins[k][0])}[q+{which}][l]"
+        source = f"{table}[q+{which}]" if table else f"{self._get(self.ins[k][0])}[q+{which}][l]"
         self._room(1)
         self.body.append(
             f"x[0]={at}[0];for(int l=0;l<L;l++){{const int q=(int)x[0][l];double*t=(double*){to}+l;"
@@ -325,14 +388,20 @@ class _Graph:
 
     def _call(self, k: int) -> None:
         g, T = self.nodes[k].which_function(), self.T
-        done = self.writer.function(g, self.wide)
+        made = [self._made_by(k, i) for i in self.ins[k]]
+        fixed = tuple(j for j, by in enumerate(made) if by in self.repeated)
+        done = self.writer.function(g, self.wide, fixed)
         unwanted = sum(g.nnz_out(j) for j, o in enumerate(self.outs[k]) if o < 0)
         absent = max((g.nnz_in(j) for j, i in enumerate(self.ins[k]) if i < 0), default=0)
         self._room(absent + unwanted)
         self.inner = max(self.inner, done.work)
         if absent:
             self._each(absent, f"x[k]={self.p}all(0.0)")
-        args = ",".join(self._w(i) for i in self.ins[k]) or "x"
+        where = [
+            f"(w+{self.repeated[by]})" if by in self.repeated else self._get(i)
+            for i, by in zip(self.ins[k], made, strict=True)
+        ]
+        args = ",".join(where) or "x"
         at, results = absent, []
         for j, o in enumerate(self.outs[k]):
             results.append(self._w(o) if o >= 0 else f"x+{at}")
@@ -357,17 +426,22 @@ def _own_code(fun: ca.Function) -> str:
     return text[text.index("static int casadi_f0(") :]
 
 
-def _mapped(writer: Writer, fun: ca.Function, wide: bool, name: str) -> int:
-    """Write a map: column by column, or, in a single evaluation, in lanes."""
+def _columns(fun: ca.Function) -> tuple[ca.Function, int]:
+    """Return what a map evaluates, and for how many columns."""
     (inner,) = (fun.get_function(n) for n in fun.get_function())
-    count = next(fun.nnz_out(j) // inner.nnz_out(j) for j in range(fun.n_out()) if inner.nnz_out(j))
-    n_in = [inner.nnz_in(i) for i in range(inner.n_in())]
-    n_out = [inner.nnz_out(j) for j in range(inner.n_out())]
+    some = (j for j in range(fun.n_out()) if inner.nnz_out(j))
+    return inner, next((fun.nnz_out(j) // inner.nnz_out(j) for j in some), 0)
+
+
+def _mapped(writer: Writer, fun: ca.Function, wide: bool, name: str, fixed: Fixed) -> int:
+    """Write a map: column by column, or, in a single evaluation, in lanes."""
+    inner, count = _columns(fun)
     done = writer.function(inner, True)
     if not wide:
-        return _map_in_lanes(writer, done, name, count, n_in, n_out)
-    args = ",".join(f"a[{i}]+c*{n}" for i, n in enumerate(n_in)) or "0"
-    results = ",".join(f"r[{j}]+c*{n}" for j, n in enumerate(n_out))
+        return _map_in_lanes(writer, inner, done, name, count, fixed)
+    steps = [0 if i in fixed else inner.nnz_in(i) for i in range(inner.n_in())]
+    args = ",".join(f"a[{i}]+c*{n}" for i, n in enumerate(steps)) or "0"
+    results = ",".join(f"r[{j}]+c*{inner.nnz_out(j)}" for j in range(inner.n_out()))
     writer.put(
         f"static void {name}(const V*const*a,V*const*r,V*w){{\n"
         f"for(int c=0;c<{count};c++){{const V*const a1[]={{{args}}};V*const r1[]={{{results}}};"
@@ -377,19 +451,24 @@ def _mapped(writer: Writer, fun: ca.Function, wide: bool, name: str) -> int:
 
 
 def _map_in_lanes(
-    writer: Writer, done: Written, name: str, count: int, n_in: list[int], n_out: list[int]
+    writer: Writer, inner: ca.Function, done: Written, name: str, count: int, fixed: Fixed
 ) -> int:
     """Write a map over numbers: columns go into lanes, the last ones again where some are left."""
-    before, after, at = [], [], 0
+    once, before, after, at = [], [], [], 0
     args, results = list[str](), list[str]()
-    for i, n in enumerate(n_in):
-        before.append(
-            f"for(int l=0;l<L;l++){{const int d=c+l<{count}?c+l:{count - 1};"
-            f"for(int k=0;k<{n};k++)((double*)(v+{at}))[k*L+l]=a[{i}][d*{n}+k];}}"
-        )
+    for i in range(inner.n_in()):
+        n = inner.nnz_in(i)
+        if i in fixed:
+            once.append(f"for(int k=0;k<{n};k++)v[{at}+k]=v_all(a[{i}][k]);")
+        else:
+            before.append(
+                f"for(int l=0;l<L;l++){{const int d=c+l<{count}?c+l:{count - 1};"
+                f"for(int k=0;k<{n};k++)((double*)(v+{at}))[k*L+l]=a[{i}][d*{n}+k];}}"
+            )
         args.append(f"v+{at}")
         at += n
-    for j, n in enumerate(n_out):
+    for j in range(inner.n_out()):
+        n = inner.nnz_out(j)
         after.append(
             f"for(int l=0;l<L&&c+l<{count};l++)for(int k=0;k<{n};k++)"
             f"r[{j}][(c+l)*{n}+k]=((double*)(v+{at}))[k*L+l];"
@@ -401,7 +480,7 @@ def _map_in_lanes(
     aligned = "V*const v=(V*)(((uintptr_t)w+8*L-1)&~(uintptr_t)(8*L-1));"
     loop = f"for(int c=0;c<{count};c+=L){{"
     run = f"{call}{done.name}(a1,r1,v+{at});"
-    writer.put("\n".join([head, aligned, loop, *before, run, *after, "}}"]))
+    writer.put("\n".join([head, aligned, *once, loop, *before, run, *after, "}}"]))
     return (at + done.work + 1) * writer.lanes
 
 
@@ -426,7 +505,7 @@ for(int k=0;k<N;k++)r[0][k]=x[k];
 }"""
 
 
-def _newton(writer: Writer, fun: ca.Function, wide: bool, name: str) -> int:
+def _newton(writer: Writer, fun: ca.Function, wide: bool, name: str, _: Fixed) -> int:
     """Write the loop around a step; what has converged in a lane stays as it is."""
     loop = fun.get_function("jac_g_x")
     n: int = fun.nnz_in(0)
