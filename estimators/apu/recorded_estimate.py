@@ -37,8 +37,6 @@ from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import Tracked, track_jumps
 from estimators.apu.joint import (
     ETA_SIGMA,
-    H_FLOOR,
-    H_GAIN,
     ElectricalSide,
     electrical_side,
     fused,
@@ -75,6 +73,7 @@ STEP = 1.5 * DT  # longest of the gas-path filter
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 STILL = 25  # equal readings in a row that noise does not give
 FEWEST = 20  # innovations that a verdict takes
+SEVERAL = 100.0  # chi-squared of two degrees of freedom that one faulty phase leaves unexplained
 STEEP = 0.1  # change of a factor beyond which no filter was tried
 
 
@@ -521,9 +520,7 @@ def _restless(side: ElectricalSide) -> Iterator[str]:
             f"its filter began anew {len(side.resets)} times up to {side.resets[-1]:g} s, as after "
             "a step of load or a fault: no model of one step fits, and reports around are doubtful"
         )
-    h, s = side.severities
-    second = np.sort((h - H_FLOOR) / s, axis=0)[-2]
-    several = np.flatnonzero((side.phase > 0) & (second > 5))
+    several = np.flatnonzero((side.phase > 0) & (side.misfit > SEVERAL))
     if several.size:
         yield (
             f"at {side.t[several[0]]:g} s several phases look faulty at once, which is no short "
@@ -547,7 +544,7 @@ def _judge_gas(
     changed = bool(tracked.alarms) or bool((np.abs(x - 1) > SURE * s).any())
     for side in sides:
         h, h_sigma = side.severities[:, :, -1]
-        i = int((h / np.hypot(h_sigma, H_GAIN)).argmax())
+        i = int((h / h_sigma).argmax())
         if changed and not side.phase[-1] and h[i] > 2 * h_sigma[i]:
             doubts.append(
                 f"a short circuit of h_{PHASES[i]} = {h[i]:.1e} +- {Z95 * h_sigma[i]:.1e} may be "

@@ -54,6 +54,7 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 _STUDY = f"""
 study NAME    | all, or one of {", ".join(names())}
 --seeds int N | fresh seeds (default: the study's own)
+--first-seed int N | the first of them (default: the study's own)
 {_OUT}
 --again       | also run what is kept
 --json        | print the claims as JSON
@@ -210,17 +211,25 @@ def _study(args: argparse.Namespace) -> int:
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
     usage.count("--seeds", args.seeds, least=2)
+    usage.count("--first-seed", args.first_seed, least=0)
     folder = registry.prepare(args.out)
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
     for name in chosen:
-        study = catalogue.get(name)
+        study = catalogue.from_seed(catalogue.get(name), args.first_seed)
         n = args.seeds or study.seeds
         todo = list(study.parts) if args.again else catalogue.pending(study, folder, n)
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
-            record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
+            record = catalogue.run(
+                name,
+                folder,
+                n_seeds=n,
+                first_seed=args.first_seed,
+                again=args.again,
+                progress=progress,
+            )
         with understood(name):
             found[name] = study.report.claims(catalogue.results(record))
         if not args.json:

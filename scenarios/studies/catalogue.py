@@ -10,6 +10,7 @@ run with the same seeds and the same constants is not run again.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
 import re
@@ -27,7 +28,18 @@ from scenarios.shell.locking import locked
 from scenarios.studies import estimation, kept
 from scenarios.studies.registration import Results, Study, plain
 
-__all__ = ["STUDIES", "State", "get", "other_code", "pending", "read", "results", "run", "states"]
+__all__ = [
+    "STUDIES",
+    "State",
+    "from_seed",
+    "get",
+    "other_code",
+    "pending",
+    "read",
+    "results",
+    "run",
+    "states",
+]
 
 PACKAGES = ("apu-casadi", "casadi", "numpy", "scipy", "filterpy")
 
@@ -152,6 +164,11 @@ def _holds(made: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     return True
 
 
+def from_seed(study: Study, first: int | None) -> Study:
+    """Return the study with another first seed; None: its own."""
+    return study if first is None else dataclasses.replace(study, seed0=first)
+
+
 def pending(study: Study, folder: str | Path, n_seeds: int) -> list[str]:
     """Return the parts that are not kept in ``folder`` with these seeds and today's constants."""
     found = states(study, read(study, folder), n_seeds, code=False)
@@ -182,6 +199,7 @@ def run(
     folder: str | Path,
     *,
     n_seeds: int | None = None,
+    first_seed: int | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -193,6 +211,7 @@ def run(
         name: of the study.
         folder: where ``NAME.json`` is kept.
         n_seeds: fresh seeds; the study's own number by default.
+        first_seed: the first of them; the study's own by default.
         again: run all parts, kept or not.
         progress: see :data:`Progress`.
 
@@ -200,7 +219,7 @@ def run(
         ParameterError: unknown study, fewer than two seeds.
         DataError: the folder cannot be used.
     """
-    study = get(name)
+    study = from_seed(get(name), first_seed)
     n = study.seeds if n_seeds is None else n_seeds
     if n < 2:
         raise ParameterError(f"a study of {n} seeds says nothing: 2 at least")

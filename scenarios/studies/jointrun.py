@@ -25,7 +25,7 @@ from apu_casadi.machine.machinedata import require_linear
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT
-from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
+from estimators.apu.joint import estimate_joint, joint_case
 from estimators.apu.sensors import gas_path_table
 from scenarios import registry
 from scenarios.schema import Scenario
@@ -207,16 +207,6 @@ def joint_seconds(scenario: str = "joint", repeat: int = 3, seed: int = 1) -> di
 # ------------------------------------------------------------------------------ what it says
 
 
-def _sigma(e: xr.Dataset, name: str) -> np.ndarray:
-    """Standard deviation of all that may be wrong.
-
-    The electrical filter's power comes with the variance of its windows; the gain errors of its
-    sensors, common to all windows, are added here.
-    """
-    s = np.asarray(e[f"{name}_sigma"].values, float)
-    return np.hypot(s, GAIN_SHARE * e[name].values) if name == "P_total" else s
-
-
 def _at(t: np.ndarray, when: float) -> int:
     """Last sample at or before an instant."""
     return int(np.searchsorted(t, when + 1e-9)) - 1
@@ -240,7 +230,7 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         values = {}
         for n in SHOWN:
             x, true = (float(e[f"{n}{end}"].values[k]) for end in ("", "_true"))
-            s = float(_sigma(e, n)[k])
+            s = float(e[f"{n}_sigma"].values[k])
             inside = bool(abs(x - true) <= Z95 * s)
             values[n] = {"true": true, "estimate": x, "half_width": Z95 * s, "inside": inside}
         found = int(e["faulty_phase"].values[k])
@@ -422,7 +412,7 @@ def saved(e: xr.Dataset, every: int = 2) -> dict[str, Any]:
     """Return an estimate for JSON: the report, and every second sample for the figure."""
     keep, curves = slice(None, None, every), {}
     for n in SHOWN:
-        curves[n], curves[f"{n}_sigma"] = e[n].values[keep], _sigma(e, n)[keep]
+        curves[n], curves[f"{n}_sigma"] = e[n].values[keep], e[f"{n}_sigma"].values[keep]
         curves[f"{n}_true"] = e[f"{n}_true"].values[keep]
     t, alarms = e["time"].values[keep], json.loads(e.attrs["alarms"])
     return {"report": report(e), "t": t, "curves": curves, "alarms": alarms}
