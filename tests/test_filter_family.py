@@ -22,6 +22,7 @@ from estimators.apu.joint import electrical_samples
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.ekf import ekf_step, extended_kalman_filter
 from estimators.filters.filtering import FilterStep
+from estimators.filters.imm import interacting_multiple_models
 from estimators.filters.ukf import ukf_step
 from estimators.models.filtermodel import (
     FilterModel,
@@ -70,6 +71,7 @@ def slopes(model: FilterModel, x, u, w, dt, first: int) -> np.ndarray:
 # ------------------------------------------------------------------------------ gas path
 
 
+@pytest.mark.long
 def test_derivatives_of_the_gas_path_filter_by_every_parameter_are_exact():
     """Transition and output by all parameters of the engine, against units made with them.
 
@@ -108,6 +110,7 @@ def truth():
     return simulate_joint(Apu(), duration=0.5, load=KW100, waveform_dt=None)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [None, ukf_step])
 def test_another_engine_builds_and_compiles_nothing(truth, step, asked, monkeypatch):
     """The block of the second engine's filter is the first one's; its beliefs are its own."""
@@ -312,3 +315,22 @@ def test_a_filter_of_another_engine_compiles_nothing(truth, asked):
         unit = Apu().change({"gas_generator.eta_c": 0.84 + 1e-3 * k})
         gas_path_filter(unit.gas_generator, **how).run(data)
     assert before and asked == before
+
+
+def test_interacting_models_of_another_engine_compile_nothing(truth, asked):
+    """Modes are members: the block is the families', the numbers of each mode are arguments."""
+    probabilities = []
+    before = set(asked)
+    for eta in (0.85, 0.84):
+        unit = Apu().change({"gas_generator.eta_c": eta}).gas_generator
+        filts = [gas_path_filter(unit, gains=g, inertia=None) for g in (False, ("T5",))]
+        models = {n: ekf_step(f.model) for n, f in zip(("exact", "biased"), filts, strict=True)}
+        priors = {n: f.prior() for n, f in zip(models, filts, strict=True)}
+        rates = np.array([[-0.1, 0.1], [0.1, -0.1]])
+        data = filts[0].recording(truth, 1)
+        r = interacting_multiple_models(models, priors, data, rates=rates)
+        probabilities.append(r.probability)
+        if not before:
+            before = set(asked)
+    assert before and asked == before
+    assert np.abs(probabilities[0] - probabilities[1]).max() > 1e-6

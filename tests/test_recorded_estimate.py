@@ -361,3 +361,19 @@ def test_commands(run, tmp_path, capsys, monkeypatch):
     ):
         assert cli.main(wrong) != 0
         assert words in capsys.readouterr().err
+
+
+def test_noise_is_tuned_from_a_recording(files, tmp_path, capsys):
+    """The command: ten samples know the noise of T5 to a quarter; JSON, figure and text agree."""
+    gas = str(files[0])
+    assert cli.main(["tune", gas, "--noise", "T5", "--walk", "", "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    report = json.loads((tmp_path / "tune.json").read_text())
+    (row,) = report["estimates"]
+    assert (row["name"], row["kind"], row["unit"]) == ("T5", "noise", "K")
+    assert row["low"] < row["estimate"] < row["high"] and 0.3 < row["estimate"] / row["start"] < 2
+    assert report["loglik"] >= report["loglik_start"]
+    assert f"noise of output T5       {row['start']:>11.4g}  {row['estimate']:>10.4g}" in said
+    assert (tmp_path / "tune.png").stat().st_size > 10_000
+    assert cli.main(["tune", gas, "--noise", "T9", "--walk", ""]) == 2
+    assert "noise of output 'T9'" in capsys.readouterr().err

@@ -88,6 +88,7 @@ def test_the_filter_carries_the_lag_exactly():
     assert float(model.output(x, u, [], w)[0][-1]) == 700.0
 
 
+@pytest.mark.long
 def test_a_lagging_sensor_is_followed_through_a_load_drop(drop):
     """The filter is consistent; one that takes the thermocouple for instantaneous is not."""
     late, instant = ([], [])

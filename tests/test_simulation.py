@@ -1,5 +1,7 @@
 """The integrators on models with known solutions, and what they say when they fail."""
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -52,6 +54,23 @@ def test_decay_and_its_means_are_exact(solver, mx):
         assert res.mean["y"] == pytest.approx(6 * -np.expm1(-a * dt) / (a * dt), rel=1e-6)
         mean_square = 36 * -np.expm1(-2 * a * dt) / (2 * a * dt)
         assert res.mean["y^2"] == pytest.approx(mean_square, rel=1e-6)
+
+
+def test_idas_starts_where_its_own_scale_says(monkeypatch):
+    """A unit's magnitudes may differ from its family's, by which the integrator is scaled."""
+    z = Signals([Signal("z", "V", "input times state", nominal=5e-3)])
+    unit = dataclasses.replace(StateSpace.member("unit", LINEAR, Signals([]), [0.7]), z=z)
+    run, starts = stepper(unit, solver="idas"), []
+    call = type(run._F).__call__
+
+    def noting(solver, *given):
+        starts.append(given[-1])
+        return call(solver, *given)
+
+    monkeypatch.setattr(type(run._F), "__call__", noting)
+    made = run([3.0], [2.0], [], 0.5)
+    assert made.x_end[0] == pytest.approx(3 * np.exp(-0.7), rel=1e-6)
+    assert_allclose(starts[0] * LINEAR.z.nominals, 6.0, rtol=1e-4)
 
 
 def test_steppers_are_built_once():

@@ -187,7 +187,7 @@ class Stepper(Rebuilt):
         if self.solver != "idas":
             xf, qf = self._F(scaled, p, np.zeros(0))
             return xf * self.ss.x.nominals[:, None], qf
-        z0 = self.ss.z_of(x0, u, theta).full().ravel() / self.ss.z.nominals
+        z0 = self.ss.z_of(x0, u, theta).full().ravel() / self.ss.shared.z.nominals
         for last, move in enumerate(_MOVES, 1 - len(_MOVES)):
             try:
                 xf, qf = self._F(scaled, p, z0 * (1.0 + move) + move)
@@ -326,11 +326,10 @@ def stepper(
     rtol: float = RTOL,
     atol: float = ATOL,
 ) -> Stepper:
-    """Return a :class:`Stepper`, built once for each set of arguments.
+    """Return a :class:`Stepper`, built once for each set of arguments; they are its own.
 
     Args:
         n_out: number of equally spaced outputs in a step, or the outputs as fractions of it.
-        Others as for :class:`Stepper`.
     """
     if isinstance(n_out, np.ndarray):
         grid = n_out

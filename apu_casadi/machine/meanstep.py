@@ -54,6 +54,7 @@ DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
 SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
 END_TOL = 1e-5  # nominal units: doubt about the state at the end, whose error is much smaller
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
+_PHASE = ("_a", "_b", "_c")
 _PHASES = 5  # rotor angles that tell the harmonics 0, 1, 2 apart
 
 
@@ -143,26 +144,29 @@ def _shifted(weights: Any, term: Term, highest: int) -> list[Any]:
 
 
 def _harmonics(
-    ss: GeneratorModel,
-    at_sample: tuple[Any, Any, Any],
-    quad: Sequence[str],
-    weights: Any,
-    share: Any,
-) -> Any:
-    """What each mean of ``quad`` gets from one sample (x, u, theta); shape (means,)."""
+    ss: GeneratorModel, at_sample: tuple[Any, Any, Any], quad: Sequence[str], share: Any
+) -> tuple[Any, Any]:
+    """What each mean of ``quad`` gets from one sample (x, u, theta), and the weights for it.
+
+    Returns:
+        The means, shape (means,), and symbols of the weights of c0, c1, s1, ..., of as many as are
+        needed.
+    """
     x, u, th = at_sample
     asked = [Term.of(q) for q in quad]
     own = list(dict.fromkeys((q.base, q.power) for q in asked))
     y = ss.g(x, u, th)
     values = ca.vertcat(*(Term(b, n, "", 0, False).value(ss, x, y) for b, n in own))
     parts = _parts(ss, x, u, th, ca.Function("terms", [x, u, th], [values]))
+    parts_of = [parts[own.index((q.base, q.power))] for q in asked]
+    highest = max(q.k + len(p) // 2 for q, p in zip(asked, parts_of, strict=True))
+    weights = ca.SX.sym("W", 2 * highest + 1)
     light = weights * window(share)
     total = []
-    for q in asked:
-        own_parts = parts[own.index((q.base, q.power))]
+    for q, own_parts in zip(asked, parts_of, strict=True):
         factors = _shifted(light if q.weighted else weights, q, len(own_parts) // 2)
         total.append(sum(f * p for f, p in zip(factors, own_parts, strict=True)))
-    return ca.vertcat(*total)
+    return ca.vertcat(*total), weights
 
 
 def _parts(ss: GeneratorModel, x: Any, u: Any, th: Any, terms: ca.Function) -> list[list[Any]]:
@@ -174,9 +178,13 @@ def _parts(ss: GeneratorModel, x: Any, u: Any, th: Any, terms: ca.Function) -> l
         x_phi = ca.SX(x)
         x_phi[at] = float(angle)
         values.append(ca.vertsplit(terms(x_phi, u, th)))
-    # what does not depend on the angle needs no more than its first value
+    # what does not depend on the angle needs no more than its first value; the coefficients are
+    # constant where the load is balanced
     draws = np.random.default_rng(0)
-    xd, ud = ss.x.nominals * draws.normal(size=len(ss.x)), np.abs(draws.normal(size=len(ss.u)))
+    xd = ss.x.nominals * draws.normal(size=len(ss.x))
+    of_phase = {n: n[:-2] if n[-2:] in _PHASE else n for n in ss.u.names}
+    value = {n: abs(draws.normal()) for n in dict.fromkeys(of_phase.values())}
+    ud = np.array([value[n] for n in of_phase.values()])
     seen = []
     for angle in phi:
         xd[at] = angle
@@ -227,11 +235,10 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
             samples.append(four)
     X = ca.horzcat(*samples)
     w_, d_, t_ = ca.SX.sym("w"), ca.SX.sym("dt"), ca.SX.sym("theta0")
-    highest = 2 + max((Term.of(q).k for q in quad), default=0)  # a square has two
-    rows = _constant_weights(d_, w_, t_, highest)
+    share = ca.SX.sym("share")
+    terms, W = _harmonics(ss, (x, u, th), quad, share)
+    rows = _constant_weights(d_, w_, t_, W.numel() // 2)
     weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
-    W, share = ca.SX.sym("W", 2 * highest + 1), ca.SX.sym("share")
-    terms = _harmonics(ss, (x, u, th), quad, W, share)
     means, before = hoisted("harmonics", [x, W, share], ca.vertcat(u, th), [terms])
     shares = ranges[2] + ranges[3] * ca.DM(_shares()).T
     each = means.map("each", "serial", X.shape[1], [3], [])
@@ -355,22 +362,79 @@ def _half_turn(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
     """Half a turn, after which the phases are reversed instead of the angle going on.
 
     First: (x, V, even and odd entries, d) -> (x, V, x at the strides).  Second: (u, theta, length
-    of a stride) -> d.
+    of a stride, angle at the start) -> d, the same for every half turn.
     """
     nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
     step, _ = leap(ss, PACE, False, chained=True)
     x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
     P = [ca.SX.sym("P", part.size, STRIDES // 2) for part in (kinds.even, kinds.odd)]
-    h, at = ca.SX.sym("h"), ss.x.index("theta_e")
-    xk, Vk, states = x, V, []
+    h, theta0, at = ca.SX.sym("h"), ca.SX.sym("theta0"), ss.x.index("theta_e")
+    xk, Vk, states = ca.SX(x), V, []
+    xk[at] = theta0
     for k in range(0, STRIDES // 2, PACE):
         these = [ca.vec(p[:, k : k + PACE]) for p in P]
         X, Vk = step(xk, Vk, ca.vertcat(*these), u, th, h)
         xk = X[:, -1]
         states.append(X)
     xk = xk * _signs(ss)
-    xk[at] = x[at]
-    return hoisted("half", [x, V, *P], ca.vertcat(u, th, h), [xk, Vk, ca.horzcat(*states)])
+    xk[at] = theta0
+    outputs = [xk, Vk, ca.horzcat(*states)]
+    return hoisted("half", [x, V, *P], ca.vertcat(u, th, h, theta0), outputs)
+
+
+class _Sampled:
+    """What is averaged, at the samples of a step, and their means.
+
+    The angles of the samples are the same in every half turn: what follows from them is computed
+    once for each, and harmonics are taken out of the sums over the half turns.
+    """
+
+    def __init__(self, ss: GeneratorModel, quad: Sequence[str]) -> None:
+        nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
+        x, u, th = (ca.SX.sym(k, n) for k, n in zip("xut", (nx, nu, nt), strict=True))
+        angle, weight = ca.SX.sym("angle"), ca.SX.sym("weight", 2)
+        x_now = ca.SX(x)
+        x_now[ss.x.index("theta_e")] = angle
+        y = ss.g(x_now, u, th)
+        self._asked = [Term.of(q) for q in quad]
+        #: values and whether they are weighted; harmonics apart
+        self._own = list(dict.fromkeys((q.base, q.power, q.weighted) for q in self._asked))
+        terms = [Term(b, n, "", 0, w).value(ss, x_now, y) * weight[int(w)] for b, n, w in self._own]
+        outputs = [ca.vertcat(*terms), y[ss.y.index("V_t")]]
+        fixed = ca.vertcat(u, th, angle)
+        self._values, self._fixed = hoisted("y", [x, weight], fixed, outputs)
+
+    def __call__(self, X: Sequence[Any], weights: Any, fixed: Any, angles: Any) -> tuple[Any, Any]:
+        """Return the means and the terminal voltages of all samples.
+
+        Args:
+            X: states at the start, and at the samples of each half turn.
+            weights: plain ones and those of weighted means, shape (2, samples).
+            fixed: inputs and theta.
+            angles: at the start, and at the samples of a half turn.
+        """
+        n, values = angles.numel(), self._values
+        d = self._fixed.map(n)(ca.vertcat(ca.repmat(fixed, 1, n), angles))
+        first, V = values(X[0], weights[:, 0], d[:, 0])
+        half, total, Vs = values.map(n - 1), ca.MX(0), [V]
+        for k, states in enumerate(X[1:]):
+            at = 1 + k * (n - 1)
+            of_half, V = half(states, weights[:, at : at + n - 1], d[:, 1:])
+            total = total + of_half
+            Vs.append(V)
+        sums = ca.horzcat(first, total)
+        return self._means(n)(sums, angles), ca.horzcat(*Vs)
+
+    def _means(self, n: int) -> ca.Function:
+        """Function (sums over the half turns, angles) -> the means asked for."""
+        sums, angles = ca.SX.sym("sums", len(self._own), n), ca.SX.sym("angles", 1, n)
+        found = []
+        for q in self._asked:
+            row = sums[self._own.index((q.base, q.power, q.weighted)), :]
+            if q.trig:
+                row = row * (ca.cos if q.trig == "cos" else ca.sin)(q.k * angles)
+            found.append(ca.sum2(row))
+        return ca.Function("means", [sums, angles], [ca.vertcat(*found)], {"cse": True})
 
 
 def _periodic_step(
@@ -397,32 +461,28 @@ def _periodic_step(
     _, V_of = leap(ss, PACE, False, chained=True)
     h_now = stride / w
     x_k, V_k, samples = X0, ca.vertcat(V_of(X0, U, TH)[0], 0, 0), [X0]
-    d = before(ca.vertcat(U, TH, h_now))
+    d = before(ca.vertcat(U, TH, h_now, theta0))
     for _ in range(turn.halves):
         x_k, V_k, X = half(x_k, V_k, *P, d)
         samples.append(X)
-    X = ca.horzcat(*samples)
     length = DT / h_now
     weights = _end_weights(turn)(length)
-    x, u, th = (ca.SX.sym(k, n) for k, n in zip("xut", (nx, nu, nt), strict=True))
-    outputs, share = ss.g(x, u, th), ca.SX.sym("share")
-    terms = [Term.of(q).expression(ss, x, outputs, share) for q in quad]
-    terms.append(outputs[ss.y.index("V_t")])
-    y, before = hoisted("y", [x, share], ca.vertcat(u, th), [ca.vertcat(*terms)])
     # beyond the end of the step the weight goes on as the polynomial that it is
     shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
-    Y = y.map("ys", "serial", turn.samples, [2], [])(X, shares, before(ca.vertcat(U, TH)))
-    mean = ca.mtimes(Y[:-1, :], weights[0, :].T) / length
+    plain = weights[0, :] / length
+    angles = theta0 + stride * ca.DM(np.arange(half_turn + 1)).T
+    both = ca.vertcat(plain, plain * window(shares))
+    mean, V_all = _Sampled(ss, quad)(samples, both, ca.vertcat(U, TH), angles)
     # the end of the step, with the phases as they are after so many half turns
     tail = np.arange(turn.first, turn.samples)
     turned = np.maximum(0, (tail - 1) // (STRIDES // 2)) % 2 == 1
     reversed_ = np.where(turned, _signs(ss), 1.0)
-    X_tail = X[:, turn.first :] * reversed_
+    X_tail = ca.horzcat(*samples)[:, turn.first :] * reversed_
     ends = ca.mtimes(X_tail, weights[1:, turn.first :].T)
     linear = np.zeros((nx, 1))
     linear[ss.x.indices(ss.linear), 0] = 1
     # the exciter's last step is as long as it must be
-    V_tail = Y[-1, turn.first :]
+    V_tail = V_all[turn.first :]
     V_end, V_middle, V_start = (ca.mtimes(V_tail, weights[k, turn.first :].T) for k in (1, 3, 4))
     rest = DT - h_now * PACE * ca.floor(length / PACE)
     _, exciter = exciter_step(ss)

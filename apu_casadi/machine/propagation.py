@@ -247,11 +247,50 @@ def hoisted(
     """Take out of a loop what follows from its fixed inputs alone.
 
     Returns:
-        Function (*varying, d) -> outputs, and Function fixed -> d.
+        ``Function(*varying, d)`` -> outputs, and Function fixed -> d.
     """
-    new, d, by = ca.extract_parametric(ca.cse(list(outputs)), fixed, {"extract_trivial": True})
+    outputs, factors, divisors = _multiplied(varying, fixed, outputs)
+    given = ca.vertcat(fixed, *factors)
+    new, d, by = ca.extract_parametric(ca.cse(outputs), given, {"extract_trivial": True})
     inner = ca.Function(name, [*varying, ca.vertcat(*d)], new, {"cse": True})
-    return inner, ca.Function(f"{name}_fixed", [fixed], [ca.vertcat(*by)], {"cse": True})
+    made = ca.vertcat(*by)
+    if factors:
+        made = ca.substitute(made, ca.vertcat(*factors), 1.0 / ca.vertcat(*divisors))
+    return inner, ca.Function(f"{name}_fixed", [fixed], [made], {"cse": True})
+
+
+def _multiplied(
+    varying: Sequence[Any], fixed: Any, outputs: Sequence[Any]
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Write divisions by what is fixed as products: a chain of steps waits for each of them.
+
+    Returns:
+        Outputs with new symbols for the factors, these symbols, and what they are reciprocals of.
+    """
+    f = ca.Function("f", [fixed, *varying], list(outputs), {"cse": True})
+    inputs = [ca.vertsplit(ca.vec(a)) for a in (fixed, *varying)]
+    results = [ca.SX(f.sparsity_out(i)) for i in range(f.n_out())]
+    values: list[Any] = [None] * f.sz_w()
+    constant = [True] * f.sz_w()  # follows from what is fixed
+    factors = dict[int, tuple[Any, Any]]()
+    for k in range(f.n_instructions()):
+        op, at, to = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if op == ca.OP_OUTPUT:
+            results[to[0]].nz[to[1]] = values[at[0]]
+            continue
+        if op == ca.OP_INPUT:
+            made, known = inputs[at[0]][at[1]], at[0] == 0
+        elif op == ca.OP_CONST:
+            made, known = ca.SX(f.instruction_constant(k)), True
+        else:
+            parts, known = [values[i] for i in at], all(constant[i] for i in at)
+            if op == ca.OP_DIV and constant[at[1]] and not constant[at[0]]:
+                # a product with 1/b itself would be written as a division again
+                key = parts[1].element_hash()
+                op, parts[1] = ca.OP_MUL, factors.setdefault(key, (ca.SX.sym("r"), parts[1]))[0]
+            made = (ca.SX.unary if len(at) == 1 else ca.SX.binary)(op, *parts)
+        values[to[0]], constant[to[0]] = made, known
+    return results, [r for r, _ in factors.values()], [b for _, b in factors.values()]
 
 
 @kept

@@ -25,6 +25,7 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from estimators.apu.gaspathmodel import DT
 from estimators.apu.sensors import GAS_PATH, SensorSet
 from estimators.filters.belief import Belief
 from estimators.information.identifiability import Identifiability, identify
@@ -169,7 +170,7 @@ def gas_path(
     if len(parts) == 1:
         return parts[names[0]]
     first = parts[names[0]]
-    constant = [n for n in first.theta.names if n.startswith("gain_")]
+    constant = [n for n in first.theta.names if n.startswith(("gain_", "bias_"))]
     return together(parts, shared=constant)
 
 
@@ -200,7 +201,9 @@ def _gas_path(
     at, H, _ = _derivatives(point, gg)
     y, along = _readings(gg, sensors, at)
     sigma = np.array([sensors.sigma(n, v) for n, v in zip(sensors.names, y, strict=True)])
-    sigma /= math.sqrt(samples)
+    # of a slower sensor fewer are averaged
+    share = [min(1.0, s.rate * DT) if s.rate else 1.0 for s in sensors.sensors]
+    sigma /= np.sqrt(samples * np.array(share))
     if "PW" in sensors.names:
         i = sensors.names.index("PW")
         sigma[i] = sensors.sigma("PW", y[i]) if power_noise is None else power_noise * abs(y[i])
@@ -212,7 +215,7 @@ def _gas_path(
     priors = dict.fromkeys(gg.THETA.names, prior)
     columns = [along @ H]
     gains = {
-        s.name: (eta_bias if s.name == "PW" else s.gain if gain_errors else 0.0)
+        s.name: (eta_bias if s.name == "PW" else s.unsure("gain") if gain_errors else 0.0)
         for s in sensors.sensors
     }
     for i, (name, gain) in enumerate(gains.items()):
@@ -221,6 +224,11 @@ def _gas_path(
             signals.append(Signal(f"gain_{name}", "1", what))
             priors[f"gain_{name}"] = gain
             columns.append(np.eye(len(y))[:, [i]] * y[i])
+    for i, s in enumerate(sensors.sensors):
+        if gain_errors and s.unsure("bias") > 0:
+            signals.append(Signal(f"bias_{s.name}", s.unit, f"offset of {s.name}"))
+            priors[f"bias_{s.name}"] = s.bias
+            columns.append(np.eye(len(y))[:, [i]])
     return Sensitivities.of(
         Signals(signals),
         sensors.names,

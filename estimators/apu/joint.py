@@ -54,6 +54,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, spliced, track_jumps
+from estimators.apu.priorfile import Prior
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from estimators.apu.unknowns import Knowledge, of_parameter, usual
 from estimators.filters.ekf import ekf_step
@@ -69,6 +70,7 @@ __all__ = [
     "ElectricalSide",
     "JointCase",
     "View",
+    "beside_truth",
     "better_speed",
     "cross_talk",
     "electrical_samples",
@@ -266,14 +268,14 @@ def estimate_joint(
     """
     apu = Apu() if apu is None else apu
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
-    t, rows = samples(ds)
+    t, _ = samples(ds)
     how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend, "unknowns": unknowns}
     also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
-    machines, sides, pickups = machines_of(ds, apu), {}, []
-    for ending, one, view in machines:
+    sides, pickups = {}, []
+    for number, (ending, one, view) in enumerate(machines_of(ds, apu), 1):
         own = own_gains(electrical_gains, ending)
         measured = electrical_samples(view, one, rng, sensors=electrical_sensors, gains=own)
-        sides[ending] = electrical_side(one, electrical_sensors, measured, t, **also, **how)
+        sides[number] = electrical_side(one, electrical_sensors, measured, t, **also, **how)
         pickups.append((measured["t"], measured["w_r"]))
     for n in gas_gains or {}:
         gas_sensors[n]
@@ -290,7 +292,7 @@ def estimate_joint(
         efficiency_error=(gas_gains or {}).get("PW", 0.0),
         **how,
     )
-    return _as_dataset(ds, apu, t, rows, sides, gas, tracked)
+    return beside_truth(ds, sides, gas, tracked)
 
 
 def fused(
@@ -304,11 +306,13 @@ def fused(
     power: bool = True,
     efficiency_error: float = 0.0,
     prior: Mapping[str, float] | None = None,
+    spread: Prior | None = None,
     inputs: Mapping[str, Any] | None = None,
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
     unknowns: Mapping[str, Knowledge] | None = None,
     step: StepMaker | None = None,
+    test: JumpTest = TEST,
     backend: str | None = None,
     max_dt: float = math.inf,
 ) -> tuple[GasPathFilter, Tracked]:
@@ -324,7 +328,9 @@ def fused(
         power: whether the filter gets the shaft power.
         efficiency_error: actual relative error of the generators' efficiency.
         prior: means of the start by state.
+        spread: of which the standard deviations are taken.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
+        test: of jumps of the health.
         eta, gain_errors, unknowns, step, backend: as for :func:`estimate_joint`.
     """
     J = of_parameter(usual(unknowns, gain_errors), "J")
@@ -333,11 +339,15 @@ def fused(
     courses = _courses(apu, sides)
     streams: dict[str, Any] = {"readings": readings, "max_dt": max_dt}
     tracked: Tracked | None = None
-    start = gas.prior(**(prior or {}))
+    if spread is not None:
+        spread.check(gas.model.x)
+    start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
     for first, mean, white, loss in courses:
         given = dict(inputs or {})
         if "jump_loss" in gas.model.u.names:
             given["jump_loss"] = (t, _opening(loss))
+        else:
+            white = np.hypot(white, loss)
         told = mean * (1 + efficiency_error)
         known = t, np.append(told, told[-1]), np.append(white, white[-1])
         data = gas.of_readings(**streams, power=known, inputs=given)
@@ -345,7 +355,7 @@ def fused(
             data = _with_speed(gas, data, speed, speed_sigma, apu)
         # from the window on in which more is known
         k = int(np.searchsorted(data.t, t[first] - 1e-9)) + 1 if first else 0
-        now = track_jumps(gas, data, test=TEST, prior=start, step=step, backend=backend)
+        now = track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
         tracked = now if tracked is None else spliced(tracked, now, k)
     assert tracked is not None
     return gas, tracked
@@ -405,22 +415,25 @@ def _gas_filter(
         consider_inertia=J.how == "considered",
         eta=common if power and common else None,
         consider_eta=False,
-        loss=power,
+        loss=bool(power and common),
     )
 
 
-def _as_dataset(
-    ds: xr.Dataset,
-    apu: Apu,
-    t: np.ndarray,
-    rows: np.ndarray,
-    sides: Mapping[str, ElectricalSide],
-    gas: GasPathFilter,
-    tracked: Tracked,
+def beside_truth(
+    ds: xr.Dataset, sides: Mapping[int, ElectricalSide], gas: GasPathFilter, tracked: Tracked
 ) -> xr.Dataset:
-    """Put estimates beside the truth."""
-    r = tracked.result
-    values: dict[str, Any] = {"nis": r.nis}
+    """Put estimates beside the truth of a run, as :func:`estimate_joint` returns them.
+
+    Args:
+        ds: the run.
+        sides: of its machines by number; where the run has one for all, the first stands for them.
+        gas, tracked: filter and result of the gas path.
+    """
+    differ = GENERATOR in ds.dims
+    known = sides if differ else {1: sides[min(sides)]}
+    r, t = tracked.result, known[min(known)].t
+    rows, at = (np.searchsorted(v, t + 1e-7) - 1 for v in (ds["time"].values, r.t))
+    values: dict[str, Any] = {"nis": r.nis[at]}
     signals = [Signal("nis", "1", "normalised innovation squared of the gas-path filter")]
 
     def put(n: str, unit: str, doc: str, estimate: Any, s: Any, true: Any) -> None:
@@ -430,11 +443,13 @@ def _as_dataset(
 
     for name in ("N", *HEALTH):
         x = gas.model.x[name]
-        put(name, x.unit, x.doc, *r[name], ds[name].values[rows])
-    for (end, side), (_, _, view) in zip(sides.items(), machines_of(ds, apu), strict=True):
+        mean, sigma = r[name]
+        put(name, x.unit, x.doc, mean[at], sigma[at], ds[name].values[rows])
+    for number, side in known.items():
+        end, view = (f"_{number}" if differ else ""), of_generator(ds, number)
         m, k_rf = view["mu"].values[rows], view["k_rf"].values[rows]
         h_true = np.where(m > 0, m / (np.nan_to_num(k_rf) + 1 - m), 0.0)
-        true_phase, of = _true_phases(ds, end, t), f" of generator {end[1:]}" if end else ""
+        true_phase, of = _true_phases(ds, end, t), f" of generator {number}" if differ else ""
         for i, phase in enumerate(PHASES):
             doc = f"severity mu/(k_rf + 1 - mu) of a short circuit in phase {phase}{of}"
             true = h_true * (true_phase == i + 1)
@@ -447,18 +462,18 @@ def _as_dataset(
         ]
         values |= {f"faulty_phase{end}": side.phase, f"ttsc_probability{end}": side.probability}
     P_true = window_means(ds["time"].values, ds["P_total"].values, t)[:-1]
-    n, of_two = len(sides), len(apu.machines) / 2
-    P = of_two / n * np.sum([s.P for s in sides.values()], axis=0)
-    sigma = of_two / n * np.sqrt(np.sum([s.variance for s in sides.values()], axis=0))
+    share = int(ds.attrs.get("generators", 2)) / 2 / len(known)
+    P = share * np.sum([s.P for s in known.values()], axis=0)
+    sigma = share * np.sqrt(np.sum([s.variance for s in known.values()], axis=0))
     doc = "mean mechanical power of both generators over the window before"
     P, sigma, P_true = (np.append(np.nan, v) for v in (P, sigma, P_true))
     put("P_total", "W", doc, P, sigma, P_true)
-    at = {
-        "resets": sorted({v for s in sides.values() for v in s.resets}),
-        "alarms": [float(t[i]) for i in tracked.alarms],
-        "onsets": [float(t[i]) for i in tracked.onsets],
+    found = {
+        "resets": sorted({v for s in known.values() for v in s.resets}),
+        "alarms": [float(r.t[i]) for i in tracked.alarms],
+        "onsets": [float(r.t[i]) for i in tracked.onsets],
     }
-    attrs = {n: json.dumps(v) for n, v in at.items()}
+    attrs = {n: json.dumps(v) for n, v in found.items()}
     return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)
 
 

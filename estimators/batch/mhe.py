@@ -71,7 +71,7 @@ def _along(model: FilterModel) -> ca.Function:
     point, mean = ca.vertcat(at, w), ca.vertcat(m, kind.zeros(nw))
     outputs, forecast = linearisation(model, kind, u, p, dt)
     (h0, H, _), (f0, F, _) = outputs(point, u, p), forecast(point, u, p, dt)
-    nu = y - h0 + H @ (point - mean)
+    nu = model.innovation(y, h0) + H @ (point - mean)
     d, La, S, nis, loglik, measured = update(ca.tril(L), H, nu, R)
     m1 = f0 + F @ (mean + d - point)
     L1, C, _, _ = predict(La, F, dt)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BLOCK",
+    "CHAIN",
     "STEP_IN",
     "STEP_OUT",
     "FilterResult",
@@ -267,7 +268,7 @@ def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.F
     return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
 
 
-def block_of(one: ca.Function, name: str, carried: int) -> ca.Function:
+def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) -> ca.Function:
     """Return ``BLOCK`` calls of a step as one function.
 
     Args:
@@ -275,10 +276,11 @@ def block_of(one: ca.Function, name: str, carried: int) -> ca.Function:
             is the same in all calls.
         name: of the result, which takes the other inputs and gives the other outputs side by side.
         carried: number of inputs that are handed on; of these outputs the last is returned.
+        short: ``CHAIN`` calls only, for steps that take long.
     """
     kept = one.n_out() - carried
     chain = _chained(one, CHAIN, f"{name}_chain", carried, kept)
-    return _chained(chain, CHAIN, f"{name}_block", carried, kept)
+    return chain if short else _chained(chain, CHAIN, f"{name}_block", carried, kept)
 
 
 @kept

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.machine.generator import Generator
+    from estimators.apu.sensors import SensorSet
     from estimators.apu.severity import Severity
     from estimators.apu.trials import Trials
     from estimators.information.identifiability import Identifiability, SensorComparison
@@ -40,7 +41,7 @@ HELP = "tell what can be known of the faults from given sensors"
 OPTIONS = f"""
 --point A,B =design  | design, offdesign, partload, idle; several: read at each (default
                      | %(default)s)
---sensors A,B        | that are there (default N,P3,T3,T5,Wf)
+--sensors A,B        | that are there (default N,P3,T3,T5,Wf); or a file of sensors, .toml
 {given.UNIT}
 --prior float PCT =2.0 | 1 sigma of each health factor before, %% (default 2)
 --samples int N =50  | samples of 20 ms that are averaged (default 50)
@@ -67,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
             f"{args.prior:g}, {args.eta_bias:g}, {args.samples:g}, {args.trials:g}"
         )
     given.parts(args)
-    sensors = study.BASE if args.sensors is None else given.names(args.sensors)
-    sets, added = _sets(args, sensors)
+    table, sensors = _named(args, study.BASE)
+    sets, added = _sets(args, table, sensors)
     f = _found(args)
     if args.figure is not None:
         figure = _figure(f.point, args.samples, _engine(args), given.program(args))
@@ -86,15 +87,31 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _named(args: argparse.Namespace, base: Sequence[str]) -> tuple[SensorSet, Sequence[str]]:
+    """Return all sensors in question, and the names of those that are there."""
+    from estimators.apu.identify import CANDIDATES
+    from estimators.apu.sensorfile import read_sensors
+    from estimators.apu.sensors import SensorSet
+
+    if args.sensors is None or not args.sensors.endswith(".toml"):
+        names = base if args.sensors is None else given.names(args.sensors)
+        return CANDIDATES.including(*names), names
+    found = read_sensors(args.sensors)
+    own, power = found.gas_path, ("PW",) if not found.complete else ()
+    more = [s for s in CANDIDATES.sensors if s.name not in own]
+    # shaft power is a question of its own unless the file is about all that there is
+    return SensorSet((*own.sensors, *more)), [n for n in own.names if n not in power]
+
+
 def _sets(
-    args: argparse.Namespace, sensors: Sequence[str]
+    args: argparse.Namespace, table: SensorSet, sensors: Sequence[str]
 ) -> tuple[SensorComparison, list[dict[str, Any]]]:
     """Compare the sensors with sets that have one more, and rank what to add."""
     from estimators.apu import identify as study
     from estimators.information.identifiability import compare_sensors, which_to_add
 
     how: dict[str, Any] = {"prior": args.prior / 100, "samples": args.samples}
-    how["sensors"] = study.CANDIDATES.including(*sensors)
+    how["sensors"] = table
     how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors, **_engine(args)}
     g = study.gas_path(args.point, **how)
     more = [s for s in g.sensors if s not in sensors]

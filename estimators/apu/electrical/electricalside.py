@@ -120,7 +120,8 @@ def loosened(sensors: SensorSet) -> SensorSet:
     noise = {}
     for s in sensors.sensors:
         size = rated.get(s.name, rated.get(s.name[0])) if s.name != "w_r" else 0.0
-        noise[s.name] = math.hypot(s.noise, s.gain * float(size or 0.0) / math.sqrt(2))
+        gain = s.unsure("gain") * float(size or 0.0) / math.sqrt(2)
+        noise[s.name] = math.hypot(s.noise, gain, s.unsure("bias"))
     return sensors.change(**noise)
 
 
@@ -269,7 +270,7 @@ def electrical_side(
     for k in [k for k in range(1, K) if phase[k] and phase[k] != phase[k - 1]]:
         begin = max([v for v in w.resets if v <= t[k] + 1e-9] + [float(t[0])])
         # whole windows: from the beginning of the one in which the machine changed
-        first = int(np.floor((begin - t[0]) / DT + 1e-6))
+        first = min(int(np.floor((begin - t[0]) / DT + 1e-6)), k - 1)
         i = phase[k] - 1
         one = filters.windows((PHASES[i],), base, float(t[first]))
         last = k

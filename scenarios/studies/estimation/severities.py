@@ -188,10 +188,8 @@ def estimated(cell: Cell, seed: int, **options: Any) -> dict[str, Any]:
     false += int(((said[own] > 0) & ((said[own] != right) | (t <= onset))).any())
     alarms = [a for a in json.loads(e.attrs["alarms"]) if not (cell.gas and a > GAS_FAULT)]
     health = {n: score(n) for n in HEALTH}
-    healthy = {
-        n: abs(float(e[n].values[-1]) - 1) / float(e[f"{n}_sigma"].values[-1]) for n in HEALTH
-    }
-    wrong = bool(alarms) or (not cell.gas and max(healthy.values()) > SURE)
+    # of an engine that is healthy the estimate of a factor is its error
+    off = not cell.gas and max(map(abs, health.values())) > SURE
     power = e["P_total"].values[-1] - e["P_total_true"].values[-1]
     return {
         "health": list(health.values()),
