@@ -71,7 +71,7 @@ MARGIN = (
     1.1  # on the variance of the gas path's innovations, for maps and gas data of another engine
 )
 STEEP = 0.1  # change of a factor beyond which no filter was tried
-SEVERAL = 50.0  # chi-squared of two degrees of freedom that one faulty phase may leave
+SEVERAL = 25.0  # chi-squared of two degrees of freedom that one faulty phase may leave
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
@@ -204,7 +204,8 @@ def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
         yield Doubt(
             "machine",
             f"the severities are {math.sqrt(side.misfit[-1]):.0f} sigmas from what one faulty "
-            "phase explains: no short circuit of one phase; another machine, or sensors that err alike",
+            "phase explains: no short circuit of one phase; another machine, or like errors of "
+            "several sensors",
         )
     if h[best, -1] > STEEP_H:
         yield Doubt(

@@ -79,7 +79,7 @@ class ElectricalSide:
             :class:`.hypotheses.Hypotheses`.
         resets: instants, s, at which the machine changed.
         result: of the filter with the three h, at every sample; without them, of the healthy
-            machine's.
+            machine's; see ``judged`` of :func:`electrical_side`.
     """
 
     t: np.ndarray
@@ -152,14 +152,17 @@ class _Filters:
     step: StepMaker
     backend: str | None
 
-    def of(self, phases: tuple[str, ...]) -> ElectricalFilter:
-        """The filter with the severities of some phases; the healthy machine's without."""
-        healthy = self.gain_errors and not phases
+    def of(self, phases: tuple[str, ...], *, plain: bool = False) -> ElectricalFilter:
+        """The filter with the severities of some phases; the healthy machine's without.
+
+        A ``plain`` one takes gain errors for noise, as the healthy machine's does.
+        """
+        healthy = self.gain_errors and (plain or not phases)
         free = {n: how for n, (how, _) in filter_unknowns(self.unknowns).items()}
         return electrical_filter(
             self.machine,
             sensors=loosened(self.sensors) if healthy else self.sensors,
-            gains="consider" if self.gain_errors and phases else "none",
+            gains="consider" if self.gain_errors and not healthy else "none",
             power=True,
             phases=phases,
             free=free if phases else None,
@@ -178,13 +181,24 @@ class _Filters:
                 f"{t.size - 1} windows of shaft power expected, the waveforms give {ends.size}"
             )
 
-    def healthy(self, base: Recording, names: tuple[str, ...]) -> tuple[FilterResult, Any, Any]:
-        """Power of a healthy machine and its variance, from a recording with inputs ``names``."""
-        of = self.of(())
+    def recording(self, of: ElectricalFilter, base: Recording) -> Recording:
+        """The recording of a filter that takes gain errors for noise, from that of the others."""
+        names = self.of(PHASES).model.u.names
         rows = [names.index(n) for n in of.model.u.names]
         variance = np.array([[of.sensors.sigma(n, 0.0) ** 2] for n in of.model.y.names])
         spread = np.broadcast_to(variance, base.y.shape)
-        data = Recording(base.t, base.u[rows], base.y, spread, of.model.p.pack({}))
+        return Recording(base.t, base.u[rows], base.y, spread, of.model.p.pack({}))
+
+    def plain(self, base: Recording) -> FilterResult:
+        """Innovations of the three severities' filter that takes gain errors for noise."""
+        of = self.of(PHASES, plain=True)
+        data, prior = self.recording(of, base), of.prior(self.measured, sigma=self.spread())
+        return track(of, prior, data, step=self.step, backend=self.backend, own_level=True)[0]
+
+    def healthy(self, base: Recording) -> tuple[FilterResult, Any, Any]:
+        """Power of a healthy machine, and its variance."""
+        of = self.of(())
+        data = self.recording(of, base)
         r = run(self.step(of.model), of.prior(self.measured), data, backend=self.backend)
         ends, P, var = window_power(of, r, data)
         self.checked(ends, float(self.t[0]))
@@ -227,6 +241,7 @@ def electrical_side(
     ttsc: bool = True,
     gain_errors: bool = True,
     unknowns: Mapping[str, Knowledge] | None = None,
+    judged: bool = False,
     step: StepMaker = ekf_step,
     backend: str | None = None,
 ) -> ElectricalSide:
@@ -239,6 +254,8 @@ def electrical_side(
         t: ends of the windows of the mean power, among the instants of the samples.
         unknowns: parameters that are estimated or considered, by name, see
             :mod:`estimators.apu.unknowns`.
+        judged: whether the innovations are to be judged: ``result`` is then that of a filter with
+            the three h which takes gain errors for noise, and so leaves their offsets alone.
         ttsc, gain_errors, step, backend: as for :func:`estimators.apu.joint.estimate_joint`.
 
     Raises:
@@ -251,7 +268,7 @@ def electrical_side(
     three, begin, K = filters.of(PHASES), float(t[0]), t.size
     # the inputs are the same for all: made once
     base = three.recording(measured, window=DT, start=begin)
-    healthy, P, noise = filters.healthy(base, three.model.u.names)
+    healthy, P, noise = filters.healthy(base)
     share = GAIN_SHARE if gain_errors else 0.0
     if not ttsc:
         views = (View(0, P, noise, np.zeros_like(P)),)
@@ -290,7 +307,8 @@ def electrical_side(
     )
     # severities far from zero are not linear by a share of a few per cent
     misfit = np.append(0.0, may.misfit / (1 + 1e-3 * may.statistic.max(0)))
-    told = severities, probability, phase, misfit, tuple(w.resets), w.result
+    result = filters.plain(base) if judged and gain_errors else w.result
+    told = severities, probability, phase, misfit, tuple(w.resets), result
     return ElectricalSide(t, tuple(courses), share, *told)
 
 
