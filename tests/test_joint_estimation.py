@@ -149,7 +149,7 @@ def test_cases_of_a_seed_are_reproducible():
     assert set(a.gas_gains) == {"P3", "T3", "T5", "Wf", "PW"}
 
 
-@pytest.mark.ci
+@pytest.mark.long
 def test_a_hot_field_is_no_short_circuit():
     """The field's resistance is 20 % more than the filters know, 50 K."""
     hot = APU.change({"machine.r_fd": 1.2 * APU.generator.machine.r_fd})
@@ -168,7 +168,7 @@ def test_a_hot_field_is_no_short_circuit():
     assert blind.misfit[-1] > 25 or blind.resets
 
 
-@pytest.mark.ci
+@pytest.mark.long
 def test_which_machine_is_found():
     """A short circuit in phase b of the second; each has gain errors of its own."""
     ds = simulate_joint(
