@@ -32,8 +32,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core import interrupts
+from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
-from apu_casadi.core.profiles.profile import Varying
+from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.version import installed
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, registry
@@ -65,12 +66,16 @@ HEALTH_RANGES: Mapping[str, tuple[float, float]] = {
 }
 MU_RANGE, K_RF_RANGE = (0.01, 0.10), (10.0, 200.0)
 SHIFT = 1.0  # s; a fault begins up to this much before or after its time in the base scenario
+H_FIRST = 1e-5  # severity from which a short circuit grows
+GROWTH = (0.2, 0.9)  # time over which a fault grows, of what is left of the run
 
 
 # ------------------------------------------------------------------------------ what to run
 
 
-def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> list[Scenario]:
+def random_faults(
+    n: int, seed: int = 0, *, base: str | Scenario = "joint", growing: float = 0.0
+) -> list[Scenario]:
     """Draw ``n`` scenarios with random health factors, stator faults, and fault times.
 
     Run i depends on the seed and i alone, so a longer campaign begins with the same runs.  Health
@@ -81,11 +86,16 @@ def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> l
         n: number of runs.
         seed: of the random numbers; each run's own seed, for its noise, follows from it.
         base: scenario with a phase that changes health and one with a fault; these two are changed.
+        growing: share of the faults that grow into what is drawn, health factors along ramps from
+            one, a short circuit exponentially from the severity ``H_FIRST``, each over ``GROWTH``
+            of the time that is left; the others are steps.  What is drawn is the same.
 
     Raises:
-        ScenarioError: ``base`` has no such phases, or ``n`` or ``seed`` is negative.
+        ScenarioError: ``base`` has no such phases, ``n`` or ``seed`` is negative, or ``growing``
+            does not lie in [0, 1].
     """
     s = registry.get(base) if isinstance(base, str) else base
+    growing = bounded(growing, "growing", lo=0.0, hi=1.0)
     if n < 1 or seed < 0:
         raise ScenarioError(f"a campaign needs n >= 1 runs and a seed >= 0, got {n} and {seed}")
     sick = next((i for i, p in enumerate(s.phases) if isinstance(p.health, Mapping)), None)
@@ -93,13 +103,17 @@ def random_faults(n: int, seed: int = 0, *, base: str | Scenario = "joint") -> l
     if sick is None or short is None:
         what = "a phase with health factors" if sick is None else "a phase with a fault"
         raise ScenarioError(f"scenario {s.name!r} lacks {what} to draw at random")
-    return [_drawn(s, sick, short, seed, i) for i in range(n)]
+    return [_drawn(s, sick, short, seed, i, growing) for i in range(n)]
 
 
 def _short(p: Phase) -> tuple[Ttsc, int | None] | None:
-    """Return the short circuit that a phase begins with, and the generator that has it or None."""
+    """Return the short circuit that a phase begins with, and the generator that has it or None.
+
+    Of one that changes in time, what it is once it is there.
+    """
     faults = p.fault if isinstance(p.fault, tuple) else [(None, p.fault)]
-    return next(((f, k) for k, f in faults if isinstance(f, Ttsc)), None)
+    found = ((f.example() if isinstance(f, Varying) else f, k) for k, f in faults)
+    return next(((f, k) for f, k in found if isinstance(f, Ttsc)), None)
 
 
 def _phase_of(fault: Any) -> str:
@@ -108,7 +122,7 @@ def _phase_of(fault: Any) -> str:
     return str(getattr(fault, "phase", "-"))
 
 
-def _drawn(s: Scenario, sick: int, short: int, seed: int, i: int) -> Scenario:
+def _drawn(s: Scenario, sick: int, short: int, seed: int, i: int, growing: float = 0.0) -> Scenario:
     rng = np.random.default_rng([seed, i])
     table = s.to_dict()
     phases = table["phase"]
@@ -130,7 +144,36 @@ def _drawn(s: Scenario, sick: int, short: int, seed: int, i: int) -> Scenario:
     table["title"] = f"{s.name} with random faults: seed {seed}, run {i}"
     table["doc"] = ""
     table["seed"] = int(rng.integers(2**31))
+    if growing:
+        _grow(table, sick, short, growing, rng)
     return Scenario.from_dict(table)
+
+
+def _grow(
+    table: dict[str, Any], sick: int, short: int, share: float, rng: np.random.Generator
+) -> None:
+    """Let a share of the faults of a drawn scenario grow into what they are."""
+    grows = rng.random(2) < share
+    parts = zip((sick, short), rng.uniform(*GROWTH, 2), strict=True)
+    over = [_digits(part * (table["duration"] - table["phase"][k]["start"])) for k, part in parts]
+    if grows[0]:
+        health, ramp = table["phase"][sick]["health"], {"from": 1.0, "over": over[0]}
+        table["phase"][sick]["health"] = {n: {**ramp, "to": f} for n, f in health.items()}
+    if grows[1]:
+        fault = table["phase"][short]["fault"]
+        h = _digits(fault["mu"] / (fault.pop("k_rf") + 1.0 - fault["mu"]))
+        fault["h"] = {"kind": "exponential", "from": H_FIRST, "to": h, "over": over[1]}
+
+
+def _profiles(s: Scenario) -> str:
+    """Return in words what grows in a scenario; "-" where nothing does."""
+    found = []
+    for p in s.phases:
+        health = p.health if isinstance(p.health, Mapping) else {}
+        found += [f"{n} {f.label}" for n, f in health.items() if isinstance(f, Profile)]
+        faults = [of.fault for of in p.fault] if isinstance(p.fault, tuple) else [p.fault]
+        found += [f.label for f in faults if isinstance(f, Varying)]
+    return "; ".join(found) or "-"
 
 
 def _digits(x: float) -> float:
@@ -477,6 +520,10 @@ def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Da
     said = ["; ".join(r.get("warnings", ())) or "-" for r in records]
     words = "what must be known of the run; - nothing"
     data["warnings"] = (runs, np.array(said), {"long_name": words})
+    grown = [_profiles(s) for s in scenarios]
+    if set(grown) != {"-"}:
+        words = "how the faults of the run grow; - not"
+        data["profiles"] = (runs, np.array(grown), {"long_name": words})
     seeds = [-1 if s.seed is None else s.seed for s in scenarios]
     data["seed"] = (runs, np.array(seeds, dtype=np.int32), {"long_name": "of the noise; -1 none"})
     for k, (unit, doc) in _OF_RUNS.items():

@@ -1,6 +1,7 @@
-"""The JSON schema of a scenario file, made of the classes that read it; editors complete by it.
+"""JSON schemas of scenario and engine files, made of what reads them; editors complete by them.
 
-``apu list --schema > scenario.schema.json`` writes it, with the parts of ``--with`` too.
+``apu list --schema > scenario.schema.json`` writes that of a scenario file, with the parts of
+``--with`` too, ``apu list --engine-schema > engine.schema.json`` that of an engine's file.
 """
 
 from __future__ import annotations
@@ -9,21 +10,26 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.profiles.points import FILE_KEYS as FILE_KEYS_OF_POINTS
 from apu_casadi.core.profiles.points import OfPoints
 from apu_casadi.core.profiles.profile import PROFILES
 from apu_casadi.core.register import Key
+from apu_casadi.core.units import ALL_UNITS
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from apu_casadi.machine.faults.fault import FAULTS, Fault
+from apu_casadi.machine.generator import CHOICES
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import HEALTH_HI, HEALTH_LO, MOST, STARTS
 from scenarios.phases import CHANGES, Change, Phase
 from scenarios.reading import DEFAULT_FAULT, names_of
 from scenarios.schema import EXCHANGES, FILE_KEYS, Scenario
+
+if TYPE_CHECKING:
+    from apu_casadi.core.parameters import Parameters
 
 Table = dict[str, Any]
 _GENERATOR = {"$ref": "#/definitions/generator"}
@@ -47,6 +53,68 @@ def file_schema() -> Table:
     table = _object(_scenario(), ("name", "duration", "phase"))
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "apu-casadi scenario"}
     return head | table | {"definitions": definitions}
+
+
+def engine_schema() -> Table:
+    """Return the schema (JSON Schema, draft 7) of an engine's file."""
+    from apu_casadi.gaspath.engines import HEAD
+    from apu_casadi.gaspath.gas import DATA_SETS
+    from apu_casadi.gaspath.steady.steadypoint import LIMIT_RANGES, LIMIT_UNITS
+    from apu_casadi.machine.machinedata import SaturatedMachine
+    from apu_casadi.unit.apu import Apu
+
+    sets = Apu().parameter_sets()
+    limits = {n: _given(_number(*LIMIT_RANGES[n], unit=u), u) for n, u in LIMIT_UNITS.items()}
+    gas = _object(_set(sets["gas_generator"]) | {"gas_data": {"enum": list(DATA_SETS)}})
+    inner = {n: _object(_set(sets[n])) for n in ("exciter", "coupling")}
+    inner["machine"] = _object(_set(SaturatedMachine()) | {"S_10": _given(_number(0.0), "1")})
+    of_one = inner | {n: {"enum": list(words)} for n, words in CHOICES.items()}
+    of_one["count"] = {"type": "integer", "minimum": 1, "maximum": MOST}
+    several = {"type": "array", "items": _object(of_one), "minItems": 1, "maxItems": MOST}
+    laws = [
+        _object({"kind": {"const": kind}, **_set(law())}, () if kind == "PI" else ("kind",))
+        for kind, law in ((kind, GOVERNORS[kind]) for kind in GOVERNORS)
+    ]
+    table: Table = {n: {"type": "string"} for n in HEAD} | {
+        "gas_generator": gas,
+        "limits": _object(limits),
+    }
+    table |= {n: _map(sets[n]) for n in ("compressor_map", "turbine_map")}
+    table |= {"generator": {"anyOf": [_object(of_one), several]}, "governor": {"anyOf": laws}}
+    table |= {"coupling": inner["coupling"]}
+    head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "apu-casadi engine"}
+    return head | _object(table, minProperties=1)
+
+
+def _set(p: Parameters) -> Table:
+    """Return the numbers of a parameter set as an engine's file gives them."""
+    fields = {f.name: f.metadata for f in dataclasses.fields(p) if "unit" in f.metadata}
+    return {
+        n: _given(_number(m["lo"], m["hi"], unit=m["unit"], doc=m["doc"]), m["unit"])
+        for n, m in fields.items()
+    }
+
+
+def _given(number: Table, si: str) -> Table:
+    """Return a number alone, in SI units, or a table with value, unit and source."""
+    same = {u for u, (base, *_) in ALL_UNITS.items() if base == si or {base, si} == {"1", "kg/kg"}}
+    text: Table = {"type": "string"}
+    full: Table = {"value": {"type": "number"}, "unit": text, "source": text}
+    other = _object(full | {"unit": {"enum": sorted(same | {si})}}, ("value", "unit"))
+    alone = _object({"value": number, "source": text}, ("value",))
+    words = {k: number[k] for k in ("description",) if k in number}
+    return {"anyOf": [number, alone, other]} | words
+
+
+def _map(calibration: Parameters) -> Table:
+    from apu_casadi.gaspath.maps.mapfiles import SHIPPED
+
+    text: Table = {"type": "string", "minLength": 1}
+    flag = {"type": "boolean"}
+    place = {n: _given(_number(), "1") for n in ("N_map_des", "beta_des")}
+    own = {**place, **_set(calibration)}
+    of_file = _object({"file": text, "trim": flag, "check": flag, **own}, ("file",))
+    return {"anyOf": [of_file, _object({"shipped": {"enum": list(SHIPPED)}, **own}, ("shipped",))]}
 
 
 def docs_of(cls: type) -> dict[str, str]:

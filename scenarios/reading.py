@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from apu_casadi.unit.noise import Noise
 
 _ONE_LOAD = "(give a list with a load for each generator, or an [[event]] with generator)"
+STEADY = (
+    "a number that does not change in time is expected, got a table with {}; profiles are for the "
+    "numbers of load, fault, health and ambient, and for N_ref_rpm"
+)
+"""Words for a table, with its keys, where a number is wanted."""
 DEFAULT_FAULT = "ttsc"
 """Kind of a fault whose table names none."""
 
@@ -86,6 +91,8 @@ def check_numbers(checked: Any) -> None:
     """Check the fields that have :func:`limits`; one whose type says so may be None."""
     for f in dataclasses.fields(checked):
         value = getattr(checked, f.name)
+        if isinstance(value, Mapping) and "unit" in f.metadata:
+            raise PlacedError(f.name, STEADY.format(", ".join(map(str, value)) or "no key"))
         if "unit" in f.metadata and not (value is None and "None" in f.type):
             object.__setattr__(checked, f.name, bounded(value, f.name, **f.metadata))
 
@@ -179,6 +186,8 @@ def read_fault(data: Any, place: str = "fault") -> Fault | Varying[Fault | None]
         text = f'a table with {names}, or "none", is expected, got {data!r}'
         raise PlacedError(place, text)
     with inside(place):
+        healed = 'healthy again is fault = "none", of one generator with its number beside kind'
+        require(data.get("kind") != "none", "kind", healed)
         kind = FAULTS[_kind(data, FAULTS, DEFAULT_FAULT)]
         other = {n: k.name for n, k in kind.instead.items()}
         for k in data:
@@ -273,7 +282,14 @@ def _fault_of(row: Any, place: str) -> FaultOf:
     require(isinstance(row, Mapping) and "generator" in row, f"{place}.generator", missing)
     own = {k: v for k, v in row.items() if k != "generator"}
     number = number_of(row["generator"], f"{place}.generator")
-    return FaultOf(number, None if own == {"kind": "none"} else read_fault(own, place))
+    if own.get("kind") == "none":
+        rest = [str(k) for k in own if k != "kind"]
+        kinds = (
+            f"a generator without fault takes no more keys; kinds with some: {', '.join(FAULTS)}"
+        )
+        require(not rest, f"{place}.{'.'.join(rest[:1])}", kinds)
+        return FaultOf(number, None)
+    return FaultOf(number, read_fault(own, place))
 
 
 def read_noise(data: Any) -> Noise:
@@ -282,6 +298,7 @@ def read_noise(data: Any) -> Noise:
     Raises:
         ScenarioError: an unknown name, or a value that is negative or not finite.
     """
+    from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.machine.measurement import MeasurementNoise
     from apu_casadi.unit.noise import Noise
 
@@ -294,7 +311,7 @@ def read_noise(data: Any) -> Noise:
         for k, part in parts.items():
             if isinstance(part, MeasurementNoise):
                 part = dataclasses.asdict(part)
-            known = names_of(MeasurementNoise) if k == "terminal" else tuple(part)
+            known = names_of(MeasurementNoise) if k == "terminal" else GasGenerator.Y.names
             checked = table_of(part, k, known).items()
             made[k] = {n: bounded(v, f"{k}.{n}", lo=0.0) for n, v in checked}
         if "terminal" in made:

@@ -10,22 +10,40 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.core.errors import ScenarioError, ValidityError, nearest
-from apu_casadi.core.sharing import last, once
-from scenarios.extensions import digest
+from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityError, nearest
+from apu_casadi.core.sharing import once
+from scenarios.doubts import doubts
 from scenarios.schema import Scenario
 from scenarios.shell import jsontext
+from scenarios.units import engine_digest, engine_file, of_scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from apu_casadi.unit.apu import Apu
-    from apu_casadi.unit.enginefile import Engine
+
+__all__ = [
+    "assumed",
+    "conditions",
+    "engine_digest",
+    "engine_file",
+    "get",
+    "implausible",
+    "list_scenarios",
+    "name_of",
+    "prepare",
+    "profiles",
+    "run",
+    "summary",
+    "unit_for",
+    "write",
+]
 
 Progress = Callable[[float, float], None]
 """Called with the simulated and the total time [s]."""
@@ -58,13 +76,18 @@ def get(name_or_path: str | os.PathLike[str]) -> Scenario:
 
     Raises:
         ScenarioError: unknown name (the nearest is named), missing file, wrong key or value.
+
+    Warns:
+        ApuWarning: a number of a file that is possible and most often a slip.
     """
     text = os.fspath(name_or_path)
     path = Path(text)
-    if path.suffix == ".py":
-        return Scenario.from_python(path)
-    if path.suffix == ".toml":
-        return Scenario.from_toml(path)
+    if path.suffix in (".py", ".toml"):
+        read = Scenario.from_python if path.suffix == ".py" else Scenario.from_toml
+        s = read(path)
+        for words in implausible(s):
+            warnings.warn(ApuWarning(f"{path}: {words}"), stacklevel=2)
+        return s
     library = _library()
     if text in library:
         return library[text]
@@ -100,6 +123,8 @@ def run(
         ScenarioError, ParameterError: a wrong description; OperatingPointError, SimulationError :
             the unit cannot run so; DataError : ``out`` cannot be written.
     """
+    from apu_casadi.unit.departures import name_phases
+
     s = scenario if isinstance(scenario, Scenario) else get(scenario)
     if overrides:
         s = s.change(**overrides)
@@ -110,8 +135,11 @@ def run(
     except ValidityError as error:
         inside = [p["name"] for p in s.phase_table() if p["start"] < error.t + 1e-9]
         raise ValidityError(f"in phase {inside[-1]!r}: {error.words}", error.t) from None
-    ds.attrs["scenario"] = s.to_json()
+    ds.attrs |= {"title": s.title or s.name, "scenario": s.to_json()}
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
+    name_phases(ds)
+    if strange := implausible(s):
+        ds.attrs["implausible"] = json.dumps(strange, ensure_ascii=False)
     if s.engine:
         ds.attrs["assumed"] = json.dumps(assumed(s), ensure_ascii=False)
     if out is not None:
@@ -119,58 +147,14 @@ def run(
     return ds
 
 
-def engine_file(name: str | os.PathLike[str] | None) -> Engine:
-    """Return the unit of a file, or of the package by its name; None is the default one.
-
-    Raises:
-        DataError: the file cannot be read; ParameterError, MapError : what it says cannot be.
-    """
-    if name is None:
-        return _engine_file(None)
-    return _engine_file(str(name), engine_digest(name))
-
-
-@last(4)
-def _engine_file(name: str | None, content: str = "") -> Engine:
-    from apu_casadi.unit.enginefile import Engine, read_unit
-
-    return Engine() if name is None else read_unit(name)
-
-
-def engine_digest(name: str | os.PathLike[str]) -> str:
-    """Return a digest of an engine's file and of the map files that it names.
-
-    Raises:
-        ScenarioError: one of them cannot be read; DataError : no unit of this name.
-    """
-    from apu_casadi.unit.enginefile import files_of
-    from apu_casadi.unit.shippedunits import unit_path
-
-    return "".join(digest(p, "engine file") for p in files_of(unit_path(Path(name))))
-
-
-@last(4)
-def unit_of(parameters: str = "{}", engine: str | None = None, content: str = "") -> Apu:
-    """Return the unit with some parameters changed, and another engine if one is given.
-
-    The last few are kept, since building takes longer.
-
-    Args:
-        parameters: values by dotted name, a JSON table.
-        engine: file of the unit, or the name of a shipped one.
-        content: its digest, so that a file that has changed is read again.
-
-    Raises:
-        ParameterError: an unknown name or a value out of range.
-    """
-    return engine_file(engine).unit.change(json.loads(parameters))
-
-
 def unit_for(s: Scenario) -> Apu:
     """Return the unit that a scenario is about."""
-    law = {} if s.governor is None else {"governor.kind": s.governor}
-    parameters = json.dumps({**s.parameters, **law}, sort_keys=True)
-    return unit_of(parameters, *([s.engine, engine_digest(s.engine)] if s.engine else []))
+    return of_scenario(s.engine, s.governor, s.parameters)
+
+
+def implausible(s: Scenario) -> list[str]:
+    """Return what is possible in a scenario and most often a slip, each with its place."""
+    return doubts(s, unit_for(s), engine_file(s.engine).unit)
 
 
 def assumed(s: Scenario) -> list[dict[str, Any]]:
@@ -198,6 +182,7 @@ def _simulate(
         solver=solver,
         phasors=phasors,
         strict=strict,
+        limits=engine_file(s.engine).limits,
         progress=progress,
     )
 
@@ -217,10 +202,15 @@ def name_of(ds: xr.Dataset) -> str:
         return "result"
 
 
+_TOLD = {"assumed": "assumed_engine", "implausible": "implausible"}
+"""Attributes of some runs, JSON lists, and their names in the summary."""
+
+
 def summary(ds: xr.Dataset) -> dict[str, Any]:
     """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
     from apu_casadi.core.results import phase_summary
-    from apu_casadi.unit.validity import by_phase, found_in
+    from apu_casadi.unit.departures import by_phase, rows_of
+    from apu_casadi.unit.validity import found_in
 
     scenario, rows = _table(ds, "scenario"), phase_summary(ds)
     return {
@@ -228,11 +218,11 @@ def summary(ds: xr.Dataset) -> dict[str, Any]:
         "title": str(scenario.get("title", "")),
         "apu_casadi_version": str(ds.attrs.get("apu_casadi_version", "")),
         **{k: scenario[k] for k in ("engine", "governor", "extensions") if k in scenario},
-        **({"assumed_engine": json.loads(ds.attrs["assumed"])} if "assumed" in ds.attrs else {}),
+        **{k: json.loads(ds.attrs[a]) for a, k in _TOLD.items() if a in ds.attrs},
         **conditions(ds),
         "profiles": profiles(ds),
         "phases": [r | {"beyond": b} for r, b in zip(rows, by_phase(ds), strict=True)],
-        "validity": json.loads(ds.attrs.get("validity", "[]")),
+        "validity": rows_of(ds),
         "warnings": found_in(ds),
     }
 
@@ -281,17 +271,31 @@ def _table(ds: xr.Dataset, name: str) -> dict[str, Any]:
 
 
 def write(
-    ds: xr.Dataset, out: str | os.PathLike[str], *, figures: bool = True, name: str | None = None
+    ds: xr.Dataset,
+    out: str | os.PathLike[str],
+    *,
+    figures: bool = True,
+    name: str | None = None,
+    formats: Sequence[str] = ("nc",),
 ) -> list[Path]:
-    """Write ``NAME.nc``, ``summary.json`` and the figures into a folder; return the paths.
+    """Write data, ``summary.json`` and the figures into a folder; return the paths.
+
+    Args:
+        ds: what a run gave.
+        out: the folder.
+        figures: whether they are drawn.
+        name: of the data, without ending; that of the scenario by default.
+        formats: of the data (:data:`apu_casadi.core.resultformats.FORMATS`).
 
     Raises:
+        ParameterError: an unknown format.
         DataError: the folder or a file cannot be written.
     """
-    from apu_casadi.core import files, results
+    from apu_casadi.core import files
+    from apu_casadi.core.resultformats import save_as
 
     folder = prepare(out)
-    made = [results.save(ds, folder / f"{name or name_of(ds)}.nc")]
+    made = [p for form in formats for p in save_as(ds, folder / (name or name_of(ds)), form)]
     text = jsontext.dumps(summary(ds))
     made.append(files.write_text(folder / "summary.json", text + "\n"))
     if figures:

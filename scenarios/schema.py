@@ -69,7 +69,7 @@ from apu_casadi.unit.events import (
 )
 from apu_casadi.unit.exchange import OFFERED
 from apu_casadi.unit.shippedunits import is_name
-from scenarios import extensions
+from scenarios import extensions, units
 from scenarios.phases import Change, Changing, Phase, Plain, plain
 from scenarios.reading import (
     check_numbers,
@@ -86,6 +86,7 @@ from scenarios.reading import (
 )
 
 if TYPE_CHECKING:
+    from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.noise import Noise
 
 LARGEST_FILE = 1 << 24
@@ -228,23 +229,30 @@ class Scenario(Plain):
                 ok = all(None not in (j, k) and j != k for j in same)
                 require(ok, f"event[{i}].{name}", text)
             taken += [(c.time, *of) for of in c.touched()]
-        n = self.parameters.get("generator.count", 2)
-        if self.engine is None and isinstance(n, int):
-            self._check_generators(n)
+        self._check_generators(len(self._unit().machines) if self._own else 2)
+
+    @property
+    def _own(self) -> bool:
+        """Whether its unit is another one than the default."""
+        return bool(self.engine or self.governor or self.parameters)
+
+    def _unit(self) -> Apu:
+        return units.checked(self.engine, self.governor, self.parameters)
 
     def _check_generators(self, n: int) -> None:
         """Refuse loads and faults of generators that a unit of ``n`` has not."""
-        parts: list[tuple[str, Changing]] = [
+        parts: list[tuple[str, Phase | Change]] = [
             *((f"phase[{i}]", p) for i, p in enumerate(self.phases, 1)),
             *((f"event[{i}]", c) for i, c in enumerate(self.changes, 1)),
         ]
         for place, c in parts:
+            note = f" (phase {c.name!r})" if isinstance(c, Phase) else ""
             if isinstance(c.load, tuple):
                 text = f"{len(c.load)} loads, but the unit has {n} generators"
-                require(len(c.load) == n, f"{place}.load", text)
+                require(len(c.load) == n, f"{place}.load", text, note)
             for name, k in c.touched():
                 text = f"generator {k}, but the unit has 1 to {n}"
-                require(k is None or k <= n, f"{place}.{name}", text)
+                require(k is None or k <= n, f"{place}.{name}", text, note)
 
     def _beyond(self, t: float) -> str:
         return f"{t:g} s is not before the end of the run at {self.duration:g} s"

@@ -488,6 +488,7 @@ def open_files(folder):
 NEEDS_ROOT = (of_another, link_of_another, files_of_another)
 
 
+@pytest.mark.long
 @needs_compiler
 @needs_owners
 @pytest.mark.parametrize(

@@ -75,6 +75,7 @@ def test_memory_is_that_of_this_process():
     assert 20 < runparts.peak_memory() < 1e5
 
 
+@pytest.mark.long
 def test_a_part_runs_in_a_process_of_its_own():
     """The long run is measured there, and its answer comes back."""
     load = {"kind": "R", "power_kW": 150.0}

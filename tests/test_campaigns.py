@@ -15,6 +15,8 @@ import pytest
 from apu_casadi.core import results
 from apu_casadi.core.errors import DataError, ScenarioError, SimulationError
 from apu_casadi.core.means import UNBALANCE
+from apu_casadi.core.profiles.profile import Varying, at
+from apu_casadi.core.profiles.shapes import Ramp
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios import campaign_records, campaigns, registry
 from scenarios.campaign_records import COLUMNS, RUNS
@@ -66,6 +68,37 @@ def test_draws_depend_on_seed_and_index_alone(base):
     assert all(0.2 <= s.phases[2].start < 0.4 for s in long)
 
 
+def test_a_share_of_the_faults_grows_into_what_is_drawn(base):
+    """Ramps from one, exponentially from 1e-5; what is drawn is that of the steps."""
+    steps, grown = (random_faults(60, 3, base=base, growing=g) for g in (0.0, 0.5))
+    healths = [s.phases[1].health for s in grown]
+    ramps = [h for h in healths if isinstance(h["f_eta_c"], Ramp)]
+    shorts = [s.phases[2].fault for s in grown if isinstance(s.phases[2].fault, Varying)]
+    assert 15 < len(ramps) < 45 and 15 < len(shorts) < 45
+    for a, b in zip(steps, grown, strict=True):
+        last, first = (at(b.phases[k].health["f_W_c"], t) for k, t in ((1, 9.0), (1, 0.0)))
+        assert last == a.phases[1].health["f_W_c"] and first in (1.0, last)
+        fault, wanted = at(b.phases[2].fault, 9.0), a.phases[2].fault
+        assert fault.h == pytest.approx(wanted.h, rel=1e-4)
+        assert (fault.phase, fault.mu, fault.kappa) == (wanted.phase, wanted.mu, wanted.kappa)
+        assert (a.seed, a.phases[2].start) == (b.seed, b.phases[2].start)
+        if fault is not b.phases[2].fault:
+            assert b.phases[2].fault.at(0.0).h == pytest.approx(1e-5)
+    assert Scenario.from_dict(grown[0].to_dict()) == grown[0]
+    again = random_faults(1, base=base.change(phases=grown[0].phases))
+    assert isinstance(again[0].phases[2].fault, Ttsc)
+    for g in (-0.1, 1.5):
+        with pytest.raises(ScenarioError, match="growing"):
+            random_faults(1, base=base, growing=g)
+
+
+def test_a_campaign_of_growing_faults_says_how_they_grow(base):
+    ds = run_campaign(random_faults(2, 1, base=base, growing=1.0), workers=1)
+    assert counts(ds)["done"] == 2 and ds["h"].values[0, 2] > 1e-5
+    words = str(ds["profiles"].values[0])
+    assert "f_eta_c ramp from 1 to" in words and "h exponential from 1e-05 to" in words
+
+
 def test_a_base_without_faults_is_refused():
     with pytest.raises(ScenarioError, match="lacks a phase with"):
         random_faults(1, base="quiet")
@@ -73,6 +106,7 @@ def test_a_base_without_faults_is_refused():
         random_faults(0)
 
 
+@pytest.mark.long
 def test_summaries_are_those_of_single_runs(base, tmp_path):
     runs = random_faults(2, 1, base=base)
     ds = run_campaign(runs, workers=1, out=tmp_path)
@@ -169,6 +203,7 @@ def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path, caplog):
         run_campaign([run], summary_only=False)
 
 
+@pytest.mark.long
 def test_processes_give_the_same_and_one_that_dies_is_told(base, monkeypatch):
     """Three workers' worth of tasks over two processes; one kills its process."""
     before = (dict(os.environ), sys.modules["__main__"].__dict__.get("__file__"))

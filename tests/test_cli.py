@@ -44,6 +44,7 @@ def test_list_loads_nothing_heavy():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.long
 def test_run_prints_the_phases_and_writes_everything(fake, capsys, tmp_path):
     assert cli.main(["run", "joint"]) == 0
     out, err = capsys.readouterr()

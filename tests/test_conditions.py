@@ -151,6 +151,7 @@ def written_elsewhere(text):
     return found
 
 
+@pytest.mark.long
 def test_no_default_is_written_elsewhere():
     """Every argument, field, option and table takes its default from ``gaspath/conditions.py``."""
     wrong = [
@@ -207,6 +208,7 @@ def healthy(apu, tmp_path_factory):
     return save(ds, folder / "run.nc"), csv, ds
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("file", ["run.nc", "bench.csv"])
 def test_fitting_a_healthy_run_with_all_defaults_finds_it_healthy(healthy, file, capsys):
     """0.958 was found for f_eta_c, the day of the fit being 5 K colder than that of the run.

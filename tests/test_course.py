@@ -86,6 +86,7 @@ def followed(load, fault, begin, steps=6, waves=False):
     return off, states, seen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("load", "fault", "begin"),
     [(RAMP, None, 3.0), (KW100, GROWN, 6.0)],
@@ -98,6 +99,7 @@ def test_means_follow(load, fault, begin):
     assert max(off.values()) < 1e-5 and states < 2e-5
 
 
+@pytest.mark.long
 def test_waveforms_follow():
     """Samples to 1e-6 of their peaks, load and fault on their way at once."""
     load = varying(SeriesLoad.from_power, Ramp(100e3, 200e3, over=60.0))

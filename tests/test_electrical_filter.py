@@ -208,6 +208,7 @@ HOLES = {
 SOME = ("a current", "every other voltage", "everything for eight periods")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hole", "gains"),
     [*((h, "none") for h in HOLES), *((h, g) for h in SOME for g in ("estimate", "consider"))],

@@ -196,6 +196,7 @@ def test_parameters_are_unknowns_of_a_fit_like_health_factors():
         gg.with_free("gas_generator.eta_burn")
 
 
+@pytest.mark.long
 def test_many_units_leave_the_memory_flat():
     """400 engines, used and dropped: less than 2 MB more, 5 kB each."""
     gg = GasGenerator()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from apu_casadi.core import backend, results
-from apu_casadi.core.errors import ApuError, DataError, ParameterError
-from apu_casadi.gaspath.steady.steadypoint import Limits
+from apu_casadi.core.errors import ApuError, ApuWarning, DataError, ParameterError, ScenarioError
+from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS, Limits
 from apu_casadi.gaspath.steady.trimbatch import performance_deck
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
@@ -19,6 +19,7 @@ from apu_casadi.unit.enginefile import GAS, Engine, read_unit, write_unit
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint
 from apu_casadi.unit.shippedunits import shipped_units, titles, unit_path
+from apu_casadi.unit.usual import USUAL, unusual
 from estimators.apu import fitting, identify
 from scenarios import campaigns, registry
 from scenarios.cli import main
@@ -197,6 +198,10 @@ gear = 3.2
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (
+            "# nothing",
+            r"engine\.toml: empty: an engine has at least one of the tables gas_generator",
+        ),
         ("[governer]\nKp = 1", r"unknown 'governer' \(did you mean 'governor'\?\)"),
         ("[governor]\nKP = 1", r"\[governor\]: unknown 'KP' \(did you mean 'Kp'\?\)"),
         ("[governor]\nkind = 'PIX'", r"\[governor\]: unknown kind 'PIX' .*'PI'"),
@@ -218,6 +223,8 @@ gear = 3.2
         ("[coupling]\neta_gt = 1.0", r"\[coupling\]: unknown 'eta_gt' .*eta_gtSg"),
         ("[limits]\nT4max = 1", r"\[limits\]: unknown 'T4max' .*T4_max"),
         ("[limits]\nT4_max = 'x'", r"\[limits\]: limit T4_max.*number"),
+        ("[limits]\nSM_min = 20", r"\[limits\]: limit SM_min must lie in \[-inf, 1\], got 20"),
+        ("[limits]\nT4_max = -5", r"\[limits\]: limit T4_max must lie in \[250, inf\], got -5"),
         ("[gas_generator]\nW2 = { value = 3, unit = 'kg' }", r"W2.unit: unknown unit 'kg' .*kg/s"),
         ("[gas_generator]\nW2 = { value = 3, unit = 'K' }", r"W2.unit: a unit of kg/s is expect"),
         ("[gas_generator]\nW2 = { val = 3 }", r"W2: unknown 'val' .*value"),
@@ -234,6 +241,40 @@ def test_mistakes_are_told_with_their_place(tmp_path, text, words):
     with pytest.raises(ApuError, match=words) as e:
         read_unit(path)
     assert str(tmp_path) in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[gas_generator]\nN = 36050", "[gas_generator]: N = 36050 rad/s is outside 300 to 20000"),
+        ("[generator.machine]\nr_s = 4.4", "[machine]: r_s = 4.4 ohm is outside 0.0001 to 1 ohm"),
+        ("[governor]\nWf_max = 240", "[governor]: Wf_max = 240 kg/s is outside 0.001 to 2 kg/s"),
+        (
+            "[coupling]\ngear = 1.5",
+            "[coupling]: the governed speed of 3775.15 rad/s, gear 1.5 and 2",
+        ),
+        ("[limits]\nT4_max = 3000", "[limits]: T4_max = 3000 K is outside 900 to 2300 K"),
+    ],
+)
+def test_what_is_most_often_a_slip_is_told(tmp_path, text, words):
+    """A wrong unit: taken, with a warning that has file, table, value and usual range."""
+    path = tmp_path / "slip.toml"
+    path.write_text(text)
+    with pytest.warns(ApuWarning) as told:
+        read_unit(path)
+    assert any(str(w.message).startswith(f"{path}, {words}") for w in told)
+
+
+def test_every_number_has_a_usual_range_or_a_narrow_one():
+    """And the default unit is within all of them."""
+    apu = Apu()
+    for part, p in apu.parameter_sets().items():
+        for f in dataclasses.fields(p):
+            lo, hi = USUAL.get(f"{part}.{f.name}", (f.metadata.get("lo"), f.metadata.get("hi")))
+            assert lo is None or np.isfinite([lo, hi]).all(), f.name
+    assert set(n for n in USUAL if n.startswith("limits.")) == {f"limits.{n}" for n in LIMIT_UNITS}
+    assert set(USUAL) - {f"limits.{n}" for n in LIMIT_UNITS} <= set(apu.parameters())
+    assert list(unusual(apu, USUAL, Limits())) == []
 
 
 def test_names_of_shipped_units(work):
@@ -269,6 +310,7 @@ def test_figures_that_were_not_put_in_are_predicted(tpe):
     assert {a.name.split(".")[0] for a in tpe.assumed} >= {"machine", "exciter", "limits"}
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 def test_the_second_unit_compiles_nothing(tpe, monkeypatch):
     """Trim, deck and a joint run with load step and both faults, on what the default unit made."""
@@ -315,6 +357,7 @@ def test_its_faults_are_estimated(tpe):
 # ------------------------------------------------------------------------------ commands
 
 
+@pytest.mark.long
 def test_every_command_takes_a_unit(work, capsys, tpe):
     """Each runs with the shipped unit and tells once, on stderr or in JSON, what is assumed."""
     gg = tpe.unit.gas_generator
@@ -378,6 +421,7 @@ def test_every_command_takes_a_unit(work, capsys, tpe):
     assert "the published points are those of the default unit" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_estimate_takes_a_unit(work, capsys):
     (work / "still.toml").write_text(RUN.partition('[[phase]]\nname = "ill"')[0])
     assert main(["estimate", "joint", "--scenario", "still.toml", "--json", "--figures"]) == 0
@@ -405,7 +449,9 @@ def test_a_scenario_names_its_unit(work, tpe, monkeypatch):
     keys = [campaigns._task(x, "propagator", None).key for x in (s, own)]
     assert keys[0] != keys[1]
     with pytest.raises(DataError, match=r"engine 'tpe33': .*'tpe331'"):
-        registry.unit_for(s.change(engine="tpe33"))
+        registry.engine_file("tpe33")
+    with pytest.raises(ScenarioError, match=r"engine: engine 'tpe33': .*'tpe331'"):
+        s.change(engine="tpe33")
 
 
 def test_list_shows_the_units(capsys):

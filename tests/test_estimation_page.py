@@ -82,8 +82,8 @@ def test_figures_refuse_what_does_not_fit():
 
 
 def test_the_readme_has_the_short_table(records):
-    """``apu estimate page --readme README.md`` puts it there."""
-    text = (HERE / "README.md").read_text(encoding="utf-8")
+    """``apu estimate page --readme docs/how-to/estimate.md`` puts it there."""
+    text = (HERE / "docs/how-to/estimate.md").read_text(encoding="utf-8")
     assert estimation_page.put_summary(text, records) == text
     with pytest.raises(DataError, match="no place"):
         estimation_page.put_summary("nothing", records)

@@ -25,6 +25,7 @@ def asked():
     return Asked(Apu(), load, Ttsc(0.05, 20.0, 1.0, "b"), Ambient(altitude=3000.0))
 
 
+@pytest.mark.long
 @needs_compiler
 @pytest.mark.parametrize("name", CI)
 def test_a_thousand_steps_equal_python_s(asked, name, tmp_path):

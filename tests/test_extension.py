@@ -134,6 +134,7 @@ def test_a_fault_in_run_linearisation_and_estimator(mine):
     assert by_m == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_fault_is_found_by_a_filter(mine):
     """m as an unknown of the extended Kalman filter on the generator's own equations."""
     gen, own = Generator(), mine["MyFieldShort"](0.1)
@@ -159,6 +160,7 @@ def test_a_fault_is_found_by_a_filter(mine):
     assert abs(mean[-1] - 0.1) < 4 * sigma[-1] < 0.02
 
 
+@pytest.mark.long
 def test_sensors_in_filter_and_joint_estimation(ds, mine, tmp_path):
     """The lag is a state; they narrow what is known of the compressor; files have their columns."""
     own = ("T41_mine", "dP_mine")
@@ -180,6 +182,7 @@ def test_sensors_in_filter_and_joint_estimation(ds, mine, tmp_path):
     assert table.get("T41_mine", "K") == pytest.approx([1173.15, 1178.15])
 
 
+@pytest.mark.long
 def test_an_engine_in_run_linearisation_and_estimator(folder):
     """Another size and another pressure ratio, from one file."""
     gg = read_engine("engine.toml")
@@ -207,6 +210,7 @@ def test_a_governor_in_run_linearisation_and_estimator(mine):
     assert np.isfinite(filt.run(filt.recording(ds, 1)).mean).all()
 
 
+@pytest.mark.long
 def test_a_filter_step_in_run_and_joint_estimation(ds, mine):
     """A steady gain, found by the package's filter, serves almost as well as that."""
     filt = gas_path_filter(gains=False)
@@ -246,6 +250,7 @@ def test_a_scenario_names_load_fault_and_governor(folder, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "argv",
     [

@@ -127,6 +127,7 @@ def test_keys_of_an_own_part_are_checked_as_all_are(files):
         assert message in str(e.value)
 
 
+@pytest.mark.long
 def test_workers_of_a_campaign_know_them(files):
     """Fresh processes read the tables alone; a changed part is another run."""
     parts, path = files
@@ -256,6 +257,7 @@ def other_engine(tmp_path, monkeypatch):
     return path, read_engine(path)
 
 
+@pytest.mark.long
 def test_every_command_takes_another_engine(other_engine, capsys):
     """The fuel that commands print is the other engine's."""
     _, made = other_engine

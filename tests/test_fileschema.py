@@ -6,8 +6,11 @@ from importlib.resources import files
 
 import pytest
 
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.enginefile import write_unit
+from apu_casadi.unit.shippedunits import shipped_units
 from scenarios.cli import main
-from scenarios.fileschema import docs_of, file_schema
+from scenarios.fileschema import docs_of, engine_schema, file_schema
 from scenarios.schema import FILE_KEYS, Scenario
 
 jsonschema = pytest.importorskip("jsonschema")
@@ -88,6 +91,69 @@ def test_it_is_made_of_the_classes_and_documented(validator, capsys):
     assert power is None or power["description"].endswith("[kW]")
     start = schema["properties"]["phase"]["items"]["properties"]["start"]
     assert start["description"] == "instant at which it begins and its changes take effect [s]"
+
+
+ENGINE = """
+name = "own"
+[gas_generator]
+N = { value = 41730, unit = "r/min", source = "plate" }
+W2 = 3.49
+gas_data = "nasa9"
+[compressor_map]
+file = "maps/radial.csv"
+check = false
+[[generator]]
+neutral = "isolated"
+machine.S_10 = 0.1
+[[generator]]
+[generator.coupling]
+gear = 3.2
+[governor]
+kind = "PI"
+Wf_max = { value = 240, unit = "kg/h" }
+[limits]
+T4_max = 1400.0
+"""
+
+
+@pytest.fixture(scope="module")
+def of_engines():
+    schema = engine_schema()
+    jsonschema.Draft7Validator.check_schema(schema)
+    return jsonschema.Draft7Validator(schema)
+
+
+def test_every_unit_that_is_shipped_or_written_passes(of_engines, tmp_path, capsys):
+    """And every key of the scenario's parameters has its table there."""
+    for path in shipped_units().values():
+        of_engines.validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    of_engines.validate(tomllib.loads(ENGINE))
+    mixed = {"generator2.machine.r_s": 0.005, "generator2.neutral": "isolated", "machine.S_10": 0.1}
+    for unit in (Apu(), Apu().change(mixed)):
+        write_unit(unit, tmp_path / "unit.toml")
+        of_engines.validate(tomllib.loads((tmp_path / "unit.toml").read_text()))
+    assert main(["list", "--engine-schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(of_engines.schema))
+    table = of_engines.schema["properties"]
+    assert tuple(table) == ("name", "title", "doc", "gas_generator", "limits", "compressor_map",
+                            "turbine_map", "generator", "governor", "coupling")  # fmt: skip
+    assert table["gas_generator"]["properties"]["W2"]["description"].endswith("[kg/s]")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[governor]", "[governer]"), ('"PI"', '"PIX"'), ('"isolated"', '"loose"'), ("W2", "w2"),
+        ("3.49", "-3.49"), ("3.49", '"3.49"'), ('"r/min"', '"K"'), ("T4_max", "T4max"),
+        ("value = 240", "val = 240"), ("gear = 3.2", "gear = 0.0"), ("check = false", "check = 1"),
+        ('file = "maps/radial.csv"', 'file = "a"\nshipped = "axi5"'), ("1400.0", "-1400.0"),
+        ('source = "plate"', "source = 4"), ('"nasa9"', '"nasa"'), ("machine.S_10", "machine.S_11"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_an_engine_do_not(of_engines, old, new):
+    """Each is one that the program refuses as well."""
+    assert old in ENGINE
+    assert not of_engines.is_valid(tomllib.loads(ENGINE.replace(old, new, 1)))
 
 
 def test_words_come_from_docstrings():

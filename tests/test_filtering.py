@@ -21,6 +21,7 @@ STEPS = {"ekf": ekf_step, "ukf": ukf_step}
 every_step = pytest.mark.parametrize("name", STEPS)
 
 
+@pytest.mark.long
 @every_step
 @pytest.mark.parametrize("K", [1, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK + 30])
 def test_blocks_are_the_step_sample_by_sample(name, K):
@@ -71,6 +72,7 @@ def test_going_on_from_the_final_belief(name):
     assert_allclose(second.mean[:, -1], whole.mean[:, -1], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.long
 @every_step
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_generated_c_gives_the_same(name):

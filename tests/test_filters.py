@@ -67,6 +67,7 @@ def filtered(name, model, prior, data):
     return run(make(model, **options), prior, data, full=True, backend="vm")
 
 
+@pytest.mark.long
 @every
 @pytest.mark.parametrize("seed", [0, 1])
 def test_is_the_kalman_filter_on_linear_models(seed, name):
@@ -121,6 +122,7 @@ def test_nothing_measured_is_prediction_only(name):
     assert r.loglik == 0 and not r.nis.any() and not r.measured.any()
 
 
+@pytest.mark.long
 @every
 def test_singular_priors_give_no_nan(name):
     """A state known exactly, a considered one of no variance, two that are one: as by hand."""

@@ -266,6 +266,7 @@ def test_exact_derivatives_of_the_program():
     assert_allclose(U + np.triu(U, 1).T, differences(lagrangian), atol=1e-6)
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth():
     """120 fits of a decay with one program: 95 % intervals; chi2 has its degrees of freedom."""
     m, rec, one = decay_data(n=12)

@@ -55,6 +55,7 @@ def out(capsys, *argv):
 COMMON = ("--column", "T5=EGT_in", "--readings", "25")
 
 
+@pytest.mark.long
 def test_steady_points(capsys, steady, tmp_path):
     """The truth lies in the intervals; profile and standard error agree; the figure is drawn."""
     figure = tmp_path / "sub" / "fit.png"
@@ -77,6 +78,7 @@ def test_steady_points(capsys, steady, tmp_path):
     assert report["misfit"]["Wf"]["readings"] == 4 and report["misfit"]["T3"]["readings"] == 4
 
 
+@pytest.mark.long
 def test_two_transients_with_a_bias_each(capsys, tmp_path):
     """Two load steps, CVODES: common health, T5 sensor with another bias in each run."""
     gg = fitting._engine()
@@ -129,6 +131,7 @@ def test_what_is_open_is_said(capsys, steady, tmp_path):
     assert [r["estimate"] for r in json.loads(text)["parameters"]] == [None] * 4
 
 
+@pytest.mark.long
 def test_options_change_the_answer(capsys, steady):
     """A prior narrows, a considered gain widens, a wrong sigma shows in chi-squared."""
 
@@ -166,6 +169,7 @@ def test_verdicts():
     assert verdict(10.0, 10, 0.4) == "the model fits within the stated noise"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
@@ -234,6 +238,7 @@ def test_readings_as_the_model_takes_them():
         fitting.to_recording(gg, lifted, fitting.EngineData("x", t, {}))
 
 
+@pytest.mark.long
 def test_coverage_study_in_small(tmp_path):
     """Thirty steady fits: each factor's intervals hold the truth most of the time; JSON written."""
     report = fitting.run_study(tmp_path / "fit.json", n=30, seed0=1, kinds=("steady",))

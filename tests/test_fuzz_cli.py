@@ -87,6 +87,7 @@ def refused(argv, capsys, seed):
     assert "Errno" not in err and "object at 0x" not in err, told
 
 
+@pytest.mark.long
 def test_wrong_lines_are_refused(odd_files, capsys):
     for seed in range(SEED, SEED + CASES):
         refused(wrong_line(random.Random(seed)), capsys, seed)
@@ -98,6 +99,7 @@ def test_many_wrong_lines_are_refused(odd_files, capsys):
         refused(wrong_line(random.Random(seed)), capsys, seed)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("words", "parser"), ALL, ids=[" ".join(w) for w, _ in ALL])
 def test_no_option_may_be_abbreviated(words, parser, capsys):
     """What is short for one option today may be another's name tomorrow."""
@@ -153,6 +155,7 @@ SURROUNDINGS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(SURROUNDINGS))
 def test_surroundings(tmp_path, name):
     """Streams that are closed or full, encodings, and what else a shell can do to a command."""

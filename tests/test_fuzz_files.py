@@ -148,6 +148,7 @@ def damaged_files_are_read_or_refused(name, folder, seeds):
             raise AssertionError(f"{told}: {type(e).__name__}: {e}") from e
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(KINDS))
 def test_damaged_files(tmp_path, name):
     n = CASES // 3 if name.endswith(".nc") else CASES  # reading netCDF takes longest
@@ -226,6 +227,7 @@ def test_results_of_other_than_numbers(tmp_path):
         assert words in str(e.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "words"),
     [

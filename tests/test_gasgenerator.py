@@ -236,6 +236,7 @@ def test_second_derivatives_of_the_root_equal_differences_of_first_ones(gg):
         np.testing.assert_allclose(second[:, k], column, atol=1e-6 * np.abs(second).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backend", ["vm", "auto"])
 def test_what_is_not_a_number_is_never_called_solved(gg, backend):
     """NaN in any input or in the start leaves a residual that fails every check."""

@@ -198,6 +198,7 @@ def test_what_lies_along_the_null_direction_is_not_seen(plain):
     assert min(seen(e) for e in np.eye(4)) > 0.05
 
 
+@pytest.mark.long
 def test_the_variance_of_a_power_window_counts(plain):
     """A window of unknown power tells nothing, a precise one more: sigma comes with the sample."""
     t, values = truth_of(steady(), 60)
@@ -228,6 +229,7 @@ def test_considered_efficiency_is_not_touched_and_costs_certainty():
 # ------------------------------------------------------------------------------ jumps
 
 
+@pytest.mark.long
 def test_a_jump_is_found_where_it_is_and_beliefs_before_the_alarm_stay(plain):
     before, after = truth_of(steady(), 60), truth_of(steady(FAULTY), 60)
     t, values = joined(before, after)
@@ -279,6 +281,7 @@ def _result(e):
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_false_alarms_of_white_innovations_are_as_rare_as_stated():
     """Two hours of white noise at a stated rate of 72 an hour: Bonferroni's bound holds."""
     rng = np.random.default_rng(5)

@@ -130,6 +130,7 @@ def test_steady_state_refuses(arguments, message):
 # -- an independent machine -------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fault", "gen"),
     [
@@ -249,6 +250,7 @@ def test_elimination_solves_the_dae(gen, kind, faulted):
 # -- conservation -----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gen", "load", "fault"),
     [

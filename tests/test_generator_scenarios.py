@@ -179,6 +179,7 @@ def test_captions_tell_generator_and_phase(ds):
     assert "Load of generator 2 100 kW;" in told
 
 
+@pytest.mark.long
 def test_figures_draw_each_generator(ds, tmp_path):
     made = plotting.save_figures(ds, tmp_path)
     stems = [p.stem for p in made]

@@ -9,7 +9,7 @@ import pytest
 
 from apu_casadi import Apu, FaultChange, Generator, LoadChange, SeriesLoad, Ttsc, simulate_joint
 from apu_casadi.core import results
-from apu_casadi.core.errors import DataError, OperatingPointError, ParameterError, ScenarioError
+from apu_casadi.core.errors import DataError, ParameterError, ScenarioError
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.measurement import MeasurementNoise
@@ -96,12 +96,8 @@ def test_wrong_generators_are_refused():
         Apu(others=(gen,))
     with pytest.raises(ParameterError, match=r"needs equal generators.*generator2\.machine\.r_s"):
         OTHER.PW(1e5)
-    with pytest.raises(ParameterError, match="one model of the unit needs equal"):
-        simulate_monolithic(OTHER, duration=0.1, load=KW100)
-    with pytest.raises(ScenarioError, match="2 loads; the one model of the unit has one for all"):
-        simulate_monolithic(Apu(), duration=0.1, load=[KW100, KW100])
-    with pytest.raises(OperatingPointError, match="the averaged unit"):
-        linearise_joint(Apu(), Apu().steady_state([KW100, SeriesLoad.from_power(50e3)]))
+    with pytest.raises(ScenarioError, match="load: 2 entries expected, one a generator, got 1"):
+        simulate_monolithic(OTHER, duration=0.1, load=[KW100])
     with pytest.raises(ParameterError, match="power 1 "):
         Apu().change({"generator.power": 1})
 
@@ -239,6 +235,7 @@ def test_shaft_power_is_the_sum_over_the_generators(n):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("waveform_dt", [None, 5e-5])
 @pytest.mark.parametrize("phase", "abc")
 def test_different_generators_by_blocks_equal_cvodes(waveform_dt, phase):
@@ -319,6 +316,7 @@ def test_different_generators_in_a_file_have_the_same_bits(piece, tmp_path, monk
 # -- what takes part, and what refuses ----------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "how",
     [
@@ -360,16 +358,11 @@ def test_three_in_one_model_load_the_shaft_as_in_the_joint_run():
     assert one.PW.values == pytest.approx(one.P_total.values, rel=1e-6)
 
 
-def test_linear_models_refuse_generators_that_differ_and_know_how_many():
-    at = Apu().steady_state([KW100, KW150])
-    with pytest.raises(OperatingPointError, match="averaged unit needs equal generators"):
-        linearise_joint(Apu(), at)
-    with pytest.raises(ParameterError, match="averaged unit needs equal generators"):
-        linearise_joint(OTHER, OTHER.steady_state(KW100))
+def test_linear_models_know_how_many_generators_there_are():
     # the shaft power of four takes twice as much of the speed as that of two
     gains = []
     for n in (2, 4):
         unit = Apu().change({"generator.count": n})
         model = linearise_joint(unit, unit.steady_state(SeriesLoad.from_power(50e3)))
-        gains.append(model.derivative("PW", "V_ref"))
-    assert gains[1] == pytest.approx(2 * gains[0], rel=1e-6)
+        gains.append(model.derivative("PW", "lam_fd"))
+    assert gains[1] == pytest.approx(2 * gains[0], rel=1e-6) and abs(gains[0]) > 1e5

@@ -21,7 +21,10 @@ from scipy.stats import multivariate_normal
 
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
 from apu_casadi.core.signals import Signal, Signals
+from estimators.batch.immsmoother import imm_smoother
+from estimators.batch.smoother import rts_smoother
 from estimators.filters.belief import Belief
+from estimators.filters.ekf import extended_kalman_filter
 from estimators.filters.imm import interacting_multiple_models, log_normalised, multiple_models
 from estimators.filters.ukf import ukf_step
 from estimators.models.filtermodel import discretise
@@ -341,3 +344,129 @@ def test_a_lost_mode_is_named():
         interacting_multiple_models(
             {"calm": models["calm"], "burst": burst}, PRIOR, _data(9), transition=PI, backend="vm"
         )
+
+
+# ------------------------------------------------------------------------------ smoother
+
+EXACT = dict(rtol=1e-9, atol=1e-10)
+
+
+def smoothed(models, data, T, prior=PRIOR, **how):
+    """Filter, then smooth."""
+    r = interacting_multiple_models(
+        models, prior, data, transition=T, full=True, backend="vm", **how
+    )
+    return r, imm_smoother(r)
+
+
+def smoothed_histories(data, T):
+    """Smoothed probability of the second mode, mean and variance, by each of the 2^K histories."""
+    names, K = list(A), data.size
+    logs, means, variances, paths = [], [], [], np.array([*itertools.product(range(2), repeat=K)])
+    for path in paths:
+        m, P, ll, known = PRIOR.mean, PRIOR.cov, np.log(0.5), []
+        for k, j in enumerate(path):
+            before = m, P
+            m, P, gain = _update(names[j], m, P, data.y[:, k])
+            ll += gain + (np.log(T[j, path[k + 1]]) if k + 1 < K else 0.0)
+            known.append((*before, m, P))
+            m, P = _predict(names[j], m, P, data.dt[k])
+        m, P = known[-1][2:]
+        mean, variance = [m], [P.diagonal()]
+        for k in range(K - 2, -1, -1):
+            m1, P1, *_ = known[k + 1]
+            _, _, mf, Pf = known[k]
+            G = Pf @ A[names[path[k]]].T @ np.linalg.inv(P1)
+            m, P = mf + G @ (m - m1), Pf + G @ (P - P1) @ G.T
+            mean.insert(0, m)
+            variance.insert(0, P.diagonal())
+        logs.append(ll)
+        means.append(np.array(mean).T)
+        variances.append(np.array(variance).T)
+    w = np.exp(np.array(logs) - logsumexp(logs))
+    mean = np.einsum("h,hik->ik", w, means)
+    return w @ paths, mean, np.einsum("h,hik->ik", w, variances + (means - mean) ** 2)
+
+
+@pytest.mark.parametrize("make", [lambda m: m, ukf_step], ids=["ekf", "ukf"])
+def test_one_mode_is_the_plain_smoother(make):
+    """More samples than a block holds, a gap."""
+    data, model = _data(120), _models()["wild"]
+    _, s = smoothed({"only": make(model)}, data, np.eye(1))
+    f = extended_kalman_filter(model, PRIOR, data, full=True, backend="vm")
+    true = rts_smoother(f)
+    assert_allclose(s.mean, true.mean, **EXACT)
+    assert_allclose(s.variance, true.variance, **EXACT)
+    assert_allclose(s.modes[0].cov, true.cov, **EXACT)
+
+
+def test_static_modes_are_the_exact_mixture_of_smoothers():
+    """Whole smoothers weighed by Bayes' rule; a mode's probability is the same at all instants."""
+    data = _data(9)
+    _, s = smoothed(_models(), data, np.eye(2))
+    m = multiple_models(_models(), PRIOR, data, full=True, backend="vm")
+    w = np.exp(m.log_probability)
+    each = [rts_smoother(r) for r in m.results]
+    mean = sum(wi * e.mean for wi, e in zip(w, each, strict=True))
+    assert_allclose(s.probability, np.repeat(w[:, None], 9, axis=1), rtol=1e-8)
+    assert_allclose(s.mean, mean, **EXACT)
+    variance = sum(wi * (e.variance + (e.mean - mean) ** 2) for wi, e in zip(w, each, strict=True))
+    assert_allclose(s.variance, variance, **EXACT)
+
+
+def test_modes_that_differ_in_nothing_are_one_smoother_and_a_chain():
+    """No sample tells them apart: the chain's own probabilities, forwards and backwards."""
+    model, data = _models()["calm"], _data(30)
+    how = {"prior_probability": {"one": 0.9, "other": 0.1}}
+    r, s = smoothed({"one": model, "other": model}, data, PI, **how)
+    f = extended_kalman_filter(model, PRIOR, data, full=True, backend="vm")
+    assert_allclose(s.mean, rts_smoother(f).mean, **EXACT)
+    assert_allclose(s.variance, rts_smoother(f).variance, **EXACT)
+    assert_allclose(s.probability, r.probability, rtol=1e-9)
+
+
+def test_the_smoother_with_switching_is_near_all_histories():
+    """Merging is the only approximation: over six recordings the probability errs by 2 % where the
+    filter's is 12 % off, the mean by a fifth of a standard deviation."""
+    off, filtered, sigmas = [], [], []
+    for seed in range(6):
+        data = _data(5, seed)
+        p, mean, variance = smoothed_histories(data, PI)
+        r, s = smoothed(_models(), data, PI)
+        off.append(np.abs(s.probability[1] - p))
+        filtered.append(np.abs(r.probability[1] - p))
+        sigmas.append(np.abs(s.mean - mean) / np.sqrt(variance))
+    assert np.mean(off) < 0.03 < 0.08 < np.mean(filtered)
+    assert np.mean(sigmas) < 0.2
+
+
+def test_a_mode_with_a_state_of_its_own_is_smoothed():
+    """A third state that one mode has alone, of its own noise only: smoothed by its own mode."""
+    small = _models()["calm"]
+    A3 = np.block([[A["calm"], np.zeros((2, 1))], [np.zeros((1, 2)), np.eye(1)]])
+    none = np.zeros((3, 0))
+    C3 = np.c_[np.eye(2), [0, 0]]
+    big = linear(A3, none, none, C3, np.zeros((2, 0)), [*small.walk, 0.0], name="big")
+    priors = {
+        "small": PRIOR,
+        "big": Belief.of(big.x, {"x0": 0, "x1": 0, "x2": 3.0}, {"x0": 1, "x1": 1, "x2": 0.5}),
+    }
+    data = _data(20)
+    _, s = smoothed({"small": small, "big": big}, data, PI, prior=priors)
+    f = extended_kalman_filter(small, PRIOR, data, full=True, backend="vm")
+    true = rts_smoother(f)
+    assert_allclose(s.mean, true.mean, **EXACT)
+    assert_allclose(s.variance, true.variance, **EXACT)
+    assert_allclose(s.mode_mean[1][2], 3.0, rtol=1e-12)
+    assert_allclose(s.modes[1].cov[:, 2, 2], 0.25, rtol=1e-12)
+
+
+def test_what_smoothing_lacks_is_told():
+    r = interacting_multiple_models(_models(), PRIOR, _data(5), transition=PI, backend="vm")
+    with pytest.raises(EstimationError, match="full=True"):
+        imm_smoother(r)
+    wide = Belief(PRIOR.x, np.zeros(2), 1e18 * np.array([[1.0, 1 - 1e-13], [1 - 1e-13, 1.0]]))
+    silent = _data(2)
+    silent.y[:, 0] = np.nan
+    with pytest.raises(EstimationError, match=r"mode 'calm' at t = .*no digits left"):
+        smoothed(_models(), silent, PI, prior=wide)

@@ -195,12 +195,14 @@ def check(answer, folder, signum=signal.SIGINT):
     assert not [p for p in Path(folder).rglob("*") if p.name.endswith(".part")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "after"), [("run", 0.5), ("deck", 3.0), ("fit", 2.0)])
 def test_ctrl_c_ends_a_command_with_one_line(tmp_path, name, after):
     """During imports, in compiled code on threads, and while a fit builds or solves its problem."""
     check(interrupted(COMMANDS[name], after, tmp_path), tmp_path)
 
 
+@pytest.mark.long
 def test_sigterm_and_a_second_ctrl_c(tmp_path):
     """kill is answered as Ctrl-C is, with 143; impatience changes nothing."""
     check(

@@ -209,6 +209,7 @@ def _quiet(protocol):
     return dataclasses.replace(protocol, noise=1e-9, baseline=1e-9)
 
 
+@pytest.mark.long
 def test_truth_ends_at_the_trim(gg):
     """Two routes to the faulty unit's steady state: simulated, and trimmed with its health.  The
     load wanders by half a per cent in a second, so the ends agree to that."""
@@ -238,6 +239,7 @@ def test_a_window_is_its_seed(gg):
     assert again.sizes == both.sizes
 
 
+@pytest.mark.long
 def test_one_filter_tells_a_clear_fault(gg):
     """An eighth of the noise: the class, its onset and healthy consistency, by the ratio alone."""
     p = dataclasses.replace(SHORT, noise=0.125)

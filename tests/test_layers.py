@@ -26,10 +26,10 @@ INFORMATION = (*FILTERS, "estimators.information")
 GENERIC = (*INFORMATION, "estimators.batch", "estimators.detection")
 ESTIMATORS = (*UNIT, *GENERIC, "estimators.apu")
 SHELL = (*CORE, "scenarios", "scenarios.shell")
-READING = (*ESTIMATORS, "scenarios.extensions", "scenarios.reading")
+READING = (*ESTIMATORS, "scenarios.extensions", "scenarios.reading", "scenarios.units")
 SCENARIO = (*READING, *SHELL, "scenarios.figures", "scenarios.phases", "scenarios.schema",
-            "scenarios.fileschema", "scenarios.registry", "scenarios.campaign_records",
-            "scenarios.campaigns")  # fmt: skip
+            "scenarios.fileschema", "scenarios.doubts", "scenarios.registry",
+            "scenarios.campaign_records", "scenarios.campaigns")  # fmt: skip
 STUDIES = (*SCENARIO, "scenarios.validation", "scenarios.studies")
 PAGES = (*STUDIES, "scenarios.bench", "scenarios.pages")
 
@@ -53,9 +53,11 @@ BELOW: dict[str, tuple[str, ...]] = {
     "scenarios.figures": UNIT,
     "scenarios.extensions": CORE,
     "scenarios.reading": (*ESTIMATORS, "scenarios.extensions"),
+    "scenarios.units": (*ESTIMATORS, "scenarios.extensions", "scenarios.reading"),
     "scenarios.phases": READING,
     "scenarios.schema": (*READING, "scenarios.phases"),
     "scenarios.fileschema": (*READING, "scenarios.phases", "scenarios.schema"),
+    "scenarios.doubts": (*READING, "scenarios.phases", "scenarios.schema"),
     "scenarios.registry": SCENARIO,
     "scenarios.campaign_records": SCENARIO,
     "scenarios.campaigns": SCENARIO,
@@ -63,8 +65,9 @@ BELOW: dict[str, tuple[str, ...]] = {
     "scenarios.studies": STUDIES,
     "scenarios.bench": STUDIES,
     "scenarios.pages": STUDIES,
+    "scenarios.datasets": SCENARIO,
     "scenarios.export": (*ESTIMATORS, *SHELL),
-    "scenarios.commands": (*PAGES, "apu_casadi", "scenarios.export"),
+    "scenarios.commands": (*PAGES, "apu_casadi", "scenarios.export", "scenarios.datasets"),
     "scenarios.cli": (*SHELL, "scenarios.commands"),
 }
 # who may import a package of others' code; all others may not
@@ -103,9 +106,8 @@ def imports(path: Path) -> list[tuple[int, str]]:
         elif isinstance(node, ast.ImportFrom):
             module = "." * node.level + (node.module or "")
             for a in node.names:
-                inner = ROOT.joinpath(*module.split("."), a.name)
-                is_module = inner.with_suffix(".py").exists() or (inner / "__init__.py").exists()
-                found.append((node.lineno, f"{module}.{a.name}" if is_module else module))
+                inner = f"{module}.{a.name}"
+                found.append((node.lineno, inner if inner in modules() else module))
     return sorted(set(found))
 
 

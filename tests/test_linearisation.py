@@ -164,6 +164,7 @@ def test_steady_point_is_steady(joint, point):
         assert y[name] == pytest.approx(point.generator.y[name], rel=1e-9), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("what", "kind", "size", "end", "outputs"),
     [
@@ -302,6 +303,7 @@ def test_averaging_is_exact_without_a_fault(apu):
                 assert rates[n] == pytest.approx(v, abs=1e-9 * np.abs(there).max()), (ss.name, n)
 
 
+@pytest.mark.long
 def test_column_of_h_is_the_period_mean_of_the_faulty_generator(apu):
     """A small TTSC in abc: means over 400 Hz periods follow the column of h, the 800 Hz part not.
 

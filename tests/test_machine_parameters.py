@@ -34,6 +34,7 @@ def somewhere(ss: StateSpace, load, gen) -> tuple[np.ndarray, np.ndarray]:
     return x, u
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gen", "load", "fault"),
     [

@@ -34,6 +34,7 @@ def sample(t: MapTable, count: int) -> list[tuple[int, int]]:
     return [divmod(int(c), m) for c in some] + [(0, 0), (0, m - 1), (n - 1, 0), (n - 1, m - 1)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(MAPS))
 @pytest.mark.parametrize("column", COLUMNS)
 @pytest.mark.parametrize("factor", [1e300, 10.0, 2.0, 0.5])
@@ -49,6 +50,7 @@ def test_every_wrong_cell_is_found_and_named(name, column, factor):
             assert worst.expected == pytest.approx(a[i, j] / factor, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(MAPS))
 @pytest.mark.parametrize("factor", [1.2, 0.8])
 def test_a_fifth_is_found_away_from_the_edges(name, factor):

@@ -81,6 +81,7 @@ def test_published_surge_line_passes_over_the_design_flow(gg):
         published_surge_line(gg.maps[1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("draw", [plot_compressor_map, plot_turbine_map])
 def test_maps_carry_axes_units_labels_and_captions(gg, lines, run, draw):
     fig = draw(gg, lines=lines, trajectory=run)
@@ -141,6 +142,7 @@ def test_eigenvalue_plot_shows_every_mode():
         plot_eigenvalues({})
 
 
+@pytest.mark.long
 def test_commands_write_their_figures(tmp_path, capsys):
     """`apu maps` and `apu linearise` print what they wrote, and the table of eigenvalues."""
     assert main(["maps", "--no-lines", "--out", str(tmp_path)]) == 0

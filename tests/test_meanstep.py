@@ -35,6 +35,7 @@ def start(gen, load, fault, ss=None):
     return ss or plain, u, theta, x
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gen", "load", "fault"),
     [

@@ -12,6 +12,7 @@ import pytest
 from apu_casadi.core.errors import ScenarioError
 from apu_casadi.core.simulation import stepper
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
@@ -137,6 +138,47 @@ def test_the_scheme_converges_to_the_one_model(truth):
     """Step 2.5 ms, corrected: speed within 2e-4 of its excursion, mean power within 2e-6."""
     N, P = errors(joint("corrected", 0.0025), truth)
     assert N < 2e-4 and P < 2e-6, f"speed {N:.1e}, power {P:.1e}"
+
+
+def test_two_different_machines_rest_where_their_steady_states_are():
+    """Nothing moves; each machine has its own power, and the shaft their sum."""
+    unit = APU.change({"generator2.machine.r_s": 0.006, "generator2.coupling.gear": 3.05})
+    loads = [KW100, ConstantPowerLoad(80e3)]
+    ds, at = simulate_monolithic(unit, duration=0.02, load=loads), unit.steady_state(loads)
+    assert abs(np.ptp(ds.N.values)) < 1e-5
+    for k in (1, 2):
+        assert ds.P_e.values[k - 1] == pytest.approx(at.of(k).y["P_e"], rel=1e-7)
+        assert ds.V_1_angle.values[k - 1, 1] == pytest.approx(ds.V_1_angle.values[k - 1, 0])
+    assert ds.P_total.values == pytest.approx(ds.P_e.values.sum(0) / 0.9, rel=1e-9)
+    assert ds.PW.values[1] == pytest.approx(at.gas["PW"], rel=1e-6)
+
+
+@pytest.mark.ci  # IDAS in the virtual machine
+def test_two_different_machines_are_what_the_exchange_converges_to():
+    """Own parameters, gear, kind of load and fault of each; order two of the speed."""
+    unit = APU.change({"generator2.machine.r_s": 0.006, "generator2.coupling.gear": 3.05})
+    how = dict(duration=0.12, load=[KW100, SeriesLoad.from_power(80e3, 0.85)])
+    how["events"] = [
+        FaultChange(0.04, Ttsc(0.05, 20.0), generator=2),
+        LoadChange(0.06, KW225, generator=1),
+    ]
+    one = simulate_monolithic(unit, **how)
+    off = {}
+    for dt in (0.02, 0.005):
+        ds = simulate_joint(unit, dt=dt, exchange="corrected", waveform_dt=None, **how)
+        N = ds.N.values[:: round(0.02 / dt)]
+        off[dt] = np.abs(N - one.N.values).max() / np.abs(one.N - one.N[0]).values.max()
+    assert off[0.005] < 4e-4 and off[0.005] < off[0.02] / 6, off
+    assert one.P_e.dims == ("generator", "time") and one.generator.values.tolist() == [1, 2]
+    assert one.P_loss_fault.values[0].max() == 0.0 < one.P_loss_fault.values[1, -1]
+
+
+def test_equal_machines_given_one_by_one_are_one():
+    """A list of two equal loads, a fault of both: the bits of the run of one group."""
+    how = dict(duration=0.04, events=[FaultChange(0.02, Ttsc(0.05, 20.0))])
+    a = simulate_monolithic(APU, load=KW100, **how)
+    b = simulate_monolithic(APU, load=[KW100, KW100], **how)
+    assert a.drop_attrs().identical(b.drop_attrs()) and "generator" not in a.dims
 
 
 @pytest.mark.parametrize("exchange", EXCHANGES)

@@ -172,6 +172,7 @@ def test_exact_propagation_leaves_to_cvodes_what_is_not_linear():
     assert status["nsteps_generator"] > 0
 
 
+@pytest.mark.long
 def test_noise_is_reproducible_and_has_the_spread_asked_for():
     """Same seed, same run; measured copies scatter around the truth with the given sigma."""
     noise = Noise(N=1.0, w1=0.5, w2=0.1, gas={"T3": 2.0}, terminal=MeasurementNoise(1.0, 2.0, 0.5))
@@ -256,6 +257,7 @@ def test_noise_refuses_unknown_signals_and_negative_spread():
         Noise(N=-1.0)
 
 
+@pytest.mark.long
 def test_a_staircase_of_small_changes_is_fast_by_default():
     """120 health changes in 61 s, every half second: each step is propagated, none integrated."""
     events = [HealthChange(0.5 * (k + 1), {"f_eta_c": 1 - 1e-4 * k}) for k in range(120)]

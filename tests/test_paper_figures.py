@@ -66,6 +66,7 @@ def test_unknown_choices_are_refused_with_the_nearest():
         paper_figures.machine_transient("helthy")
 
 
+@pytest.mark.long
 def test_figures_15_to_19_are_written(tmp_path):
     """PNG, 1600 px wide, in the paper's order."""
     made = paper_figures.write_figures(tmp_path, joint=False)

@@ -43,6 +43,7 @@ DAILY = ("with leakage", "unbalanced", "constant power")
 LONG = [n if n in DAILY else pytest.param(n, marks=pytest.mark.slow) for n in CASES]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LONG)
 def test_the_last_turn_of_a_long_run(name):
     """CVODES from the balanced, healthy state, after a whole number of turns.

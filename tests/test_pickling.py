@@ -92,6 +92,7 @@ def elsewhere(monkeypatch):
     return forget
 
 
+@pytest.mark.long
 def test_a_used_unit_is_pickled_as_its_parameters(used, elsewhere):
     """Some kilobytes; elsewhere everything is made again and gives the same bits."""
     text = pickle.dumps(used)
@@ -239,6 +240,7 @@ def test_a_result_that_is_what_it_was_made_from_is_no_circle(models):
 # ------------------------------------------------------------------------------ processes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method",
     [
@@ -260,6 +262,7 @@ def test_processes_that_get_a_used_unit_give_the_same_bits(used, method):
         assert list(pool.map(run, [used, used], range(2))) == want
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backend_name", ["loky", "threading"])
 def test_joblib(used, backend_name):
     """Two workers of either kind."""

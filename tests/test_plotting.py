@@ -24,6 +24,7 @@ def texts(fig):
     return [t.get_text().replace("\n", " ") for t in found]
 
 
+@pytest.mark.long
 def test_files_are_1600_pixels_wide(ds, tmp_path):
     made = plotting.save_figures(ds, tmp_path)
     assert [p.stem for p in made] == list(plotting.FIGURES)
@@ -33,6 +34,7 @@ def test_files_are_1600_pixels_wide(ds, tmp_path):
         assert struct.unpack(">I", head[16:20])[0] == 1600
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", plotting.FIGURES)
 def test_phases_units_and_caption_are_on_every_figure(ds, key):
     fig = plotting.DRAW[key](ds)
@@ -46,6 +48,7 @@ def test_phases_units_and_caption_are_on_every_figure(ds, key):
         assert "[" in fig.axes[0].get_ylabel()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", plotting.FIGURES)
 def test_phase_names_do_not_overlap_or_leave_the_figure(ds, key):
     ds = ds.copy()
@@ -99,6 +102,7 @@ def test_without_waveforms_the_rms_values_are_drawn():
     assert fig.axes[0].get_ylabel() == "Current [A], rms"
 
 
+@pytest.mark.long
 def test_single_phase_and_constant_values_draw(tmp_path):
     quiet = synthetic_joint(end=0.5)
     quiet["N"][:] = 3775.1

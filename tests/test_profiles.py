@@ -119,6 +119,9 @@ def test_a_file_gives_a_column(tmp_path):
         ("time,altitude\n0,1\n1,x\n", "row 3, column 'altitude': a number is expected, got 'x'"),
         ("time,altitude\n0,1\n1,nan\n", "row 3, column 'altitude': must be finite, got 'nan'"),
         ("time,altitude\n\n0,1\n1\n", "row 4: 1 cells, the header has 2 columns"),
+        ('time,altitude\n0,"' + 200_000 * "1", "row 2: no cells with commas between: field larger"),
+        ("time,altitude\n-5,1\n0,2\n", "row 2, column 'time': -5 s is before the profile begins"),
+        ("time,altitude\n0,1\n1,2\n1,3\n1,4\n", "row 5, column 'time': 1 s stands there three"),
         ("time,altitude\n1,1\n0,2\n", "row 3, column 'time': 0 s is before 1 s in the row before"),
     ],
 )
@@ -143,6 +146,8 @@ def test_wrong_files_are_refused_with_row_and_column(tmp_path, text, message):
         ({"on": 1, "off": 0, "frequency": 5, "duty": 1}, "duty: must lie in [0.001, 0.999], got 1"),
         ({"on": 1, "off": 0, "frequency": 0}, "frequency: must lie in (0, 1000] Hz, got 0"),
         ({"times": [0, 1], "values": [1]}, "values: 1 for 2 times; one for each is expected"),
+        ({"times": [-1, 0], "values": [1, 2]}, "times[1]: -1 s is before the profile begins"),
+        ({"times": [1, 1, 1], "values": [1, 2, 3]}, "times[3]: 1 s stands there three times"),
         ({"times": [1, 0], "values": [1, 2]}, "times[2]: 0 s is before 1 s; times go on"),
         ({"times": 1, "values": [1]}, "times: a list of numbers is expected, got 1"),
         ({"times": [0, "a"], "values": [1, 2]}, "times[2]: a number is expected, got 'a'"),

@@ -27,6 +27,7 @@ OUTPUTS = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "V_fd", "T_e", "P_total")
 QUAD = ("P_total", "P_e", "v_a^2", "i_b^2")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gen", "load", "fault"),
     [

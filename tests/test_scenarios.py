@@ -6,13 +6,13 @@ import types
 
 import pytest
 
-from apu_casadi.core.errors import ApuError, ParameterError, ScenarioError
+from apu_casadi.core.errors import ApuError, ApuWarning, ParameterError, ScenarioError
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
-from scenarios import registry
+from scenarios import registry, units
 from scenarios.reading import read_fault, read_load
 from scenarios.schema import Change, Phase, Scenario
 
@@ -151,6 +151,20 @@ health = "none"
         ("duration = 4.0", "duration = 4.0\nambient = 5", "ambient: a table is expected, got 5"),
         ('"mine"', '"../mine"', "name: only letters, digits"),
         ("[[phase]]", "[[phase]", "not valid TOML:"),
+        ("duration = 4.0", "duration = { from = 1.0 }", "duration: a number that does not change"),
+        ("duration = 4.0", 'duration = 4.0\nengine = "tpe33"', "engine: engine 'tpe33': no such "),
+        ("duration = 4.0", 'duration = 4.0\nengine = "tpe33"', "(did you mean 'tpe331'?)"),
+        ("{ mu", '{ generator = 2, kind = "none", mu', "phase[2].fault.mu: a generator without fa"),
+        (
+            "fault = { mu = 0.05, k_rf = 20.0 }",
+            'fault = { kind = "none" }',
+            "phase[2].fault.kind: h",
+        ),
+        (
+            "{ mu",
+            "{ generator = 3, mu",
+            "phase[2].fault: generator 3, but the unit has 1 to 2 (pha",
+        ),
     ],
 )
 def test_a_wrong_description_is_refused_with_file_place_and_nearest_name(old, new, message):
@@ -181,12 +195,113 @@ def test_noise_is_a_table_of_standard_deviations():
         GOOD + "[noise]\nterminal = { sigma_V = 0.5 }"
     )
     assert "noise.gas.T3: must be >= 0, got -1" in refusal(GOOD + "[noise]\ngas = { T3 = -1 }")
+    assert "noise.gas.T33: unknown key (did you mean 'T3" in refusal(
+        GOOD + "[noise]\ngas = { T33 = 1 }"
+    )
 
 
 def test_parameters_may_be_dotted_or_nested():
     for text in ("machine.r_s = 0.01", '"machine.r_s" = 0.01'):
         s = read(GOOD + "[parameters]\n" + text)
         assert dict(s.parameters) == {"machine.r_s": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            "machine.r_z = 1",
+            "machine.r_z: unknown parameter 'machine.r_z' (did you mean 'machine.r_s",
+        ),
+        ("machine.r_s = -1", "machine.r_s: MachineParameters.r_s [ohm] = -1 is outside [0, inf]"),
+        (
+            "machine.r_s = { from = 1, to = 2, over = 3 }",
+            "machine.r_s: a number that does not chan",
+        ),
+        (
+            '"machine.r_s" = "x"',
+            "machine.r_s: MachineParameters.r_s [ohm] must be a number, got 'x'",
+        ),
+        ("generator.count = 7", "generator.count: generator.count = 7 is not one of 1 to 4"),
+        ('governor.kind = "PX"', "governor.kind: unknown governor 'PX'"),
+        (
+            'generator2.neutral = "loose"',
+            "generator2.neutral: neutral 'loose' (valid: grounded, is",
+        ),
+        ("generator5.machine.r_s = 1", "generator5.machine.r_s: the unit has generators 1 to 2"),
+        (
+            "machine.r_s = 0.005\ngovernor.Wf_min = 0.5",
+            "governor.Wf_min: GovernorParameters: Wf_min",
+        ),
+    ],
+)
+def test_parameters_are_checked_where_they_are_read(given, message):
+    """With the file and their place, as everything else; not when the scenario runs."""
+    assert refusal(f"{GOOD}[parameters]\n{given}").startswith(f"mine.toml: parameters.{message}")
+
+
+def test_parameters_of_another_unit_are_checked_in_it(tmp_path):
+    """A count of the engine's own, and a wrong number in its file, told with both files."""
+    path = tmp_path / "one.toml"
+    path.write_text("[generator]\ncount = 1\n")
+    text = GOOD.replace("duration", f"engine = '{path}'\nduration", 1)
+    assert read(text).engine == str(path)
+    second = text.replace("{ mu", "{ generator = 2, mu")
+    assert "phase[2].fault: generator 2, but the unit has 1 to 1" in refusal(second)
+    path.write_text("[generator.machine]\nr_z = 1\n")
+    told = refusal(text)
+    assert told.startswith(f"mine.toml: engine: {path}, [generator.machine]: unknown 'r_z' (did")
+
+
+IMPLAUSIBLE = [
+    (
+        "N_ref_rpm = 3775",
+        "phase[2].N_ref_rpm: N_ref_rpm = 3775 r/min is outside 14420 to 39655 r/min",
+    ),
+    ("N_ref_rpm = 3775", "Was rad/s meant? 3775 rad/s are 36049 r/min"),
+    (
+        "health = { f_eta_c = { from = 1.0, to = 0.7, over = 1.0 } }",
+        "health.f_eta_c: f_eta_c = 0.7",
+    ),
+    (
+        "health = { f_eta_c = { from = 1, to = 0.97, over = 1, after = 60 } }",
+        "nothing of it happens",
+    ),
+    (
+        'load = { kind = "R", power_kW = 0.225 }',
+        "load.power_kW: power_kW = 0.225 kW is outside 0.45",
+    ),
+    ('load = [{kind="open"}, {kind="R", power_kW=500}]', "load[2].power_kW: power_kW = 500 kW"),
+    ('load = { kind = "series", R_ohm = 0.7, L_mH = 200 }', "load: apparent power = 0.31"),
+    (
+        "fault = { mu = 0.05, k_rf = 2e9 }",
+        "fault.k_rf: the severity h = mu/(k_rf + 1 - mu) is 2.5e-11",
+    ),
+    ("[noise]\nN = 3000", "noise.N: N = 3000 rad/s is outside 0 to 755"),
+    ("[noise]\ngas = { T3 = 300 }", "noise.gas.T3: gas.T3 = 300 K is outside 0 to 113.6"),
+    ("[noise]\nterminal = { sigma_v = 400 }", "noise.terminal.sigma_v: terminal.sigma_v = 400 V"),
+    (
+        "[parameters]\nmachine.r_s = 4.4",
+        "parameters.machine.r_s: r_s = 4.4 ohm is outside 0.0001 to",
+    ),
+    ("[parameters]\nmachine.r_s = 0.2", "parameters.machine.r_s: 0.2 is 45.5 times the unit's own"),
+    ("[parameters]\ncoupling.gear = 1.5", "2 pole pairs give 801.1 Hz, the rated frequency is 400"),
+    ("[parameters]\ngenerator2.machine.n_pp = 2.5", "n_pp = 2.5: pole pairs are a whole number"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), IMPLAUSIBLE)
+def test_what_is_possible_and_most_often_a_slip_is_told(tmp_path, given, message):
+    path = tmp_path / "slip.toml"
+    path.write_text(GOOD.replace("fault = { mu = 0.05, k_rf = 20.0 }", "") + given)
+    with pytest.warns(ApuWarning) as told:
+        s = registry.get(path)
+    assert any(str(w.message).startswith(f"{path}: ") and message in str(w.message) for w in told)
+    assert registry.implausible(s) == [str(w.message).removeprefix(f"{path}: ") for w in told]
+
+
+def test_nothing_in_the_library_is_implausible():
+    assert [registry.implausible(s) for s in registry.list_scenarios()] == [[]] * 12
 
 
 def test_unknown_name_and_missing_file():
@@ -265,6 +380,8 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     seen = {}
 
     class Unit:
+        machines = (None, None)
+
         def change(self, values):
             seen["parameters"] = values
             return self
@@ -278,9 +395,10 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     multirate.simulate_joint = simulate_joint
     monkeypatch.setitem(sys.modules, "apu_casadi.unit.multirate", multirate)
     # units are kept between runs: this stand-in must not stay
-    monkeypatch.setattr(registry, "unit_of", registry.unit_of.__wrapped__)
+    monkeypatch.setattr(units, "unit_of", units.unit_of.__wrapped__)
     engine = types.SimpleNamespace(unit=Unit(), assumed=())
-    monkeypatch.setattr(registry, "engine_file", lambda name: engine)
+    monkeypatch.setattr(units, "engine_file", lambda name: engine)
+    monkeypatch.setattr(registry, "implausible", lambda s: [])
     ds = registry.run(
         "joint",
         waveform_dt=None,

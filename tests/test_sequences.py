@@ -54,6 +54,7 @@ def test_by_hand():
     assert np.isnan(as_dict(SEQUENCES, none)["V_2_over_V_1"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("load", "fault"), [(UNEVEN, None), (KW100, Ttsc(0.05, 20.0, phase="b"))], ids=["load", "fault"]
 )

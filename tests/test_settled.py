@@ -20,8 +20,9 @@ from apu_casadi.machine.loads.openphase import OpenPhase
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.machinedata import MachineParameters, SaturatedMachine
 from apu_casadi.unit.apu import Apu, trim
+from apu_casadi.unit.averaged import generator_vectors
 from apu_casadi.unit.events import Ambient, FaultChange, LoadChange
-from apu_casadi.unit.linearisation import linearise_generator, linearise_joint
+from apu_casadi.unit.linearisation import linearise_joint
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios import registry
 from scenarios.cli import main
@@ -40,6 +41,7 @@ def run(apu=APU, **how):
     return simulate_joint(apu, **{"duration": 0.6, "waveform_dt": None, **how})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["auto", "cvodes"])
 @pytest.mark.parametrize(
     ("load", "fault"), [(UNEVEN, None), (KW100, FAULT), (UNEVEN, {2: FAULT})],
@@ -56,6 +58,7 @@ def test_nothing_moves_after_a_settled_start(load, fault, solver):
     assert json.loads(ds.attrs["warnings"]) == []
 
 
+@pytest.mark.long
 def test_it_is_where_a_run_from_the_balanced_start_ends():
     """After 6 s; the governor is the slowest."""
     late = run(duration=6.0, load=UNEVEN, fault=FAULT)
@@ -247,9 +250,9 @@ def test_refusal_tells_why():
 
 
 def test_what_needs_a_balanced_or_another_machine_says_so():
-    """Linear models of a faulty point; the joint estimation with another power or saturation."""
+    """The averaged model of a faulty point; the joint estimation with another power, saturation."""
     with pytest.raises(SignalError, match=r"without a fault"):
-        linearise_generator(APU.generator, APU.generator.steady_state(KW100, FAULT))
+        generator_vectors(APU.generator, APU.generator.steady_state(KW100, FAULT))
     saturated = APU.change({"machine.S_10": 0.1, "machine.S_12": 0.4})
     for unit in (saturated, TORQUE):
         model = linearise_joint(unit, unit.steady_state(KW100))

@@ -21,8 +21,8 @@ from estimation_models import (
 )
 from numpy.testing import assert_allclose
 
-from apu_casadi.core.errors import EstimationError
-from estimators.batch.smoother import rts_smoother
+from apu_casadi.core.errors import EstimationError, ParameterError
+from estimators.batch.smoother import fixed_lag_smoother, rts_smoother
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
 from estimators.filters.ukf import unscented_kalman_filter
@@ -148,3 +148,62 @@ def test_a_filter_that_kept_too_little_is_refused():
     r = extended_kalman_filter(model, random_belief(1, model), gappy(1, model, 5), backend="vm")
     with pytest.raises(EstimationError, match="full=True"):
         rts_smoother(r)
+
+
+# ------------------------------------------------------------------------------ fixed lag
+
+
+@every_filter
+def test_fixed_lag_is_the_batch_fit_of_what_has_come_so_far(name):
+    """Each instant against least squares of the samples up to three later ones; the lag of the
+    whole recording is the fixed-interval smoother."""
+    model, parts = random_linear(2)
+    prior, data = random_belief(2, model), gappy(2, model, 14)
+    f = FILTERS[name](model, prior, data, full=True, backend="vm")
+    s = fixed_lag_smoother(f, 3)
+    for k in range(data.size):
+        mean, cov = batch_by_hand(parts, model.walk, prior, data.part(0, min(k + 4, data.size)))
+        assert_allclose(s.mean[:, k], mean[:, k], rtol=1e-10, atol=1e-10)
+        assert_allclose(s.cov[k], cov[k], rtol=1e-10, atol=1e-10)
+    assert_allclose(fixed_lag_smoother(f, 99).mean, rts_smoother(f).mean, rtol=1e-12)
+    assert (fixed_lag_smoother(f, 0).cov == f.cov).all()
+
+
+def test_a_lag_in_seconds_counts_instants_by_their_stamps():
+    """Irregular instants: as many later ones as lie within the delay."""
+    model, _ = random_linear(3)
+    prior, data = random_belief(3, model), gappy(3, model, 20)
+    f = extended_kalman_filter(model, prior, data, full=True, backend="vm")
+    delay = 0.7
+    s = fixed_lag_smoother(f, delay=delay)
+    for k in range(data.size):
+        until = int((data.t <= data.t[k] + delay).sum())
+        cut = extended_kalman_filter(model, prior, data.part(0, until), full=True, backend="vm")
+        assert_allclose(s.mean[:, k], rts_smoother(cut).mean[:, k], rtol=1e-10, atol=1e-12)
+
+
+def test_fixed_lag_with_a_prior_that_is_far_too_wide():
+    """Digits run out: in square-root form it is the smoother of what has come so far again."""
+    model, _ = random_linear(1)
+    prior, data = Belief(model.x, np.zeros(3), 1e18 * np.eye(3)), gappy(1, model, 12, missing=0.0)
+    f = extended_kalman_filter(model, prior, data, full=True, backend="vm")
+    s = fixed_lag_smoother(f, 2)
+    for k in (0, 1, 5, 11):
+        part = data.part(0, min(k + 3, data.size))
+        cut = rts_smoother(extended_kalman_filter(model, prior, part, full=True, backend="vm"))
+        assert_allclose(s.mean[:, k], cut.mean[:, k], rtol=1e-7, atol=1e-9)
+        assert_allclose(s.variance[:, k], cut.variance[:, k], rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [({}, "either lag"), ({"lag": 1, "delay": 1.0}, "either lag"), ({"lag": -1}, ">= 0, got -1"),
+     ({"lag": 2.0}, "whole number"), ({"delay": -0.1}, "finite and >= 0 s")],
+)  # fmt: skip
+def test_impossible_lags_are_refused(how, words):
+    model = cv_model()
+    f = extended_kalman_filter(
+        model, random_belief(1, model), gappy(1, model, 5), full=True, backend="vm"
+    )
+    with pytest.raises(ParameterError, match=words):
+        fixed_lag_smoother(f, **how)

@@ -38,6 +38,7 @@ def compare(scenario, solver):
     return {n: float(np.abs(b[n] / a[n] - 1).max()) for n in SHOWN}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_idas_runs_every_scenario_as_cvodes_does(name):
     """Every switch of the library in short: 1.5e-5, speed, power and temperature 1e-6.
@@ -102,6 +103,7 @@ def open_phase(gen, load, fault, solver):
     return math.sqrt(np.mean(v**2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["cvodes", "idas"])
 @pytest.mark.parametrize("neutral", ["grounded", "isolated"])
 @pytest.mark.parametrize(

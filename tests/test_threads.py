@@ -67,6 +67,7 @@ def run(apu, k, **options):
     return simulate_joint(apu, duration=0.24, load=source, events=events, **options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options",
     [
@@ -101,6 +102,7 @@ def test_the_virtual_machine_in_four_threads_gives_the_serial_bits():
         backend.use_backend(None)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(backend.find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize(("duration", "waveform_dt"), [(0.5, 1e-3), (0.24, None)])
 def test_a_compiled_run_is_that_of_the_virtual_machine(duration, waveform_dt):

@@ -99,3 +99,60 @@ def test_compile_without_a_compiler_says_so(capsys, monkeypatch, tmp_path):
     assert status == 2 and "did you mean 'trim'?" in err
     status, text, _ = out(capsys, "compile", "--clear")
     assert status == 0 and text.startswith("0 libraries")
+
+
+MIXED = ("--load", "100e3", "--load", 'kind = "RL", power_kW = 80, power_factor = 0.85')
+OF_2 = ("--fault", "generator = 2, mu = 0.05, k_rf = 20")
+
+
+def test_each_generator_has_its_load_and_its_fault(capsys):
+    """Given twice, loads are those of generators 1 and 2, as in a scenario's list."""
+    both = ("--fault", "generator = 1, mu = 0.05, k_rf = 200")
+    status, text, _ = out(capsys, "trim", *MIXED, *OF_2, *both, "--json")
+    report = json.loads(text)
+    assert status == 0 and [f["generator"] for f in report["fault"]] == [2, 1]
+    first, second = report["generators"]
+    assert first["P_e"] > 95e3 > 81e3 > second["P_e"] and len(report["load"]) == 2
+    assert second["P_loss_fault"] > 8 * first["P_loss_fault"] > 0
+    status, text, _ = out(capsys, "trim", *MIXED)
+    assert "generator 2: 80 kW, power factor 0.85" in text
+
+
+def test_linear_models_take_loads_and_faults_by_generator(capsys, tmp_path):
+    saved = tmp_path / "model.nc"
+    how = ("linearise", "--no-figures", "--json")
+    status, text, _ = out(capsys, *how, *MIXED, "--save", str(saved))
+    report = json.loads(text)
+    assert status == 0 and "generator2.L" in report["names"]["u"] and saved.exists()
+    status, text, _ = out(capsys, *how, "--power", "100", *OF_2)
+    report = json.loads(text)
+    assert report["names"]["theta"][-3:] == [
+        f"generator2.{n}" for n in ("mu", "k_rf", "phase_angle")
+    ]
+    assert max(e["real"] for e in report["eigenvalues"]) < 0
+    one = ("--model", "generator", "--generator", "2")
+    status, text, _ = out(capsys, *how, *one, *MIXED)
+    assert "L" in json.loads(text)["names"]["u"]
+    status, text, _ = out(capsys, *how, "--power", "100", "--apart")
+    assert {"generator1.V_ref", "generator2.V_ref"} <= set(json.loads(text)["names"]["u"])
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (("trim", *MIXED, "--load", "1e5"), "2 entries expected, one a generator, got 3"),
+        (("trim", *MIXED, "--voltage", "230"), "one generator is solved alone"),
+        (("trim", "--load", "1e5", *OF_2, *OF_2), "two faults of generator 2"),
+        (("linearise", "--generator", "2"), "--generator is that of --model generator"),
+        (("linearise", "--model", "generator", "--generator", "3"), "has generators 1 to 2"),
+        (("linearise", "--model", "gas", "--apart"), "--apart is about the generators"),
+        (("linearise", "--power", "90", "--load", "1e5"), "not both"),
+        (
+            ("linearise", "--load", 'kind = "R", power_kW = { from = 100, to = 150, over = 9.0 }'),
+            "give what it is then, 100 kW at t = 0 s, 150 kW at t = 9 s",
+        ),
+    ],
+)
+def test_wrong_loads_and_faults_of_generators_are_told(capsys, argv, words):
+    status, _, err = out(capsys, *argv)
+    assert status == 2 and words in err

@@ -51,6 +51,7 @@ def reference(gg):
 FIXABLE = ("N", "PW", "Wf", "T3", "P3", "T4", "T41", "T5", "SM", "W2", "SFC", "PR_t")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "pair", [p for p in itertools.combinations(FIXABLE, 2) if p[0] in ("N", "PW", "Wf", "T5")]
 )
@@ -250,6 +251,7 @@ def test_batch_in_chunks_equals_batch_at_once(gg, monkeypatch, envelope):
         _ = again["T5"]
 
 
+@pytest.mark.long
 @needs_compiler
 def test_c_equals_vm(gg, envelope):
     """The generated C and CasADi's virtual machine: the same points to rounding."""
@@ -406,6 +408,7 @@ def test_the_second_point_counts_where_the_first_is_beyond_a_limit(gg):
     assert only["N"] == pytest.approx(hot.second["N"], rel=1e-9) and only.second is None
 
 
+@pytest.mark.long
 def test_multiple_starts_give_one_point_or_the_answer_tells_of_two(gg):
     """100 points for each pair from six starts around the root, over health, ambient and speed.
 

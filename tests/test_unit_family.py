@@ -73,6 +73,7 @@ def test_derivatives_of_the_averaged_generator_by_every_parameter_are_exact(kind
         assert (np.abs(off) <= 1e-6 * np.abs(J[:, k]).max() + rounding).all(), name
 
 
+@pytest.mark.long
 def test_derivatives_of_the_averaged_unit_by_parameters_are_exact(point):
     """Linear model with parameters of each kind in theta, against units made with them.
 
@@ -148,6 +149,7 @@ def test_another_unit_builds_and_compiles_nothing(asked):
     assert before and asked == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("load", "fault"), [(KW100, None), (LAGGING, Ttsc(0.05, 1.0, 1.0))])
 def test_derivatives_of_the_ramped_model_by_every_parameter_are_exact(load, fault):
     """Rates of the family by all numbers of the machine, against models of machines made so."""

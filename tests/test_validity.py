@@ -119,6 +119,7 @@ def test_within_the_limits_nothing_is_said(apu):
 # ------------------------------------------------------------------------------ overload
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["propagator", "cvodes", "predicted", "monolithic"])
 @pytest.mark.parametrize("load", [SeriesLoad.from_power(450e3), ConstantPowerLoad(400e3)])
 def test_an_overload_is_told_as_one(apu, way, load):
@@ -180,7 +181,10 @@ def test_a_constant_power_load_without_its_power_is_told(apu):
     P_e = np.full(101, 100e3)
     t = np.linspace(0.0, 1.0, 101)
     assert v.unserved(ConstantPowerLoad(100e3), [], t, P_e) is None
-    assert "at t = 0.5 s" in v.unserved(ConstantPowerLoad(2e5), [LoadChange(0.5, KW100)], t, P_e)
+    late = v.unserved(ConstantPowerLoad(2e5), [LoadChange(0.5, KW100)], t, P_e)
+    assert "at t = 0.5 s" in late.text()
+    assert (late.quantity, late.limit, late.worst, late.at) == ("P_e", 2e5, 1e5, 0.5)
+    assert (late.first, late.duration) == (pytest.approx(0.1), pytest.approx(0.41))
 
 
 # ------------------------------------------------------------------------------ exchange error
@@ -197,6 +201,7 @@ def truths(apu):
     }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["load step", "gas-path fault"])
 @pytest.mark.parametrize("exchange", ["paper", "predicted", "corrected"])
 def test_the_estimate_is_the_error(apu, truths, case, exchange):
@@ -346,6 +351,7 @@ def test_the_command_prints_each_warning_once_and_keeps_it(tmp_path, capsys):
         assert part in out
 
 
+@pytest.mark.long
 def test_the_command_takes_an_exchange(tmp_path, capsys):
     file = tmp_path / "surge.toml"
     file.write_text(SURGE.replace("exchange =", "# exchange ="), encoding="utf-8")

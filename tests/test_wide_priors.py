@@ -122,6 +122,7 @@ def check(result, expected, tol):
     assert (np.abs(result.mean - mean) < np.sqrt(variance) * max(tol, 1e-4)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("which", "name", "correlation"),
     [
@@ -143,6 +144,7 @@ def test_filter_and_smoother(which, name, correlation):
         check(rts_smoother(result), smoothed, TOL[which])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["speed", "sum", "mixed"])
 def test_other_filters(name):
     """Two like modes, with roots mixed; a second pass; a horizon, where IPOPT can solve it."""

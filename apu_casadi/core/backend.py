@@ -38,6 +38,7 @@ from contextvars import ContextVar, Token
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -49,6 +50,7 @@ from apu_casadi.core.sharing import BUILDING
 
 __all__ = [
     "Caller",
+    "Code",
     "Gradual",
     "Mapped",
     "available_threads",
@@ -57,6 +59,8 @@ __all__ = [
     "clear_cache",
     "compiled",
     "find_compiler",
+    "library",
+    "load_library",
     "load_or_build",
     "loaded_functions",
     "mapped",
@@ -279,19 +283,63 @@ def _find_or_make(fun: ca.Function, wanted: str, build: bool, level: int) -> ca.
     known = _compiled.get(fun, {}).get((wanted, level))
     if known is not None:
         return known
-    command = _toolchain(wanted)
-    if command is None:
-        return fun
-    text = f"{fun.name()}\n{fun.serialize()}"
-    key = _library_key(hashlib.sha256(text.encode()).hexdigest(), command, level)
-    made = _load(fun.name(), key)
-    if made is None and not build:
-        return fun
-    if made is None:
-        made = _make(fun, key, (*command, f"-O{level}"), wanted)
+    made = _library(_own_code(fun), wanted, build, level)
     if made is None:
         return fun
     _compiled.setdefault(fun, {})[wanted, level] = made
+    return made
+
+
+def _own_code(fun: ca.Function) -> Code:
+    """Return the C that CasADi writes for a function."""
+
+    def write() -> str:
+        generator = ca.CodeGenerator(f"{fun.name()}.c", {"with_header": False})
+        generator.add(fun)
+        text: str = generator.dump()
+        return text
+
+    return Code(fun.name(), f"{fun.name()}\n{fun.serialize()}", write)
+
+
+class Code(NamedTuple):
+    """C code of a function that CasADi loads as ``external``.
+
+    Args:
+        name: of the function.
+        content: all that the code depends on, beside compiler, flags and CasADi.
+        write: returns the code; asked only if there is no library.
+        flags: of the compiler, beside ``FLAGS``.
+    """
+
+    name: str
+    content: str
+    write: Callable[[], str]
+    flags: tuple[str, ...] = ()
+
+
+def library(
+    code: Code, *, backend: str | None = None, build: bool = True, level: int = 1
+) -> ca.Function | None:
+    """Return the function of a library, from the cache or compiled now; None if there is none.
+
+    Arguments and errors as of :func:`compiled`, which is this for the C that CasADi writes.
+    """
+    wanted = _wanted(backend)
+    if wanted == "vm":
+        return None
+    with BUILDING:
+        return _library(code, wanted, build, min(level, _ceiling()))
+
+
+def _library(code: Code, wanted: str, build: bool, level: int) -> ca.Function | None:
+    command = _toolchain(wanted)
+    if command is None:
+        return None
+    key = _key_of(code, command, level)
+    made = _load(code.name, key)
+    if made is None and build:
+        made = _make(code, key, (*command, f"-O{level}", *FLAGS, *code.flags), wanted)
     return made
 
 
@@ -318,17 +366,46 @@ def load_or_build(
     Raises:
         BackendError: as in :func:`compiled`.
     """
+    wanted = _wanted(backend)
     with BUILDING:
-        return _recall(recipe, build, _wanted(backend), compile_missing)
+        fun: list[ca.Function] = []
+
+        def built() -> ca.Function:
+            fun.append(build())
+            return fun[0]
+
+        made = None
+        if wanted != "vm":
+            made = _recall(recipe, built, None, wanted, compile_missing)
+        return made or (fun[0] if fun else build())
+
+
+def load_library(
+    recipe: str,
+    build: Callable[[], ca.Function],
+    code: Callable[[ca.Function], Code | None],
+    *,
+    compile_missing: bool = True,
+) -> ca.Function | None:
+    """Return the library of a recipe written by ``code``; None if there is none.
+
+    Other arguments as of :func:`load_or_build`, which is this for the C that CasADi writes.
+    """
+    wanted = _wanted(None)
+    with BUILDING:
+        return None if wanted == "vm" else _recall(recipe, build, code, wanted, compile_missing)
 
 
 def _recall(
-    recipe: str, build: Callable[[], ca.Function], wanted: str, compile_missing: bool
-) -> ca.Function:
-    command = None if wanted == "vm" else _toolchain(wanted)
-    folder = cache_folder()
+    recipe: str,
+    build: Callable[[], ca.Function],
+    code: Callable[[ca.Function], Code | None] | None,
+    wanted: str,
+    compile_missing: bool,
+) -> ca.Function | None:
+    command, folder = _toolchain(wanted), cache_folder()
     if command is None or folder is None:
-        return build()
+        return None
     alias = folder / f"apu-{_library_key(recipe, command)}.txt"
     with suppress(OSError, ValueError):
         if unsafe_file(alias):
@@ -337,16 +414,17 @@ def _recall(
         made = _load(name, key)
         if made is not None:
             return made
-    fun = build()
     if not compile_missing:
-        return fun
-    made = compiled(fun, backend=wanted)
-    if made is not fun:
-        text = f"{fun.name()}\n{fun.serialize()}"
-        key = _library_key(hashlib.sha256(text.encode()).hexdigest(), command)
+        return None
+    fun = build()
+    own = _own_code(fun) if code is None else code(fun)
+    if own is None:
+        return None
+    made = _library(own, wanted, True, 1) if code else compiled(fun, backend=wanted)
+    if made is not None and made is not fun:
         with suppress(OSError):
-            _write(alias, f"{fun.name()} {key}\n".encode())
-    return made
+            _write(alias, f"{own.name} {_key_of(own, command, 1)}\n".encode())
+    return None if made is fun else made
 
 
 def recipe(*parts: object) -> str:
@@ -396,8 +474,15 @@ def _toolchain(wanted: str) -> tuple[str, ...] | None:
 _SUFFIX = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def _library_key(content: str, command: tuple[str, ...], level: int = 1) -> str:
-    made_by = (_identity(command), f"-O{level}", *FLAGS)
+def _key_of(code: Code, command: tuple[str, ...], level: int) -> str:
+    digest = hashlib.sha256(code.content.encode()).hexdigest()
+    return _library_key(digest, command, level, code.flags)
+
+
+def _library_key(
+    content: str, command: tuple[str, ...], level: int = 1, flags: tuple[str, ...] = ()
+) -> str:
+    made_by = (_identity(command), f"-O{level}", *FLAGS, *flags)
     parts = (content, ca.__version__, *made_by, sys.platform, platform.machine())
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:40]
 
@@ -434,13 +519,13 @@ def loaded_functions() -> list[str]:
     return sorted(f.name() for f in list(_loaded.values()))
 
 
-def _make(fun: ca.Function, key: str, command: tuple[str, ...], wanted: str) -> ca.Function | None:
+def _make(code: Code, key: str, command: tuple[str, ...], wanted: str) -> ca.Function | None:
     """Generate, compile, put in place and load; None with one warning if that fails."""
     if key in _failed and wanted != "c":
         return None
     try:
-        _compile(fun, key, command)
-        made = _load(fun.name(), key)
+        _compile(code, key, command)
+        made = _load(code.name, key)
         if made is None:
             raise BackendError("the library cannot be loaded")
     except (OSError, RuntimeError, subprocess.SubprocessError, BackendError) as e:
@@ -449,28 +534,26 @@ def _make(fun: ca.Function, key: str, command: tuple[str, ...], wanted: str) -> 
             _failed.pop(next(iter(_failed)))
         _failed[key] = why
         if wanted == "c":
-            raise BackendError(f"{fun.name()} could not be compiled: {why}") from e
+            raise BackendError(f"{code.name} could not be compiled: {why}") from e
         say(
             logging.WARNING,
-            f"{fun.name()} could not be compiled, using CasADi's virtual machine: {why}",
+            f"{code.name} could not be compiled, using CasADi's virtual machine: {why}",
         )
         return None
     return made
 
 
-def _compile(fun: ca.Function, key: str, command: tuple[str, ...]) -> None:
+def _compile(code: Code, key: str, command: tuple[str, ...]) -> None:
     folder = cache_folder()
     if folder is None:
         raise BackendError("no folder for the library")
-    generator = ca.CodeGenerator(f"{fun.name()}.c", {"with_header": False})
-    generator.add(fun)
-    text = generator.dump()
+    text = code.write()
     with tempfile.TemporaryDirectory(prefix="tmp-", dir=folder) as work:
         source, library = Path(work) / "code.c", Path(work) / f"code{_SUFFIX}"
         source.write_text(text, encoding="utf-8")
         # relative names: the library does not depend on where it was made
         done = subprocess.run(
-            [*command, *FLAGS, "-o", library.name, source.name, "-lm"],
+            [*command, "-o", library.name, source.name, "-lm"],
             cwd=work, capture_output=True, encoding="utf-8", errors="replace",
             timeout=COMPILE_TIMEOUT, check=False, stdin=subprocess.DEVNULL,
         )  # fmt: skip

@@ -181,33 +181,51 @@ class Mapped:
     """A function of columns evaluated for many columns at once; made by :func:`mapped`.
 
     Memory is bounded by the chunk: buffers hold that many columns, whatever the number asked for.
+
+    Args:
+        fun: the function; for ``width`` columns at once if more than one.
+        n_threads, chunk: as in :func:`mapped`.
+        width: columns that ``fun`` takes at once.
+        common: inputs of which ``fun`` takes one column, the same for all.
+        name: for messages, by default that of ``fun``.
     """
 
     def __init__(
-        self, fun: ca.Function, n_threads: int | None = None, *, chunk: int = 1024
+        self,
+        fun: ca.Function,
+        n_threads: int | None = None,
+        *,
+        chunk: int = 1024,
+        width: int = 1,
+        common: tuple[int, ...] = (),
+        name: str | None = None,
     ) -> None:
         """Check the shapes; evaluators of each chunk size are made when first needed."""
-        wide = [fun.name_in(i) for i in range(fun.n_in()) if fun.size2_in(i) != 1]
-        wide += [fun.name_out(i) for i in range(fun.n_out()) if fun.size2_out(i) != 1]
+        self._name = fun.name() if name is None else name
+        takes = [1 if i in common else width for i in range(fun.n_in())]
+        wide = [fun.name_in(i) for i, n in enumerate(takes) if fun.size2_in(i) != n]
+        wide += [fun.name_out(i) for i in range(fun.n_out()) if fun.size2_out(i) != width]
         if wide:
-            raise BackendError(f"{fun.name()}: {', '.join(wide)} must be columns to be mapped")
-        self.fun = fun
+            raise BackendError(f"{self._name}: {', '.join(wide)} must be columns to be mapped")
+        self.fun, self._width, self._common = fun, width, common
         self.n_threads: int = max(1, available_threads() if n_threads is None else int(n_threads))
         # chunks are multiples of the thread count; the last one is filled up with its last column
         sizes = sorted({max(1, c) for c in (16, 128, chunk) if c <= chunk} | {chunk})
-        self._sizes = sorted({-(-c // self.n_threads) * self.n_threads for c in sizes})
+        each = self.n_threads * width
+        self._sizes = sorted({-(-c // each) * each for c in sizes})
 
     def __reduce__(self) -> Any:
         """Refuse compiled code, as a :class:`Caller` does."""
         Caller(self.fun).__reduce__()
-        return _mapped, (self.fun, self.n_threads, max(self._sizes))
+        more = (self._width, self._common, self._name)
+        return _mapped, (self.fun, self.n_threads, max(self._sizes), *more)
 
     def _caller(self, size: int) -> Caller:
         def made() -> Caller:
             if self.n_threads == 1:
-                f = self.fun.map(size, "serial")
+                f = self.fun.map(size // self._width, "serial")
             else:
-                f = self.fun.map(size, "thread", self.n_threads)
+                f = self.fun.map(size // self._width, "thread", self.n_threads)
             return Caller(f, copy=False)
 
         return keep(self, Caller, size, made)
@@ -221,25 +239,28 @@ class Mapped:
         Raises:
             BackendError: wrong number or shapes of arguments.
         """
-        fun = self.fun
+        fun, name = self.fun, self._name
         if len(arrays) != fun.n_in():
             raise BackendError(
-                f"{fun.name()} takes {fun.n_in()} arguments ({', '.join(fun.name_in())}), "
+                f"{name} takes {fun.n_in()} arguments ({', '.join(fun.name_in())}), "
                 f"got {len(arrays)}"
             )
         given = [np.asarray(a, dtype=float) for a in arrays]
         given = [a.reshape(-1, 1) if a.ndim < 2 else a for a in given]
-        lengths = {a.shape[1] for a in given} - {1}
         for i, a in enumerate(given):
             if a.ndim != 2 or a.shape[0] != fun.size1_in(i):
                 raise BackendError(
-                    f"{fun.name()}: {fun.name_in(i)} must have shape ({fun.size1_in(i)}, N), got "
+                    f"{name}: {fun.name_in(i)} must have shape ({fun.size1_in(i)}, N), got "
                     f"{a.shape}"
                 )
+            if i in self._common and a.shape[1] > 1:
+                raise BackendError(
+                    f"{name}: {fun.name_in(i)} is common to all columns, got {a.shape}"
+                )
+        lengths = {a.shape[1] for a in given} - {1}
         if len(lengths) > 1:
-            raise BackendError(f"{fun.name()}: unequal numbers of columns: {sorted(lengths)}")
+            raise BackendError(f"{name}: unequal numbers of columns: {sorted(lengths)}")
         N = lengths.pop() if lengths else 1
-        given = [np.broadcast_to(a, (a.shape[0], N)) for a in given]
         results = tuple(np.empty((fun.size1_out(i), N)) for i in range(fun.n_out()))
         done = 0
         while done < N:
@@ -248,9 +269,12 @@ class Mapped:
             size = fitting[-1] if fitting else self._sizes[0]
             n = min(size, left)
             call = self._caller(size)
-            for a, buffer in zip(given, call.inputs, strict=True):
+            for i, (a, buffer) in enumerate(zip(given, call.inputs, strict=True)):
+                if i in self._common:
+                    buffer.reshape(a.shape[0], -1)[:] = a
+                    continue
                 wide = buffer.reshape(a.shape[0], size)
-                wide[:, :n] = a[:, done : done + n]
+                wide[:, :n] = a if a.shape[1] == 1 else a[:, done : done + n]
                 if n < size:
                     wide[:, n:] = wide[:, n - 1 : n]
             call.evaluate()
@@ -276,5 +300,12 @@ def mapped(fun: ca.Function, n_threads: int | None = None, *, chunk: int = 1024)
     return Mapped(fun, n_threads, chunk=chunk)
 
 
-def _mapped(fun: ca.Function, n_threads: int, chunk: int) -> Mapped:
-    return Mapped(fun, n_threads, chunk=chunk)
+def _mapped(
+    fun: ca.Function,
+    n_threads: int,
+    chunk: int,
+    width: int,
+    common: tuple[int, ...],
+    name: str,
+) -> Mapped:
+    return Mapped(fun, n_threads, chunk=chunk, width=width, common=common, name=name)

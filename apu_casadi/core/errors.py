@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
+from typing import Any
 
 from apu_casadi.core import interrupts
 
@@ -80,7 +81,12 @@ class DataError(ApuError, ValueError):
 
 
 class ApuWarning(UserWarning):
-    """A result is given, but something about it must be known."""
+    """A result is given, but something about it must be known.
+
+    ``data`` is what it tells in numbers, where somebody gave them.
+    """
+
+    data: Any = None
 
 
 class ValidityWarning(ApuWarning):

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.lanes.together import Question
 
 E_contra = TypeVar("E_contra", contravariant=True)
 R_co = TypeVar("R_co", covariant=True)
@@ -56,6 +57,20 @@ def run(
         at: instant of an event.
         progress: called with (done, total) seconds after each ``advance``.
     """
+    for question in steps(system, grid, events, record=record, at=at, progress=progress):
+        raise question  # nobody is there to answer
+
+
+def steps(
+    system: System[E, R],
+    grid: np.ndarray,
+    events: Iterable[E] = (),
+    *,
+    record: Callable[[int, int, R], None],
+    at: Callable[[E], float] = lambda e: e.t,  # type: ignore[attr-defined]
+    progress: Callable[[float, float], None] | None = None,
+) -> Iterator[Question]:
+    """Do what :func:`run` does, and pause wherever the system asks, until it is answered."""
     pending, k, last, total = deque(events), 0, grid.size - 1, float(grid[-1])
     while k < last:
         t, due = float(grid[k]), []
@@ -63,7 +78,16 @@ def run(
             due.append(pending.popleft())
         if due or k == 0:
             system.switch(due, t)
-        n, made = system.advance(k, at(pending[0]) if pending else total)
+        done = None
+        while done is None:
+            try:
+                done = system.advance(k, at(pending[0]) if pending else total)
+            except Question as question:
+                asked = question
+            else:
+                break
+            yield asked
+        n, made = done
         record(k + 1, n, made)
         k += n
         if progress is not None:

@@ -327,11 +327,10 @@ def stepper(
     rtol: float = RTOL,
     atol: float = ATOL,
 ) -> Stepper:
-    """Return a :class:`Stepper`, built once for each set of arguments.
+    """Return a :class:`Stepper`, built once for each set of arguments; they are its own.
 
     Args:
         n_out: number of equally spaced outputs in a step, or the outputs as fractions of it.
-        Others as for :class:`Stepper`.
     """
     if isinstance(n_out, np.ndarray):
         grid = n_out

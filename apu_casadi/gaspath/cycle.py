@@ -202,9 +202,9 @@ class Cycle(Parametric):
     def _core(self) -> tuple[ca.Function, ca.Function, ca.Function]:
         """SX functions of a point and the map cells that it lies in.
 
-        where : (x, z, u, a, theta, c) -> N and beta on the compressor's and the turbine's table.
-        flow : (x, z, u, a, theta, c, cell_c) -> flow at which the surge line is read.
-        cycle : (x, z, u, a, theta, c, cell_c, cell_t, cell_s) -> as :class:`Assembled`.
+        - where: (x, z, u, a, theta, c) -> N and beta on the compressor's and the turbine's table.
+        - flow: (x, z, u, a, theta, c, cell_c) -> flow at which the surge line is read.
+        - cycle: (x, z, u, a, theta, c, cell_c, cell_t, cell_s) -> as :class:`Assembled`.
         """
         sizes = {"x": _NX, "z": _NZ, "u": _NU, "a": _NA, "theta": _NT, "c": _NC}
         point = Point(**{k: ca.SX.sym(k, n) for k, n in sizes.items()})

@@ -88,6 +88,9 @@ def read_tables(path: str | Path) -> dict[str, Any]:
         DataError, ParameterError: as :func:`read_engine`.
     """
     data = read_toml(path, "engine file")
+    if not data:
+        tables = ", ".join((*TABLES, *OTHERS))
+        raise ParameterError(f"{path}: empty: an engine has at least one of the tables {tables}")
     known(f"{path}", data, (*TABLES, *OTHERS, *HEAD))
     return data
 

@@ -13,15 +13,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from apu_casadi.core import simulation
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import OperatingPointError, ParameterError, nearest
+from apu_casadi.core.profiles.profile import Profile, Varying, at, fixed
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signals
 from apu_casadi.core.statespace import StateSpace
@@ -33,6 +34,7 @@ from apu_casadi.machine.generatormodel import GeneratorModel, Shaft, Structure, 
 from apu_casadi.machine.loads.load import LOADS, Load, LoadStructure
 from apu_casadi.machine.machinedata import ExciterParameters, MachineParameters
 from apu_casadi.machine.periodic import Closing, Turn, solve_periodic
+from apu_casadi.machine.switching import timeline
 from apu_casadi.machine.wrsg import Windings
 
 __all__ = ["Generator", "GeneratorPoint", "fault_of_kind", "load_of_kind"]
@@ -43,10 +45,27 @@ POWERS = ("paper", "torque")
 CHOICES = {"neutral": NEUTRALS, "excitation": EXCITATIONS, "power": POWERS}
 """What is chosen by a word, and its words."""
 
-SAME_INSTANT = 1e-9  # s; switches closer than this are one
 #: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to
 #: less than half of it makes 2.3.
 SPIKE = 3.0
+
+
+class Spike(NamedTuple):
+    """A voltage spike just after a switch.
+
+    Args:
+        words: what is told of it.
+        t: instant, s.
+        name: of the voltage.
+        V, limit: its height, and what is warned of, V.
+    """
+
+    words: str
+    t: float
+    name: str
+    V: float
+    limit: float
+
 
 #: Mean phase voltage of Table 7's reference column at 225 kW, V rms: sets the default V_ref.
 V_TABLE_7 = (229.6704 + 229.6903 + 229.6704) / 3.0
@@ -184,8 +203,8 @@ class Generator(Parametric):
 
     def spike(
         self, ss: StateSpace, x: Any, u: Any, theta: Any, *, t: float, load: Load
-    ) -> str | None:
-        """Return a warning of a voltage spike just after a switch; None without one.
+    ) -> Spike | None:
+        """Return what must be known of a voltage spike just after a switch; None without one.
 
         The flux linkages stay at a switch, hence also the currents, and a load of large resistance
         gets R times the current that flowed before.  The model lets that current die away within
@@ -203,12 +222,13 @@ class Generator(Parametric):
         v, rated = abs(y[f"v_{k}"]), math.sqrt(2.0) * self.machine.V_rated_rms
         if v <= SPIKE * rated:
             return None
-        return (
+        words = (
             f"at t = {t:.6g} s a switch to {load!r} drives the {abs(y[f'i_{k}']):.4g} A of phase "
             f"{k} through it: the model's voltage jumps to {v:.3g} V there, {v / rated:.3g} times "
             "the rated peak, until that current has died away; a real switch arcs instead. Rms "
             "values and phasors leave the spike out, single samples may not"
         )
+        return Spike(words, t, f"v_{k}", v, SPIKE * rated)
 
     # -- steady state -----------------------------------------------------------------------
 
@@ -271,8 +291,10 @@ class Generator(Parametric):
             OperatingPointError: two voltages given, a regulator limit with a balanced load, a load
                 that the field cannot carry, or a residual above 1e-6 1/s (of a periodic state
                 1e-7 per rad).
+            ScenarioError: a load or fault that changes in time.
         """
         p = self.machine
+        load, fault = (fixed(x, n, "a steady state") for n, x in (("load", load), ("fault", fault)))
         w_r = p.w_rated if w_r is None else number("w_r", w_r, error=OperatingPointError)
         theta_e = number("theta_e", theta_e, error=OperatingPointError)
         voltages = {"V_t": V_t, "V_ref": V_ref, "V_fd": V_fd}
@@ -399,17 +421,18 @@ class Generator(Parametric):
 
     def simulate(
         self,
-        load: Load,
+        load: Load | Varying[Load],
         t_end: float,
         *,
-        fault: Fault | None = None,
-        switches: Sequence[tuple[float, Load | Fault | Mapping[str, float] | None]] = (),
-        w_r: float | None = None,
-        V_ref: float | None = None,
+        fault: Fault | Varying[Fault | None] | None = None,
+        switches: Sequence[tuple[float, Any]] = (),
+        w_r: float | Profile | None = None,
+        V_ref: float | Profile | None = None,
         V_t: float | None = None,
         V_fd: float | None = None,
         theta_e: float = 0.0,
         dt_out: float = 50e-6,
+        hold: float = 0.02,
         solver: str = "auto",
         rtol: float = simulation.RTOL,
         atol: float = simulation.ATOL,
@@ -424,33 +447,38 @@ class Generator(Parametric):
                 process noise).  Several that share an instant are one switch, whatever their order.
             w_r, V_ref, V_t, V_fd, theta_e: as for :meth:`steady_state`.
             dt_out: output interval, s.
+            hold: load, fault, ``w_r`` and ``V_ref`` may follow profiles, also those of switches,
+                whose time counts from there; they are held over steps of this length, s, at their
+                value in the middle.
             solver, rtol, atol: as for :func:`apu_casadi.core.simulation.simulate`.
 
         Returns:
             xarray.Dataset: see :func:`apu_casadi.core.simulation.simulate`; attributes hold V_ref,
             the switches and, as a JSON list, ``warnings`` (:meth:`spike`).
         """
-        how = {"w_r": w_r, "V_ref": V_ref, "V_t": V_t, "V_fd": V_fd}
-        point = self.steady_state(load, fault, **how, theta_e=theta_e)
+        given = {"w_r": w_r, "V_ref": V_ref}
+        how = {n: at(v, 0.0) for n, v in given.items()} | {"V_t": V_t, "V_fd": V_fd}
+        point = self.steady_state(at(load, 0.0), at(fault, 0.0), **how, theta_e=theta_e)
         n = round(t_end / dt_out)
         if n < 1:
             raise ParameterError(f"t_end = {t_end:g} s is shorter than dt_out = {dt_out:g} s")
         grid = np.arange(n + 1) * dt_out
         if t_end - grid[-1] > 1e-9 * dt_out:
             grid = np.append(grid, t_end)
-        other: dict[str, float] = {"w_r": point.u[0], "V_ref": point.V_ref}
+        profiles = {n: v for n, v in given.items() if isinstance(v, Profile)}
+        other = {"w_r": point.u[0], "V_ref": point.V_ref, **profiles}
         plan, ss, u, theta = [], point.ss, point.u, point.theta
-        fed, told = [load], list[str]()
-        for t, changes in _instants(switches):
-            fault = changes.get("fault", fault)
-            load = changes.get("load", load)
-            other = {**other, **changes.get("inputs", {})}
-            fed.append(load)
-            new = self.variant(load, fault)
-            u_new = self.inputs(load, **other)
-            theta_new = self.fault_vector(load, fault)
-            transfer = _Transfer(self, ss, new, u, theta, u_new, theta_new, t, load, told)
-            plan.append(simulation.Switch(t, u_new, theta_new, new, transfer))
+        fed, told = [at(load, 0.0)], list[str]()
+        for now in timeline(load, fault, other, switches, t_end, hold):
+            fed.append(now.load)
+            new = self.variant(now.load, now.fault)
+            u_new = self.inputs(now.load, **now.inputs)
+            theta_new = self.fault_vector(now.load, now.fault)
+            transfer = None
+            if now.switched or new != ss:
+                of_both = u, theta, u_new, theta_new
+                transfer = _Transfer(self, ss, new, *of_both, now.t, now.load, told)
+            plan.append(simulation.Switch(now.t, u_new, theta_new, new, transfer))
             ss, u, theta = new, u_new, theta_new
         fine = min(each.fineness for each in fed)
         rtol, atol = fine * rtol, fine * atol
@@ -487,45 +515,12 @@ class _Transfer:
         after = self.generator.transfer(
             x, self.source, self.target, u=self.u, theta=self.theta, **now
         )
-        text = self.generator.spike(
+        spike = self.generator.spike(
             self.target, after, self.u_target, self.theta_target, t=self.t, load=self.load
         )
-        if text is not None:
-            self.told.append(text)
+        if spike is not None:
+            self.told.append(spike.words)
         return after
-
-
-def _instants(switches: Sequence[tuple[float, Any]]) -> list[tuple[float, dict[str, Any]]]:
-    """Return the switches instant by instant, each with its load, fault and inputs.
-
-    Raises:
-        ParameterError: something that is no change, or two of a kind at one instant, whose order
-            would decide.
-    """
-    grouped: list[tuple[float, dict[str, Any]]] = []
-    for t, change in sorted(switches, key=lambda s: s[0]):
-        if not grouped or t - grouped[-1][0] > SAME_INSTANT:
-            grouped.append((float(t), {}))
-        now = grouped[-1][1]
-        if change is None or isinstance(change, Fault):
-            kind, twice = "fault", "fault" in now
-        elif isinstance(change, Load):
-            kind, twice = "load", "load" in now
-        elif isinstance(change, Mapping):
-            kind, before = "inputs", now.get("inputs", {})
-            twice = any(before.get(k, v) != v for k, v in change.items())
-            change = {**before, **change}
-        else:
-            raise ParameterError(
-                f"switch at t = {t:g} s: a load, a fault, None or a mapping of inputs is "
-                f"needed, got {change!r}"
-            )
-        if twice and now[kind] != change:
-            raise ParameterError(
-                f"two different changes of the {kind} at t = {t:g} s: {now[kind]!r} and {change!r}"
-            )
-        now[kind] = change
-    return grouped
 
 
 @kept

@@ -83,7 +83,7 @@ class SaturatedMachine(MachineParameters):
 
     With lambda_md the flux linkage of the path and i_md = i_fd + i_kd - i_d its current,
 
-        L_md i_md = lambda_md (1 + S),    S = S_10 |lambda_md / lambda_rated|^X,
+        L_md i_md = lambda_md (1 + S),    S = S_10 abs(lambda_md / lambda_rated)^X,
 
     X = ln(S_12/S_10)/ln 1.2: the exponential form of the salient-pole machine in IEEE Std 1110,
     section 5.3.2 (GENSAE), smooth and without a threshold.  Machines without it are

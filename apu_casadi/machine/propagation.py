@@ -246,7 +246,7 @@ def hoisted(
     """Take out of a loop what follows from its fixed inputs alone.
 
     Returns:
-        Function (*varying, d) -> outputs, and Function fixed -> d.
+        ``Function(*varying, d)`` -> outputs, and Function fixed -> d.
     """
     outputs, factors, divisors = _multiplied(varying, fixed, outputs)
     given = ca.vertcat(fixed, *factors)

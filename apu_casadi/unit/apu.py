@@ -22,6 +22,7 @@ from apu_casadi.core.errors import (
     nearest,
 )
 from apu_casadi.core.parameters import Parameters, par
+from apu_casadi.core.profiles.profile import fixed
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
@@ -378,12 +379,15 @@ class Apu(Parametric):
         which is no reason not to simulate.
 
         Raises:
-            ScenarioError: another number of loads or faults than there are generators.
+            ScenarioError: another number of loads or faults than there are generators, or something
+                that changes in time.
             OperatingPointError: no such point, or it needs fuel beyond the governor's limits.
         """
-        amb = dataclasses.asdict(Ambient() if ambient is None else ambient)
-        N_ref = self.N_ref if N_ref is None else N_ref
-        loads, faults = self.each("load", load), self.each_fault(fault)
+        amb = dataclasses.asdict(Ambient() if ambient is None else _still("ambient", ambient))
+        N_ref = self.N_ref if N_ref is None else _still("N_ref", N_ref)
+        loads = tuple(_still("load", x) for x in self.each("load", load))
+        faults = tuple(_still("fault", x) for x in self.each_fault(fault))
+        health = {n: _still(n, f) for n, f in (health or {}).items()} or None
         alike = groups(zip(self.machines, loads, faults, strict=True))
         points: dict[int, GeneratorPoint] = {}
         PW = 0.0
@@ -404,6 +408,10 @@ class Apu(Parametric):
             )
         first, *others = (points[k] for k in sorted(points))
         return JointPoint(gas, first, tuple(others) if len(alike) > 1 else ())
+
+
+def _still(what: str, value: Any) -> Any:
+    return fixed(value, what, "a steady state")
 
 
 def groups(of_each: Iterable[T]) -> dict[tuple[int, ...], T]:

@@ -24,8 +24,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -39,9 +38,9 @@ from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.generator import Generator, GeneratorPoint, load_of_kind
 from apu_casadi.machine.generatormodel import DRIVES
 from apu_casadi.machine.park import Abc, abc_to_qd0
-from apu_casadi.unit.apu import Apu, JointPoint
+from apu_casadi.unit.apu import Apu, JointPoint, groups
 from apu_casadi.unit.exchange import coupled
-from apu_casadi.unit.jointfamily import JointFamily
+from apu_casadi.unit.jointfamily import Group, JointFamily, grouped
 
 # The angle enters f and g, and their derivatives by h at h = 0, through its first and second
 # harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.
@@ -50,8 +49,8 @@ _ANGLES = 6
 _H = "severity mu/(k_rf + 1 - mu) of a TTSC of one phase with kappa = mu"
 _SEVERITY = Signals([Signal("h", "1", _H, default=0.0, nominal=0.01)])
 
-_KEPT = ["V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"]
-_AXES = Signals(
+KEPT = ["V_fd", "i_fd", "i_kd", "i_kq", "E_fd", "V_t", "T_e", "P_e", "P_loss_fault", "P_total"]
+AXES = Signals(
     [
         Signal("v_q", "V", "terminal voltage, q axis", nominal=300.0),
         Signal("v_d", "V", "terminal voltage, d axis", nominal=300.0),
@@ -60,6 +59,12 @@ _AXES = Signals(
         Signal("I_t", "A", "terminal current: rms of the space vector", nominal=300.0),
     ]
 )
+
+
+def current(i_q: Any, i_d: Any) -> Any:
+    """Return the terminal current ``I_t``, A, from those on the rotor's axes."""
+    tiny = 1e-6  # A; keeps the square root smooth for an open generator
+    return ca.sqrt((i_q**2 + i_d**2 + tiny**2) / 2)
 
 
 def has_severity(gen: Generator, load_kind: str) -> bool:
@@ -124,7 +129,7 @@ def _all_generators(full: StateSpace, load_kind: str, neutral: str, n_fault: int
     faulty, numbers = n_fault > 0, Signals(full.theta[n_fault:])
     X = Signals([s for s in full.x if s.name != "theta_e"])
     U, TH = _balanced_inputs(load_kind), _SEVERITY if faulty else Signals()
-    Y = Signals([*(full.y[n] for n in _KEPT), *_AXES])
+    Y = Signals([*(full.y[n] for n in KEPT), *AXES])
     (xv, x), (uv, u), (tv, th) = X.sx(), U.sx(), TH.sx()
     pv = ca.SX.sym("numbers", len(numbers))
 
@@ -139,7 +144,7 @@ def _all_generators(full: StateSpace, load_kind: str, neutral: str, n_fault: int
     theta = ca.vertcat(fault, pv)
     angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES if faulty else np.zeros(1)
     rate: Any = 0
-    mean: dict[str, Any] = dict.fromkeys([*_KEPT, "v_q", "v_d", "i_q", "i_d"], ca.SX(0))
+    mean: dict[str, Any] = dict.fromkeys([*KEPT, "v_q", "v_d", "i_q", "i_d"], ca.SX(0))
     for angle in angles:
         x_full = full.x.stack({**x, "theta_e": ca.SX(float(angle))})
         rate += full.f(x_full, u_full, theta) / angles.size
@@ -149,8 +154,7 @@ def _all_generators(full: StateSpace, load_kind: str, neutral: str, n_fault: int
             y |= {f"{a}_q": on_axes.q, f"{a}_d": on_axes.d}
         for n in mean:
             mean[n] += y[n] / angles.size
-    tiny = 1e-6  # A; keeps the square root smooth for an open generator
-    mean["I_t"] = ca.sqrt((mean["i_q"] ** 2 + mean["i_d"] ** 2 + tiny**2) / 2)
+    mean["I_t"] = current(mean["i_q"], mean["i_d"])
     rates = full.x.unpack(rate)
     f, g = X.stack({n: rates[n] for n in X.names}), Y.stack(mean)
 
@@ -193,30 +197,26 @@ def generator_vectors(
     return ss, x, ss.u.pack(values), np.zeros(len(ss.theta))
 
 
-def _joint_signals(parts: JointFamily) -> tuple[Signals, Signals, Signals, Signals]:
-    """Return x, u, theta and y of the averaged unit."""
-    gg, gen = GasGenerator, parts.gen
-    X = Signals([*gg.X, *parts.governor.X, *gen.x])
-    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
-    own = [s for s in gen.u if s.name != "w_r"]
-    U = Signals([*(gg.U[n] for n in AMBIENT), N_ref, *own])
-    return X, U, parts.theta, Signals([*gg.Y, *gen.y])
-
-
-def _joint(parts: JointFamily, load_kind: str) -> tuple[ca.Function, StateSpace]:
+def _joint(parts: JointFamily, kinds: str) -> tuple[ca.Function, StateSpace]:
     """Return the equations (x, z, u, theta) -> (ode, alg, y) of all units, and their model."""
-    engines, gen = parts.engines, parts.machine
-    X, U, TH, Y = _joint_signals(parts)
+    gg, own, engines = GasGenerator, parts.groups, parts.engines
+    X = Signals([*gg.X, *parts.governor.X, *(s for g in own for s in g.own(g.gen.x))])
+    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
+    fed = [s for g in own for s in g.own(s for s in g.gen.u if s.name != "w_r")]
+    U = Signals([*(gg.U[n] for n in AMBIENT), N_ref, *fed])
+    TH, Y = parts.theta, Signals([*gg.Y, *(s for g in own for s in g.own(g.gen.y))])
     names = ["x", "z", "u", "theta"]
     x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in zip(names, (X, parts.z, U, TH), strict=True))
-    N, x_gov, x_gen = ca.vertsplit(x, [0, 1, 1 + len(parts.governor.X), len(X)])
+    sizes = [1, len(parts.governor.X), *(len(g.gen.x) for g in own)]
+    N, x_gov, *x_gen = ca.vertsplit(x, np.cumsum([0, *sizes]).tolist())
     inputs = dict(zip(U.names, ca.vertsplit(u), strict=True))
-    of_engine, of_gen, link = parts.parts(theta, inputs["N_ref"])
-    state = {"N": N, "x": x_gov, "x_gen": x_gen}
-    u_gg, rates, y_gen = coupled(link, gen, **state, inputs=inputs, fault=of_gen)
+    shaft = parts.shaft(theta, inputs["N_ref"])
+    machines = parts.driven(shaft, theta, x_gen, inputs)
+    u_gg, rates, y_gen = coupled(shaft, machines, N=N, x=x_gov, day=inputs)
+    of_engine = parts.engine(theta)
     N_dot, alg, y_gg = engines.equations(N, z, u_gg, of_engine)
-    name, out = f"joint_averaged_{load_kind}", [ca.vertcat(N_dot, rates), alg]
-    args, out = [x, z, u, theta], [*out, ca.vertcat(y_gg, y_gen)]
+    name, out = f"joint_averaged_{kinds}", [ca.vertcat(N_dot, rates), alg]
+    args, out = [x, z, u, theta], [*out, ca.vertcat(y_gg, *y_gen)]
     equations = ca.Function(f"{name}_equations", args, out, names, ["ode", "alg", "y"])
     start = engines.start(N, u_gg, of_engine)
     found = engines.solve(start, N, u_gg, of_engine)
@@ -227,77 +227,134 @@ def _joint(parts: JointFamily, load_kind: str) -> tuple[ca.Function, StateSpace]
     return equations, StateSpace.of(name, signals, symbols, dae=(ode, alg), f=f, g=y, z=z_sol)
 
 
-def _all_units(parts: JointFamily, load_kind: str) -> tuple[ca.Function, StateSpace]:
-    return parts.keep((_joint, load_kind), lambda: _joint(parts, load_kind))
+def _groups(
+    apu: Apu, load_kind: str | tuple[str, ...], of: tuple[tuple[int, ...], ...] | None
+) -> tuple[tuple[Group, ...], str]:
+    """Return the groups of equal generators, each with its averaged model, and their loads."""
+    kinds = apu.each("load_kind", load_kind)
+    of = tuple(groups(zip(apu.machines, kinds, strict=True))) if of is None else of
+    gens = {k: averaged_generator(apu.generators[k[0] - 1], kinds[k[0] - 1]) for k in of}
+    return grouped(apu, of, gens), "_".join(kinds[k[0] - 1] for k in of)
 
 
 @kept
 def joint_equations(
-    apu: Apu, load_kind: str = "resistive", free: tuple[str, ...] = ()
+    apu: Apu,
+    load_kind: str | tuple[str, ...] = "resistive",
+    free: tuple[str, ...] = (),
+    of: tuple[tuple[int, ...], ...] | None = None,
 ) -> ca.Function:
     """Return the family of :func:`joint_averaged` as Function (x, z, u, theta) -> (ode, alg, y)."""
-    parts = JointFamily.of(apu, averaged_generator(apu.generator, load_kind), free)
-    equations = _all_units(parts, load_kind)[0]
+    own, kinds = _groups(apu, load_kind, of)
+    parts = JointFamily.of(apu, own, free)
+    equations = parts.keep((_joint, kinds), lambda: _joint(parts, kinds))[0]
     if not free:
         return equations
-    names = joint_averaged(apu, load_kind, free).shared.theta
+    names = joint_averaged(apu, load_kind, free, of).shared.theta
 
     def reordered() -> ca.Function:
         x, z, u, theta = (ca.MX.sym(n, equations.size1_in(i)) for i, n in enumerate("xzut"))
         out = equations(x, z, u, theta[names.indices(parts.theta.names)])
         return ca.Function(equations.name(), [x, z, u, theta], out)
 
-    return parts.keep((joint_equations, load_kind, free), reordered)
+    return parts.keep((joint_equations, free), reordered)
 
 
 @kept
 def joint_averaged(
-    apu: Apu, load_kind: str = "resistive", free: tuple[str, ...] = ()
+    apu: Apu,
+    load_kind: str | tuple[str, ...] = "resistive",
+    free: tuple[str, ...] = (),
+    of: tuple[tuple[int, ...], ...] | None = None,
 ) -> StateSpace:
     """Return the whole unit with averaged generators, continuous in time.
 
     States are the rotor speed N, those of the governor (Wf_I) and those of the averaged
-    generator; inputs the ambient conditions, N_ref, V_ref and the load of each generator; theta
-    the health factors and h, which stands for the same fault in both machines, as (8) counts
-    them; outputs those of both models.  Shaft power is that of the very instant, (1), and the
-    generators' speed too, (2): nothing is exchanged and nothing held.
+    generators; inputs the ambient conditions, N_ref, and V_ref and load of each generator; theta
+    the health factors and h; outputs those of all models.  Shaft power is that of the very instant,
+    (1), and the generators' speed too, (2): nothing is exchanged and nothing held.
+
+    Generators of equal model, gear, load and severity are computed once.  Where all are equal they
+    have one set of signals, ``V_ref``, ``h``: a change of it is one of each of them.  Else there is
+    one for each group, behind the number of its first: ``generator2.V_ref``.
 
     Args:
         apu: the unit.
-        load_kind: kind of a load of ``LOADS``, as ``"resistive"``.
+        load_kind: kind of a load of ``LOADS``, as ``"resistive"``; or one for each generator.
         free: parameters of the unit by name (``machine.r_s``, ``gas_generator.eta_c``) that theta
             has too, behind h.
+        of: numbers of the generators of each group; by default those of equal model and kind.
 
     Raises:
         SignalError: unknown parameters, or some on which nothing depends.
     """
-    gen = averaged_generator(apu.generator, load_kind)
-    parts = JointFamily.of(apu, gen, free)
-    return parts.member(apu, gen, _all_units(parts, load_kind)[1], free)
+    own, kinds = _groups(apu, load_kind, of)
+    parts = JointFamily.of(apu, own, free)
+    family = parts.keep((_joint, kinds), lambda: _joint(parts, kinds))[1]
+    return parts.member(apu, own, family, free)
+
+
+def alike(apu: Apu, point: JointPoint, *, apart: bool = False) -> tuple[tuple[int, ...], ...]:
+    """Return the numbers of the generators of each group: equal ones at one point.
+
+    ``apart`` keeps equal ones apart, too.
+    """
+    each = enumerate(apu.machines, 1)
+    return tuple(groups((m, k if apart else id(point.of(k))) for k, m in each))
+
+
+class AveragedPoint(NamedTuple):
+    """The averaged unit at a steady point.
+
+    Args:
+        ss, equations: model, and that of its family as a function of (x, z, u, theta).
+        x, z, u, theta: there.
+    """
+
+    ss: StateSpace
+    equations: ca.Function
+    x: np.ndarray
+    z: np.ndarray
+    u: np.ndarray
+    theta: np.ndarray
+
+
+def averaged_point(
+    apu: Apu, point: JointPoint, free: tuple[str, ...] = (), *, apart: bool = False
+) -> AveragedPoint:
+    """Return the averaged unit at a steady point (:meth:`Apu.steady_state`).
+
+    Args:
+        free: parameters that theta has too, see :func:`joint_averaged`.
+        apart: whether generators that are equal have signals of their own all the same.
+
+    Raises:
+        SignalError: a load is not balanced, or a generator has a fault.
+    """
+    at, gas = [point.of(k + 1) for k in range(len(apu.machines))], point.gas
+    how = tuple(load_kind(p) for p in at), free, alike(apu, point, apart=apart)
+    ss, equations = joint_averaged(apu, *how), joint_equations(apu, *how)
+    given = GasGenerator.U.unpack(gas.u)
+    values = {**{n: given[n] for n in AMBIENT}, "N_ref": float(gas["N"])}
+    own, healthy = [], []
+    for group in _groups(apu, how[0], how[2])[0]:
+        k = group.numbers[0] - 1
+        gen, x_gen, u_gen, h = generator_vectors(apu.generators[k], at[k])
+        values |= group.named({n: v for n, v in gen.u.unpack(u_gen).items() if n != "w_r"})
+        own.append(x_gen)
+        healthy.append(h)
+    x = np.concatenate([gas.x, apu.governor.start(gas["Wf"]), *own])
+    more = [s.default for s in ss.theta[ss.theta.index(free[0]) :]] if free else []
+    theta = np.concatenate([gas.theta, *healthy, more])
+    return AveragedPoint(ss, equations, x, gas.z, ss.u.pack(values), theta)
 
 
 def joint_vectors(
-    apu: Apu, point: JointPoint, free: tuple[str, ...] = ()
+    apu: Apu, point: JointPoint, free: tuple[str, ...] = (), *, apart: bool = False
 ) -> tuple[StateSpace, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the averaged unit of a steady point (:meth:`Apu.steady_state`), and x, u, theta there.
+    """Return the averaged unit of a steady point, and x, u, theta there.
 
-    ``free`` are parameters that theta has too, see :func:`joint_averaged`.
-
-    Raises:
-        SignalError: the point's load is not balanced.
-        ParameterError, OperatingPointError: the generators differ, or their loads.
+    Arguments and errors as of :func:`averaged_point`.
     """
-    apu.refuse_different("the averaged unit")
-    at = point.common("the averaged unit")
-    gen_ss, x_gen, u_gen, _ = generator_vectors(apu.generator, at)
-    ss = joint_averaged(apu, load_kind(at), free)
-    gas = GasGenerator.U.unpack(point.gas.u)
-    values: Mapping[str, float] = {
-        **{n: gas[n] for n in AMBIENT},
-        "N_ref": apu.N_ref,
-        **{n: v for n, v in gen_ss.u.unpack(u_gen).items() if n != "w_r"},
-    }
-    x = np.concatenate([point.gas.x, apu.governor.start(gas["Wf"]), x_gen])
-    own = [s.default for s in ss.theta[ss.theta.index(free[0]) :]] if free else []
-    theta = np.concatenate([point.gas.theta, np.zeros(len(gen_ss.theta)), own])
-    return ss, x, ss.u.pack(values), theta
+    at = averaged_point(apu, point, free, apart=apart)
+    return at.ss, at.x, at.u, at.theta

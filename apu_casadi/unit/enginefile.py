@@ -34,13 +34,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from apu_casadi.core import files
-from apu_casadi.core.errors import ApuError, ParameterError, nearest
+from apu_casadi.core.errors import ApuError, ApuWarning, ParameterError, nearest
 from apu_casadi.core.tomlnumbers import Numbers, known, read_numbers, rows, table, text
 from apu_casadi.gaspath.engines import (
     HEAD,
@@ -59,6 +60,7 @@ from apu_casadi.unit.apu import Apu, OnShaft
 from apu_casadi.unit.control import GOVERNORS, Governor, word_of
 from apu_casadi.unit.events import MOST
 from apu_casadi.unit.shippedunits import unit_path
+from apu_casadi.unit.usual import unusual
 
 _INNER = ("machine", "exciter", "coupling")
 SATURATION = ("S_10", "S_12")
@@ -132,6 +134,9 @@ def _read(path: Path, data: Mapping[str, Any]) -> Engine:
     unit = Apu(gg, first.generator, governor, first.coupling, tuple(others))
     head = {k: data.get(k, "") for k in HEAD}
     head["name"] = head["name"] or path.stem
+    for name, words in unusual(unit, given.values, limits):
+        part = name.rpartition(".")[0]
+        warnings.warn(ApuWarning(f"{path}, [{part}]: {words}"), stacklevel=4)
     assumed = tuple(_assumed(unit, limits, given, data))
     return Engine(**head, unit=unit, limits=limits, sources=given.sources, assumed=assumed)
 
@@ -204,9 +209,8 @@ def _governor(path: Path, data: Mapping[str, Any], given: Numbers) -> Governor:
 
 def _limits(path: Path, data: Mapping[str, Any], given: Numbers) -> Limits:
     where, own = f"{path}, [limits]", table(f"{path}", data, "limits")
-    units = {f.name: LIMIT_UNITS.get(f.name, "1") for f in dataclasses.fields(Limits)}
-    known(where, own, units)
-    numbers = read_numbers(where, own, units)
+    known(where, own, LIMIT_UNITS)
+    numbers = read_numbers(where, own, LIMIT_UNITS)
     given.values |= {f"limits.{n}": v for n, v in numbers.values.items()}
     given.sources |= {f"limits.{n}": s for n, s in numbers.sources.items()}
     try:
@@ -246,7 +250,7 @@ def _assumed(
     for f in dataclasses.fields(limits):
         value = getattr(limits, f.name)
         if f"limits.{f.name}" not in given.values and value is not None and math.isfinite(value):
-            yield Assumed(f"limits.{f.name}", value, LIMIT_UNITS.get(f.name, "1"), "default limit")
+            yield Assumed(f"limits.{f.name}", value, LIMIT_UNITS[f.name], "default limit")
 
 
 def files_of(path: Path) -> list[Path]:
@@ -282,8 +286,8 @@ def write_unit(engine: Engine | Apu, path: str | Path) -> None:
     for f in dataclasses.fields(e.limits):
         value, source = getattr(e.limits, f.name), e.sources.get(f"limits.{f.name}", "")
         if value is not None:
-            unit = LIMIT_UNITS.get(f.name, "1")
-            lines += rows([(f.name, value, unit, "limit of a steady point", source)])
+            told = (f.name, value, LIMIT_UNITS[f.name], "limit of a steady point", source)
+            lines += rows([told])
     files.write_text(path, "\n".join(lines).lstrip("\n") + "\n")
 
 

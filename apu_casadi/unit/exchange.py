@@ -155,7 +155,7 @@ def governed_step(
 
 
 class Machine(NamedTuple):
-    """The generator as :func:`coupled` needs it: names, and f and g of (x, u, theta)."""
+    """A generator's model as :func:`coupled` needs it: names, and f and g of (x, u, theta)."""
 
     u: Signals
     y: Signals
@@ -163,40 +163,54 @@ class Machine(NamedTuple):
     g: Callable[[Any, Any, Any], Any]
 
 
+class Driven(NamedTuple):
+    """Equal generators on the shaft, computed once.
+
+    Args:
+        link: their gear and number.
+        model: of one of them.
+        x, theta: its states and parameters.
+        inputs: by name, but the speed.
+    """
+
+    link: Link
+    model: StateSpace | Machine
+    x: Any
+    theta: Any
+    inputs: Mapping[str, Any]
+
+
 class Coupled(NamedTuple):
     """The continuous unit at an instant, without the gas generator's own equations.
 
     Args:
         u_gg: inputs of the gas generator: fuel, shaft power and ambient conditions.
-        rates: of the states of governor and generator, one below the other.
-        y: outputs of the generator.
+        rates: of the states of the governor and of the generators, one below the other.
+        y: outputs of the generators.
     """
 
     u_gg: Any
     rates: Any
-    y: Any
+    y: list[Any]
 
 
 def coupled(
-    link: Link,
-    gen: StateSpace | Machine,
-    *,
-    N: Any,
-    x: Any,
-    x_gen: Any,
-    inputs: Mapping[str, Any],
-    fault: Any,
+    shaft: Link, machines: Sequence[Driven], *, N: Any, x: Any, day: Mapping[str, Any]
 ) -> Coupled:
-    """Couple generator and governor to a gas generator, with the values of the very instant.
+    """Couple generators and governor to a gas generator, with the values of the very instant.
 
     Args:
-        N, x, x_gen: rotor speed, states of governor and generator.
-        inputs: ambient conditions, and the generator's inputs but its speed, by name.
-        fault: theta of the generator.
+        shaft: the governor.
+        N, x: rotor speed, and states of the governor.
+        day: ambient conditions by name; more does not matter.
     """
-    u_gen = ca.vertcat(*(link.w_r(N) if n == "w_r" else inputs[n] for n in gen.u.names))
-    y = gen.g(x_gen, u_gen, fault)
-    Wf, rates = link.fuel(N, ca.vertsplit(x))
-    PW = link.PW(y[gen.y.index("P_total")])
-    u_gg = ca.vertcat(Wf, PW, *(inputs[n] for n in AMBIENT))
-    return Coupled(u_gg, ca.vertcat(*rates, gen.f(x_gen, u_gen, fault)), y)
+    Y, power, moves = [], [], []
+    for link, model, x_gen, theta, inputs in machines:
+        u = ca.vertcat(*(link.w_r(N) if n == "w_r" else inputs[n] for n in model.u.names))
+        y = model.g(x_gen, u, theta)
+        Y.append(y)
+        power.append(link.PW(y[model.y.index("P_total")]))
+        moves.append(model.f(x_gen, u, theta))
+    Wf, rates = shaft.fuel(N, ca.vertsplit(x))
+    u_gg = ca.vertcat(Wf, sum(power[1:], power[0]), *(day[n] for n in AMBIENT))
+    return Coupled(u_gg, ca.vertcat(*rates, *moves), Y)

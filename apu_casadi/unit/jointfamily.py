@@ -1,30 +1,103 @@
 """The numbers of the whole unit as parameters of its continuous models.
 
+Generators of equal model, gear, load and fault are one group, computed once.  Where there is one
+group, its signals have the names of the generator's model; where there are several, those of each
+stand behind the number of its first generator: ``generator2.lam_fd``, ``generator2.h``.
+
 Behind health factors and severities, theta of a family has the numbers of the gas generator, of
-machine and exciter, of the governor and of the gearbox, each under its dotted name.  Those of the
-gas generator are held, without derivatives, unless some of them are asked for: then they are its
-parameters alone, and the design point is solved inside.
+machines and exciters, of the governor and of the gearboxes, each under its dotted name.  Those of
+the gas generator are held, without derivatives, unless some of them are asked for: then they are
+its parameters alone, and the design point is solved inside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 
 from apu_casadi.core.sharing import keep
-from apu_casadi.core.signals import Signals
+from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.unitnumbers import GIVEN
-from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.apu import Apu, CouplingParameters
 from apu_casadi.unit.control import Governor
-from apu_casadi.unit.exchange import Link, Machine
+from apu_casadi.unit.events import who
+from apu_casadi.unit.exchange import Driven, Link, Machine
 
 T = TypeVar("T")
 _HEALTH = GasGenerator.THETA
+
+
+class Group(NamedTuple):
+    """Equal generators.
+
+    Args:
+        numbers: which, from 1.
+        gen: the model of one of them.
+        coupling: their gear.
+        alone: whether there is no other group.
+    """
+
+    numbers: tuple[int, ...]
+    gen: StateSpace
+    coupling: CouplingParameters
+    alone: bool
+
+    @property
+    def prefix(self) -> str:
+        """What stands before the names of its signals."""
+        return "" if self.alone else f"generator{self.numbers[0]}."
+
+    def own(self, signals: Iterable[Signal]) -> Signals:
+        """Return signals of one generator under the names that they have in the unit."""
+        if self.alone:
+            return Signals(signals)
+        of = who(self.numbers)
+        return Signals(
+            dataclasses.replace(s, name=self.prefix + s.name, doc=f"{of}: {s.doc}") for s in signals
+        )
+
+    def named(self, values: Mapping[str, T]) -> dict[str, T]:
+        """Return values of one generator by the names that they have in the unit."""
+        return {self.prefix + n: v for n, v in values.items()}
+
+    def of(self, values: Mapping[str, T]) -> dict[str, T]:
+        """Return what is its own of values of the unit, by the names of one generator."""
+        n = len(self.prefix)
+        return {k[n:]: v for k, v in values.items() if k.startswith(self.prefix)}
+
+    @property
+    def severity(self) -> Signals:
+        """Parameters of its model beside the numbers."""
+        return self.own(self.gen.theta)
+
+    @property
+    def numbered(self) -> Signals:
+        """Numbers of machine and exciter."""
+        assert self.gen.family is not None
+        return self.own(self.gen.family.theta[len(self.gen.theta) :])
+
+    @property
+    def gear(self) -> Signals:
+        """Numbers of the gearbox."""
+        return self.own(self.coupling.signals("coupling"))
+
+    @property
+    def held(self) -> dict[str, float]:
+        """Its numbers by name."""
+        return self.named(self.gen.held | self.coupling.held("coupling"))
+
+
+def grouped(
+    apu: Apu, of: Sequence[tuple[int, ...]], gens: Mapping[tuple[int, ...], StateSpace]
+) -> tuple[Group, ...]:
+    """Return the groups of these numbers, whose first generators have these models."""
+    return tuple(Group(k, gens[k], apu.machines[k[0] - 1].coupling, len(of) == 1) for k in of)
 
 
 class JointFamily(NamedTuple):
@@ -32,36 +105,30 @@ class JointFamily(NamedTuple):
 
     Args:
         engines: the cycle's functions.
-        gen: the model of all generators.
-        severity: its parameters beside numbers.
-        governor, coupling: of one of the units; their numbers do not matter.
-        pairs: number of generators over two.
+        groups: of equal generators; the numbers of their models do not matter.
+        governor: of one of the units, whose numbers do not matter either.
         structure: what of these does matter.
         free: whether there are derivatives by the numbers.
     """
 
     engines: CycleFunctions
-    gen: StateSpace
-    severity: Signals
+    groups: tuple[Group, ...]
     governor: Governor
-    coupling: Signals
-    pairs: float
     structure: tuple[Any, ...]
     free: bool
 
     @classmethod
-    def of(cls, apu: Apu, gen: StateSpace, free: Sequence[str] = ()) -> JointFamily:
-        """Return that of a unit and its generator's model; ``free`` are to have derivatives."""
-        gg, coupling, link = apu.gas_generator, apu.coupling.signals("coupling"), apu.link
+    def of(cls, apu: Apu, groups: Sequence[Group], free: Sequence[str] = ()) -> JointFamily:
+        """Return that of a unit and its generators; ``free`` are to have derivatives."""
+        gg, numbers = apu.gas_generator, tuple(g.numbers for g in groups)
         engines = gg.by_parameters if any(n in GIVEN for n in free) else gg.family
-        law, structure = apu.governor, (*link.structure, link.pairs, bool(free))
-        assert gen.family is not None
-        own = gen.family, gen.theta, law, coupling
-        return cls(engines, *own, link.pairs, structure, bool(free))
+        structure = (*apu.shaft.structure, numbers, bool(free))
+        return cls(engines, tuple(groups), apu.governor, structure, bool(free))
 
     def keep(self, what: tuple[Any, ...], make: Callable[[], T]) -> T:
         """Return what ``make`` makes of it, made once for all units of the structure."""
-        return keep(self.engines, JointFamily, (self.gen, self.structure, *what), make)
+        families = tuple(g.gen.family for g in self.groups)
+        return keep(self.engines, JointFamily, (families, self.structure, *what), make)
 
     @property
     def z(self) -> Signals:
@@ -71,12 +138,19 @@ class JointFamily(NamedTuple):
     @property
     def theta(self) -> Signals:
         """Health factors, severities and numbers."""
-        engine, machine = self.engines.theta[len(_HEALTH) :], self.gen.theta[len(self.severity) :]
-        law = self.governor.signals("governor")
-        return Signals([*_HEALTH, *self.severity, *engine, *machine, *law, *self.coupling])
+        engine, law = self.engines.theta[len(_HEALTH) :], self.governor.signals("governor")
+        severities = [s for g in self.groups for s in g.severity]
+        machines = [s for g in self.groups for s in g.numbered]
+        gears = [s for g in self.groups for s in g.gear]
+        return Signals([*_HEALTH, *severities, *engine, *machines, *law, *gears])
 
-    def parts(self, theta: Any, N_ref: Any = None) -> tuple[Any, Any, Link]:
-        """Return theta of the cycle and of the generator, and gearbox and governor, of symbols.
+    @property
+    def own(self) -> int:
+        """How many of theta are no numbers: health factors and severities."""
+        return len(_HEALTH) + sum(len(g.gen.theta) for g in self.groups)
+
+    def shaft(self, theta: Any, N_ref: Any = None) -> Link:
+        """Return the governor, of symbols.
 
         Args:
             theta: in the order of :attr:`theta`.
@@ -84,17 +158,41 @@ class JointFamily(NamedTuple):
         """
         at = dict(zip(self.theta.names, ca.vertsplit(theta), strict=True))
         law = self.governor.symbolic(**{n: at[f"governor.{n}"] for n in self.governor.numbers})
-        N_ref = at["gas_generator.N"] if N_ref is None else N_ref
-        gear = at["coupling.gear"], at["coupling.eta_gtSg"], at["machine.n_pp"]
-        engine, gen = (
-            theta[self.theta.indices(s.theta.names), :] for s in (self.engines, self.gen)
-        )
-        return engine, gen, Link(law, N_ref, *gear, self.pairs)
+        return Link(law, at["gas_generator.N"] if N_ref is None else N_ref)
 
-    @property
-    def machine(self) -> Machine:
-        """The generators' model for use in others; no derivatives by numbers that are not free."""
-        gen, n = self.gen, len(self.severity)
+    def engine(self, theta: Any) -> Any:
+        """Return theta of the cycle."""
+        return theta[self.theta.indices(self.engines.theta.names), :]
+
+    def driven(
+        self, shaft: Link, theta: Any, x: Sequence[Any], inputs: Mapping[str, Any]
+    ) -> list[Driven]:
+        """Return the generators on the shaft.
+
+        Args:
+            shaft, theta: as of :meth:`shaft`.
+            x: states of each group.
+            inputs: of the unit by name.
+        """
+        at, made = dict(zip(self.theta.names, ca.vertsplit(theta), strict=True)), []
+        for g, x_gen in zip(self.groups, x, strict=True):
+            own = g.of(at)
+            link = dataclasses.replace(
+                shaft,
+                gear=own["coupling.gear"],
+                eta_gtSg=own["coupling.eta_gtSg"],
+                n_pp=own["machine.n_pp"],
+                pairs=len(g.numbers) / 2,
+            )
+            names = [*g.severity.names, *g.numbered.names]
+            mine = theta[self.theta.indices(names), :]
+            made.append(Driven(link, self._machine(g), x_gen, mine, g.of(inputs)))
+        return made
+
+    def _machine(self, group: Group) -> StateSpace | Machine:
+        """A generators' model for use in others; no derivatives by numbers that are not free."""
+        gen, n = group.gen.family, len(group.gen.theta)
+        assert gen is not None
         if self.free:
             return Machine(gen.u, gen.y, gen.f, gen.g)
         sizes = {"x": len(gen.x), "u": len(gen.u), "h": n, "c": len(gen.theta) - n}
@@ -112,16 +210,18 @@ class JointFamily(NamedTuple):
         )
 
     def member(
-        self, apu: Apu, gen: StateSpace, family: StateSpace, free: Sequence[str] = ()
+        self, apu: Apu, groups: Sequence[Group], family: StateSpace, free: Sequence[str] = ()
     ) -> StateSpace:
         """Return the model of a unit of a family that was written of this.
 
         Args:
+            groups: of the unit, with its numbers.
             free: parameters that are put behind theta, with their values as defaults.
         """
-        held = apu.gas_generator.held | gen.held
-        held |= apu.governor.held("governor") | apu.coupling.held("coupling")
-        own = len(_HEALTH) + len(self.severity)
+        held = apu.gas_generator.held | apu.governor.held("governor")
+        for g in groups:
+            held |= g.held
+        own = self.own
         numbers = [held[n] for n in family.theta.names[own:]]
         made = StateSpace.member(family.name, family, Signals(family.theta[:own]), numbers)
         return made.with_free(*free) if free else made

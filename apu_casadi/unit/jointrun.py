@@ -258,6 +258,7 @@ class JointRun:
         Wf, PW = (float(v) for v in self.u[:2])
         asked: dict[str, Any] = {"ambient": dataclasses.asdict(self.here.ambient)}
         asked["PW"] = PW if math.isfinite(PW) else float(self.y[gg.Y.index("PW")])
-        words = validity.overload(self.apu, N=N, Wf=Wf, health=self.here.factors, **asked)
+        asked |= {"N_ref": self.shaft.N_ref, "health": self.here.factors}
+        words = validity.overload(self.apu, N=N, Wf=Wf, **asked)
         words = words or f"{error}; {validity.before(gg, t, self.y)}"
         return SimulationError(f"at t = {end:.6g} s: {words}")

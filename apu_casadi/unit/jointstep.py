@@ -22,6 +22,7 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.lanes.together import Together
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
@@ -234,14 +235,14 @@ class JointBlock(Rebuilt):
         return BlockResult(N, z, tuple(x_gov.tolist()), y, made)
 
 
-def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: bool) -> Gradual:
+def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: bool) -> Together:
     """One compiled block for each structure of gas generator, link and machines, and layout."""
 
-    def make() -> Gradual:
+    def make() -> Together:
         kind = "joint_course_" if wide else "joint_block_"
         name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
         function = block_function(machines, family.step, link, name, wide=wide)
-        return Gradual(function, level=3, copy=False)
+        return Together(function, function, Gradual(function, level=3, copy=False))
 
     key = (link.structure, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

@@ -15,6 +15,7 @@ import numpy as np
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.unit.apu import Apu, JointPoint, groups
+from apu_casadi.unit.departures import Departure
 from apu_casadi.unit.events import Event, HealthChange, Holding, who
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
 from apu_casadi.unit.jointstep import BlockResult, JointBlock
@@ -272,9 +273,13 @@ class Machines:
         return sum(g.propagated for g in self.groups)
 
     @property
-    def spikes(self) -> list[str]:
+    def spikes(self) -> list[Departure]:
         """What must be known of the switches so far."""
-        return [words for g in self.groups for words in g.spikes]
+        return [
+            Departure(s.name, "V", s.limit, s.V, s.t, s.t, 0.0, "spike", k, s.words)
+            for g in self.groups
+            for s, k in g.spikes
+        ]
 
 
 def means_of(apu: Apu, numbers: tuple[int, ...], phasors: bool) -> StepMeans:

@@ -16,7 +16,7 @@ import numpy as np
 from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.machine.course import Numbers
-from apu_casadi.machine.generator import Generator, GeneratorPoint
+from apu_casadi.machine.generator import Generator, GeneratorPoint, Spike
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import who
 from apu_casadi.unit.exchange import Link
@@ -96,7 +96,7 @@ class MachineStep:
         self.V_ref, self.w_r = point.V_ref, self.link.w_r(apu.N_ref)
         self.x, self.u = np.asarray(point.x, float), np.array(point.u, float)
         self.nsteps = self.propagated = 0
-        self.spikes: list[str] = []
+        self.spikes: list[tuple[Spike, tuple[int, ...] | None]] = []
         self._since = math.inf  # s since the last switch
         self._way: Way | None = None
         self._asked: tuple[Any, Any] = (load, fault)
@@ -154,9 +154,11 @@ class MachineStep:
         self.x = self.gen.transfer(
             self.x, old.ss, ss, u=self.u, theta=old.theta, u_target=u, theta_target=theta
         )
-        text = self.gen.spike(ss, self.x, u, theta, t=t, load=load)
-        if text is not None:
-            self.spikes.append(text if self._of_all else f"{who(self.numbers)}: {text}")
+        spike = self.gen.spike(ss, self.x, u, theta, t=t, load=load)
+        if spike is not None and not self._of_all:
+            spike = spike._replace(words=f"{who(self.numbers)}: {spike.words}")
+        if spike is not None:
+            self.spikes.append((spike, None if self._of_all else self.numbers))
         symmetric = fault is None and load.balanced and not self.settings.noisy
         self.u, self._since = u, 0.0
         self._enter(Phase(self.gen, load, fault, ss, u, theta, symmetric))

@@ -38,11 +38,14 @@ import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityWarning, nearest
+from apu_casadi.core.lanes.together import Course, alone
 from apu_casadi.core.means import RMS
 from apu_casadi.core.profiles.profile import Profile, Varying
-from apu_casadi.core.runloop import SAME_INSTANT, run
+from apu_casadi.core.runloop import SAME_INSTANT, steps
+from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.departures import departures
 from apu_casadi.unit.events import (
     STARTS,
     Ambient,
@@ -122,6 +125,7 @@ def simulate_joint(
     solver: str = "auto",
     start_from: str = "balanced",
     strict: bool = False,
+    limits: Limits | None = None,
     rtol: float = 1e-8,
     atol: float = 1e-10,
     progress: Callable[[float, float], None] | None = None,
@@ -151,6 +155,7 @@ def simulate_joint(
         hook: processes the rotor speed between state update and output (Algorithm 2).
         start_from: one of ``STARTS``, as above.
         strict: stop with an error where there would be a warning, at its instant where it shows.
+        limits: of the steady points of the unit, which the run is judged by; default the trim's.
         solver, rtol, atol: one of ``SOLVERS``, see :mod:`apu_casadi.unit.integrators`.
         progress, attrs: called with (done, total) seconds; more attributes for the dataset.
         storage: ``"memory"``, a folder for a temporary file, or ``"auto"``; the module's text.
@@ -167,21 +172,33 @@ def simulate_joint(
         OperatingPointError, SimulationError: no steady start; a step failed: when and why.
         ValidityError: a strict run left the model (:mod:`apu_casadi.unit.strictness`).
     """
-    noise = Noise() if noise is None else noise
-    duration = number("duration", duration, error=ScenarioError)
-    settings = _settings(exchange, dt, waveform_dt, solver, rtol, atol, noise)
-    events = in_order(events, duration, generators=len(apu.machines))
-    start = _start(apu, load, fault, health, ambient, N_ref)
+    return alone(joint_course(**locals()))
+
+
+def joint_course(apu: Apu, **how: Any) -> Course[xr.Dataset]:
+    """Do what :func:`simulate_joint` does, whose arguments these are, and pause at questions.
+
+    An ensemble answers them (:mod:`apu_casadi.unit.ensemble`); a single run asks none.
+    """
+    noise = Noise() if how["noise"] is None else how["noise"]
+    duration = number("duration", how["duration"], error=ScenarioError)
+    given = {n: how[n] for n in ("exchange", "dt", "waveform_dt", "solver", "rtol", "atol")}
+    settings = _settings(**given, noise=noise)
+    events = in_order(how["events"], duration, generators=len(apu.machines))
+    start = start_of(apu, *(how[n] for n in ("load", "fault", "health", "ambient", "N_ref")))
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
-    grid, settled = exchange_grid(duration, settings.dt, stops), _settled(start_from)
-    asked = Asked(start, grid, phasors, noise, seed, hook, settled)
+    grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(how["start_from"])
+    seed, strict = how["seed"], how["strict"]
+    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
-    record = _moved(system, events, stops, storage, strict, progress)
-    how = {"warn_exchange": warn_exchange, "strict": strict}
-    return _concluded(system, record, exchange, events, **how, attrs=attrs or {})
+    limits = how["limits"]
+    judged = (limits or Limits()) if strict else None
+    record = yield from _moved(system, events, stops, how["storage"], judged, how["progress"])
+    told = {"warn_exchange": how["warn_exchange"], "strict": strict, "limits": limits}
+    return _concluded(system, record, how["exchange"], events, **told, attrs=how["attrs"] or {})
 
 
-def _start(
+def start_of(
     apu: Apu,
     load: ALoad | Sequence[ALoad],
     fault: AFault | Sequence[AFault] | Mapping[int, AFault],
@@ -189,7 +206,7 @@ def _start(
     ambient: Ambient | Varying[Ambient] | None,
     N_ref: float | Profile | None,
 ) -> Holding:
-    """What holds from the start, for each generator, checked."""
+    """Return what holds from the start, for each generator, checked."""
     day = Ambient() if ambient is None else ambient
     speed = None if N_ref is None else SpeedChange(0.0, N_ref).N_ref
     return Holding(apu.each("load", load), apu.each_fault(fault), all_factors(health), day, speed)
@@ -200,22 +217,25 @@ def _moved(
     events: Sequence[Event],
     stops: Sequence[Event | Jump],
     storage: str | os.PathLike[str],
-    strict: bool,
+    strict: Limits | None,
     progress: Callable[[float, float], None] | None,
-) -> Recorder:
-    """Run the unit over its grid; return what was recorded."""
+) -> Course[Recorder]:
+    """Run the unit over its grid, strictly within limits if given; return what was recorded."""
     apu, asked, grid = system.apu, system.asked, system.asked.grid
     means = {k: means_of(apu, k, asked.phasors) for k in kinds(apu, system.now, events)}
     severities = stored_severities(events, *asked.start.faults)
     samples = system.machines.samples(grid)
     record = Recorder(apu.gas_generator, grid, samples, means, storage, severities)
-    record.put(0, 1, system.at_start())
-    put = Strict(system, means, record.put) if strict else record.put
-    run(system, grid, stops, record=put, progress=progress)
+    put = record.put
+    if strict is not None:
+        put = Strict(system, means, record.put, strict, events)
+    put(0, 1, system.at_start())
+    yield from steps(system, grid, stops, record=put, progress=progress)
     return record
 
 
-def _settled(start_from: str) -> bool:
+def settled_start(start_from: str) -> bool:
+    """Return whether a run starts from what has been there for long; see ``STARTS``."""
     if start_from not in STARTS:
         raise ScenarioError(f"start_from {start_from!r} {nearest(str(start_from), STARTS)}")
     return start_from == "settled"
@@ -253,6 +273,7 @@ def _concluded(
     *,
     warn_exchange: bool,
     strict: bool,
+    limits: Limits | None,
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
     """Make the dataset of a run, with what must be known of it in attributes and warnings."""
@@ -284,15 +305,33 @@ def _concluded(
     told = {"solver": json.dumps(status), **told, "exchange_error": lost, **attrs}
     more, signals = runrecord.followed(asked.start, events, grid)
     ds = record.collect(apu, {**rows, **more}, asked.noise, system.rng, told, signals)
-    notes = [ApuWarning(words) for words in (*machines.spikes, *record.warnings)]
+    notes = [d.warning() for d in (*machines.spikes, *record.warnings)]
     notes += validity.notes_of_exchange(lost, exchange, settings.dt) if warn_exchange else []
-    starved = validity.fuel_limited(apu, grid, N, Wf)
+    notes += load_notes(apu, record, asked.start, events, rows, system.shaft.N_ref)
+    found = departures(apu.gas_generator, grid, rows, limits)
+    return validity.conclude(ds, found, notes, stacklevel=6, strict=strict)
+
+
+def load_notes(
+    apu: Apu,
+    record: Recorder,
+    start: Holding,
+    events: Sequence[Event],
+    rows: Mapping[str, Any],
+    N_ref: float | None = None,
+) -> list[ApuWarning]:
+    """Return the warnings of a run that got less fuel or power than it asked for.
+
+    Args:
+        record, rows: of the run, and what its instants gave.
+        start, events: what held.
+        N_ref: governed rotor speed at the end, rad/s; None for the unit's own.
+    """
+    N, Wf = (np.asarray(rows[n]) for n in ("N", "Wf"))
+    starved = validity.fuel_limited(apu, record.grid, N, Wf, N_ref)
+    one = len(record.of) == 1
     unserved = [
-        validity.unserved(
-            asked.start.loads[k[0] - 1], events, grid, P_e, k, of_all=len(record.of) == 1
-        )
+        validity.unserved(start.loads[k[0] - 1], events, record.grid, P_e, k, of_all=one)
         for k, P_e in record.of_each("P_e", rows).items()
     ]
-    notes += [ValidityWarning(words) for words in (starved, *unserved) if words]
-    found = validity.departures(apu.gas_generator, grid, rows)
-    return validity.conclude(ds, found, notes, stacklevel=4, strict=strict)
+    return [d.warning(ValidityWarning) for d in (starved, *unserved) if d]

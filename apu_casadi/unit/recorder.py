@@ -19,6 +19,7 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.departures import Departure, excess_of
 from apu_casadi.unit.events import Event, FaultChange
 from apu_casadi.unit.integrators import WAVEFORMS
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans, phasor_signals
@@ -325,9 +326,13 @@ class Recorder:
         return {k: values if values.ndim == 1 else values[i] for k, i in each.items()}
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Departure]:
         """What must be known of the means."""
-        return [words for kept in self.of for words in kept.of_step.warnings]
+        return [
+            excess_of(e, None if len(self.of) == 1 else kept.numbers)
+            for kept in self.of
+            for e in kept.of_step.warnings
+        ]
 
     def collect(
         self,

@@ -69,6 +69,9 @@ def asked(
         "profiles": json.dumps([g.told() for g in given_profiles(start, events)]),
         "seed": "none" if seed is None else seed,
         "apu_casadi_version": installed(),
+        "Conventions": "CF-1.11, ACDD-1.3",
+        "source": f"apu-casadi {installed()}, model of an all-electric auxiliary power unit",
+        "history": f"simulated by apu-casadi {installed()}",
     }
 
 

@@ -34,6 +34,22 @@ MEANS = ("P_total", "P_e", "P_loss_fault")
 EXCESS = 0.01
 
 
+class Excess(NamedTuple):
+    """A step in which the torque takes more of the shaft than eq. (8) gives it.
+
+    Args:
+        words: what is told of it.
+        t: its end, s.
+        P: power of the torque, W.
+        limit: what it might take, W.
+    """
+
+    words: str
+    t: float
+    P: float
+    limit: float
+
+
 class RawMeans(NamedTuple):
     """Means of one or more steps as they were averaged; :meth:`StepMeans.settle` goes on.
 
@@ -117,8 +133,8 @@ class StepMeans:
         kept = (values[: len(MEANS)], rms, of_symmetry, *((parts,) if self.phasors else ()))
         return np.concatenate(kept)
 
-    def too_little(self, raw: RawMeans) -> tuple[str, float] | None:
-        """Return the words for the first of steps in which (8) gives too little, and its end, s."""
+    def too_little(self, raw: RawMeans) -> Excess | None:
+        """Return what is told of the first of steps in which (8) gives too little."""
         by_name = as_dict(raw.quad, raw.values)
         torque = 2.0 * by_name["T_e"] * raw.w_r / self.gen.machine.n_pp
         excess = torque - by_name["P_total"]
@@ -126,25 +142,27 @@ class StepMeans:
         if not out.size:
             return None
         k, t = out[0], np.broadcast_to(np.atleast_1d(raw.t), excess.shape)
-        return self._words(excess[k], torque[k], by_name["P_total"][k], float(t[k])), float(t[k])
+        return self._told(excess[k], torque[k], by_name["P_total"][k], float(t[k]))
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Excess]:
         """What must be known of the steps settled so far."""
         if self.excess[0] <= EXCESS * 2.0 * self.gen.machine.P_rated:
             return []
-        return [self._words(*self.excess)]
+        return [self._told(*self.excess)]
 
-    def _words(self, *powers_and_t: float) -> str:
+    def _told(self, *powers_and_t: float) -> Excess:
         *powers, t = powers_and_t
         more, torque, power = (self._pairs * P for P in powers)
-        return (
+        allowed = power + self._pairs * EXCESS * 2.0 * self.gen.machine.P_rated
+        words = (
             f"eq. (8) gives too little: in the step that ends at t = {t:.6g} s the torque of "
             f"{self._of} takes {torque / 1e3:.4g} kW of the shaft, eq. (8), with which "
             f"the gas generator is loaded, {power / 1e3:.4g} kW; {more / 1e3:.3g} kW are more "
             f"than {100 * EXCESS:g} % of the rated power. Eq. (8) holds output and extra loss "
             "of the fault only: near a short circuit the machine's own loss is missing"
         )
+        return Excess(words, t, torque, allowed)
 
 
 def rms_at_rest(point: GeneratorPoint) -> dict[str, float]:

@@ -25,7 +25,7 @@ import json
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -39,13 +39,19 @@ from apu_casadi.core.errors import (
     ValidityWarning,
 )
 from apu_casadi.core.profiles.profile import Varying, at, later
-from apu_casadi.core.results import phases
 from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import Governor
+from apu_casadi.unit.departures import (
+    Departure,
+    beyond_words,
+    by_phase,
+    departures,
+    stopped,
+)
 from apu_casadi.unit.events import Event, LoadChange, who
 
 if TYPE_CHECKING:
@@ -78,120 +84,34 @@ PAPER_STEP = 0.02
 """Exchange step, s, of the paper; its own scheme with it is what a reproduction asks for."""
 PAPER_ERROR = 0.1
 """Error up to which that is accepted: twice the 5 % that it loses with the paper's governor."""
+SERVED = 0.9
+"""Share of its demand that a constant-power load gets at least."""
 SETTLED = 0.1  # s after which a constant-power load should have its power
 _STILL = 1e-5  # of the governed speed: a smaller excursion is none
-_WORDS = {
-    **dict.fromkeys(("T4", "T5"), "hot"),
-    **{"SM": "beyond surge", "Mach8": "exhaust exit choked", "Wf": "no flame"},
-    **{"off_c": "off the compressor map", "off_t": "off the turbine map"},
-}
 
 
 # ------------------------------------------------------------------------------ limits
 
 
-@dataclass(frozen=True)
-class Departure:
-    """One quantity that was beyond its limit during a run.
+def fuel_limited(
+    apu: Apu, t: np.ndarray, N: np.ndarray, Wf: np.ndarray, N_ref: float | None = None
+) -> Departure | None:
+    """Return what is told of a run that ends with the fuel at its limit and the speed falling.
 
-    Args:
-        quantity, unit: output of the gas generator.
-        limit, worst: of the trim, and the value farthest beyond it.
-        first, at: instants, s, of the first value beyond and of the worst one.
-        duration: sum of the exchange steps, s, that ended beyond.
+    ``N_ref`` is the governed speed at its end, rad/s, where that is not the unit's.
     """
-
-    quantity: str
-    unit: str
-    limit: float
-    worst: float
-    first: float
-    at: float
-    duration: float
-
-    def text(self) -> str:
-        """Return it in words."""
-        when = f" at t = {self.at:.6g} s"
-        return (
-            f"{beyond_words(self.quantity, self.worst, self.unit, self.limit, when)}, first beyond "
-            f"it at t = {self.first:.6g} s, for {self.duration:.4g} s in all"
-        )
-
-
-def beyond_words(quantity: str, value: float, unit: str, limit: float, when: str = "") -> str:
-    """Return in words that a quantity is beyond its limit."""
-    spans = {"1": "", "off_c": " table spans", "off_t": " table spans"}
-    unit = spans.get(quantity if quantity.startswith("off_") else unit, f" {unit}")
-    words = _WORDS.get(quantity, "beyond a limit")
-    return f"{words}: {quantity} = {value:.5g}{unit}{when} (limit {limit:.5g})"
-
-
-def departures(
-    gg: GasGenerator,
-    t: np.ndarray,
-    outputs: Mapping[str, np.ndarray],
-    limits: Limits | None = None,
-) -> list[Departure]:
-    """Return what left the limits of a trim during a run, each quantity once.
-
-    Args:
-        t: exchange instants, s, shape (K,).
-        outputs: outputs of the gas generator by name, shape (K,), each at the end of its step.
-        limits: those of the trim by default.
-    """
-    steps = np.diff(t, prepend=t[0])
-    found = []
-    for _, name, sign, limit in (limits or Limits()).rows(gg):
-        if name not in outputs or math.isinf(limit):
-            continue
-        values = np.asarray(outputs[name])  # of a long run they lie in a file
-        beyond = sign * (values - limit)
-        out = beyond > 0
-        if not out.any():
-            continue
-        k, first = int(np.argmax(beyond)), int(np.argmax(out))
-        instants = float(t[first]), float(t[k]), float(steps[out].sum())
-        found.append(Departure(name, gg.Y[name].unit, float(limit), float(values[k]), *instants))
-    return found
-
-
-def by_phase(ds: Any) -> list[list[dict[str, Any]]]:
-    """Return for each phase of a run what was beyond its limit in it: a table for each quantity.
-
-    A table has quantity, limit, worst and its instant ``at``, ``first`` instant and duration, s.
-    """
-    rows, t = json.loads(ds.attrs.get("validity", "[]")), ds["time"].values
-    steps, found = np.diff(t, prepend=t[0]), []
-    for k, p in enumerate(phases(ds)):
-        inside = ((t > p["start"] + 1e-9) | (k == 0)) & (t <= p["end"] + 1e-9)
-        own = []
-        for d in rows:
-            sign = 1.0 if d["worst"] > d["limit"] else -1.0
-            values = ds[d["quantity"]].values
-            out = np.flatnonzero(inside & (sign * (values - d["limit"]) > 0))
-            if out.size:
-                worst = out[int(np.argmax(sign * values[out]))]
-                own.append({
-                    **{n: d[n] for n in ("quantity", "unit", "limit")},
-                    "worst": float(values[worst]), "at": float(t[worst]),
-                    "first": float(t[out[0]]), "duration": float(steps[out].sum()),
-                })  # fmt: skip
-        found.append(own)
-    return found
-
-
-def fuel_limited(apu: Apu, t: np.ndarray, N: np.ndarray, Wf: np.ndarray) -> str | None:
-    """Return the words for a run that ends with the fuel at its limit and the speed falling."""
     high = apu.governor.Wf_max
     if N.size < 2 or not (Wf[-1] >= high * (1 - 1e-9) and N[-1] < N[-2]):
         return None
     below = np.flatnonzero(Wf < high * (1 - 1e-9))
-    since = float(t[below[-1] + 1]) if below.size else float(t[0])
-    return (
+    since, end = float(t[below[-1] + 1]) if below.size else float(t[0]), float(t[-1])
+    words = (
         f"the load asks for more than the engine gives: at the end of the run the governor is at "
         f"its limit Wf_max = {high:g} kg/s, since t = {since:.6g} s, and the speed still falls "
-        f"({N[-1] * RPM:.0f} r/min, {100 * N[-1] / apu.N_ref:.1f} % of the governed one)"
+        f"({N[-1] * RPM:.0f} r/min, {100 * N[-1] / (N_ref or apu.N_ref):.1f} % of the governed one)"
     )
+    at = since, end, end - since
+    return Departure("Wf", "kg/s", high, float(Wf[-1]), *at, "fuel_limit", said=words)
 
 
 def unserved(
@@ -202,8 +122,10 @@ def unserved(
     numbers: Sequence[int] = (1,),
     *,
     of_all: bool = True,
-) -> str | None:
-    """Return the words for a constant-power load that does not get its power; None if all do.
+) -> Departure | None:
+    """Return what is told of a constant-power load that does not get its power; None if all do.
+
+    Over all of its time but the beginning, in which it settles; of several loads the first.
 
     Args:
         load, events: of the run.
@@ -211,32 +133,65 @@ def unserved(
         numbers: of the generators that it is of.
         of_all: whether they are all.
     """
-    of_these = (None, numbers[0])
-    changes = [
+    for start, x, end in _loads(load, events, numbers[0], float(t[-1])):
+        inside = np.flatnonzero((t > start + SETTLED - 1e-9) & (t <= end + 1e-9))
+        inside = inside[inside > 0]
+        if not inside.size or not at(x, float(t[inside[0]])).demand:
+            continue
+        asked = np.array([demanded(x, t[i - 1], t[i]) for i in inside])
+        lacks = P_e[inside] < SERVED * asked
+        span = _lasting(lacks, t[inside])
+        if span is None:
+            continue
+        first, k = inside[span[0]], inside[span[1]]
+        words = unserved_words(t[k], P_e[k], asked[span[1]], None if of_all else numbers)
+        times = float(t[first]), float(t[k]), float(t[k] - t[first - 1])
+        of, demand = None if of_all else tuple(numbers), float(asked[span[1]])
+        return Departure("P_e", "W", demand, float(P_e[k]), *times, "unserved", of, words)
+    return None
+
+
+def unserved_words(t: float, P_e: float, asked: float, numbers: Sequence[int] | None) -> str:
+    """Return the words for a load that lacks power, W, at an instant, s; None: all do."""
+    each = "each generator" if numbers is None else who(numbers)
+    return (
+        f"the load asks for more than the generator can give: at t = {t:.6g} s it gets "
+        f"{P_e / 1e3:.1f} kW of the {asked / 1e3:.1f} kW asked of {each}; the voltage has collapsed"
+    )
+
+
+def _lasting(lacks: np.ndarray, t: np.ndarray) -> tuple[int, int] | None:
+    """Return the first and last instant of what lasts: to the end, or for ``SETTLED``."""
+    cuts = np.flatnonzero(np.diff(np.concatenate([[False], lacks, [False]]).astype(int)))
+    for a, b in cuts.reshape(-1, 2).tolist():
+        if b == lacks.size or t[b - 1] - t[a] >= SETTLED:
+            return a, b - 1
+    return None
+
+
+def _loads(
+    load: Any, events: Sequence[Event], number: int, end: float
+) -> list[tuple[float, Any, float]]:
+    """Return the loads of a generator, each from when to when, s."""
+    own = [
         (e.t, later(e.load, e.t))
         for e in events
-        if isinstance(e, LoadChange) and e.generator in of_these
+        if isinstance(e, LoadChange) and e.generator in (None, number)
     ]
-    starts = [(0.0, load), *changes]
-    for (start, x), end in zip(starts, [*(s for s, _ in changes), float(t[-1])], strict=True):
-        k = int(np.searchsorted(t, end + 1e-9)) - 1
-        if end - start < SETTLED:
-            continue
-        x = at(x, float(t[max(k, 1) - 1 : k + 1].mean()))
-        if P_e[k] < 0.9 * x.demand:
-            each = "each generator" if of_all else who(numbers)
-            return (
-                f"the load asks for more than the generator can give: at t = {t[k]:.6g} s it gets "
-                f"{P_e[k] / 1e3:.1f} kW of the {x.demand / 1e3:.1f} kW asked of {each}; "
-                f"the voltage has collapsed"
-            )
-    return None
+    ends = [*(s for s, _ in own), end]
+    return [(t, x, e) for (t, x), e in zip([(0.0, load), *own], ends, strict=True)]
+
+
+def demanded(x: Any, before: float, t: float) -> float:
+    """Return what a load demands in the step between two instants, s; in W."""
+    return float(at(x, 0.5 * (before + t)).demand)
 
 
 def overload(
     apu: Apu,
     *,
     N: float,
+    N_ref: float | None = None,
     Wf: float,
     PW: float,
     ambient: Mapping[str, float],
@@ -248,14 +203,15 @@ def overload(
 
     Args:
         N, Wf, PW: speed (rad/s), fuel flow (kg/s) and shaft power asked for (W) when it failed.
+        N_ref: governed speed then, rad/s; None: the unit's.
         ambient, health: by name.
     """
-    high = apu.governor.Wf_max
-    if not (Wf >= high * (1 - 1e-9) and apu.N_ref > N):
+    high, governed = apu.governor.Wf_max, N_ref or apu.N_ref
+    if not (Wf >= high * (1 - 1e-9) and governed > N):
         return None
     asked = f"{PW / 1e3:.1f} kW of shaft power" if math.isfinite(PW) else "more shaft power"
     try:
-        at, free = {"N": apu.N_ref, "Wf": high}, Limits.none()
+        at, free = {"N": governed, "Wf": high}, Limits.none()
         most = trim_gas_generator(apu.gas_generator, at, theta=health, limits=free, **ambient)
         gives = (
             f"gives {most['PW'] / 1e3:.1f} kW at the governed speed (T4 = {most['T4']:.0f} K, "
@@ -268,7 +224,7 @@ def overload(
     return (
         f"the load asks for more than the engine can give at the fuel limit: it asks for {asked}; "
         f"with Wf_max = {high:g} kg/s the engine {gives}; the speed has fallen to "
-        f"N = {N * RPM:.0f} r/min, {100 * N / apu.N_ref:.1f} % of the governed one"
+        f"N = {N * RPM:.0f} r/min, {100 * N / governed:.1f} % of the governed one"
     )
 
 
@@ -476,10 +432,15 @@ def conclude(
         words = "; ".join(d.text() for d in found)
         text = f"the run left the range in which the model holds: {words}"
         notes.insert(0, ValidityWarning(text))
+    rows = [*found, *(n.data for n in notes if isinstance(n.data, Departure))]
     if strict and notes:
-        raise ValidityError(f"at the end of the run: {notes[0]}", float(ds["time"][-1]))
+        d = min(rows, key=lambda d: d.first if math.isfinite(d.first) else math.inf, default=None)
+        if d is None or d.kind == "exchange":
+            words = f"at the end of the run: {notes[0]}"
+            raise ValidityError(stopped(words, d.kind if d else ""), float(ds["time"][-1]))
+        raise ValidityError(stopped(d.text(), d.kind), d.first)
     before = json.loads(ds.attrs.get("warnings", "[]"))
-    ds.attrs["validity"] = json.dumps([asdict(d) for d in found])
+    ds.attrs["validity"] = json.dumps([d.row() for d in rows])
     ds.attrs["warnings"] = json.dumps([*before, *(str(w) for w in notes)], ensure_ascii=False)
     for w in notes:
         warnings.warn(w, stacklevel=stacklevel)
@@ -494,7 +455,10 @@ def notes_of_exchange(error: float, exchange: str, dt: float) -> list[ApuWarning
     """
     if not error > EXCHANGE_LIMIT or accepted(error, exchange, dt):
         return []
-    return [ExchangeWarning(exchange_words(error, exchange, dt))]
+    said = exchange_words(error, exchange, dt)
+    whole = math.nan, math.nan, math.nan
+    d = Departure("exchange_error", "1", EXCHANGE_LIMIT, error, *whole, "exchange", said=said)
+    return [d.warning(ExchangeWarning)]
 
 
 def found_in(ds: Any) -> list[str]:

@@ -40,6 +40,7 @@ from estimators.apu.gaspathmodel import (
     gas_path_model,
     model_sensors,
 )
+from estimators.apu.sensorchain import Draws, sampled, spread
 from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
@@ -122,19 +123,29 @@ class GasPathFilter(Parametric):
         """Sensors whose gain error is a state."""
         return tuple(n[5:] for n in self.model.x.names if n.startswith("gain_"))
 
-    def prior(self, **mean: float) -> Belief:
+    def considered(self, name: str) -> float:
+        """Return the standard deviation of what considered errors add to a reading, its unit.
+
+        It stays in the innovations of that sensor, as an offset.
+        """
+        of = {n: self.sigma[n] for n in self.model.consider if n[5:] == name}
+        bias, gain = (of.get(f"{error}_{name}", 0.0) for error in ("bias", "gain"))
+        return math.hypot(bias, gain * self.model.y[name].nominal) if of else 0.0
+
+    def prior(self, spread: Mapping[str, float] | None = None, /, **mean: float) -> Belief:
         """Return the belief before the first sample: healthy, at governed speed.
 
         Args:
+            spread: other standard deviations, by state name.
             mean: other means, by state name.
         """
         means = {"N": self.gg.parameters.N} | dict.fromkeys(HEALTH, 1.0)
-        means |= {f"gain_{n}": 0.0 for n in self.gains}
+        means |= {n: 0.0 for n in self.model.x.names if n.startswith(("gain_", "bias_"))}
         means |= {s.name: s.signal.nominal for s in self.lagging}
         means |= {n: v for n, v in self.gg.held.items() if n in self.model.x}
         if not self.known_power:
             means["PW"] = PW_PRIOR[0]
-        return Belief.of(self.model.x, means | mean, self.sigma)
+        return Belief.of(self.model.x, means | mean, {**self.sigma, **(spread or {})})
 
     def recording(
         self,
@@ -168,16 +179,8 @@ class GasPathFilter(Parametric):
             DataError: the run has no samples 20 ms apart, or lacks a signal; a wrong length.
         """
         t, truth = true_readings(self.sensors, ds)
-        return self.measured(
-            t,
-            truth,
-            seed,
-            gains=gains,
-            power=power,
-            ambient=ambient,
-            jumps=jumps,
-            power_jumps=power_jumps,
-        )
+        how: dict[str, Any] = {"power": power, "ambient": ambient, "jumps": jumps}
+        return self._noisy(t, truth, seed, gains=gains, power_jumps=power_jumps, **how)
 
     def measured(
         self,
@@ -194,13 +197,31 @@ class GasPathFilter(Parametric):
         """Measure true samples: as :meth:`recording`, from arrays of what is read, at t.
 
         Args:
-            truth: true values of the sensors, or of the outputs that they read.
+            truth: true values of the outputs that the sensors read, or of their readings under
+                names that are no outputs'.
         """
+        how: dict[str, Any] = {"power": power, "ambient": ambient, "jumps": jumps}
+        shown = self.sensors.true(t, truth)
+        return self._noisy(t, shown, seed, gains=gains, power_jumps=power_jumps, **how)
+
+    def _noisy(
+        self,
+        t: np.ndarray,
+        shown: Mapping[str, np.ndarray],
+        seed: int | np.random.Generator | None,
+        *,
+        gains: Mapping[str, float] | None,
+        power: tuple[np.ndarray, np.ndarray] | None,
+        ambient: Mapping[str, float] | None,
+        jumps: Sequence[float],
+        power_jumps: Mapping[float, float] | None,
+    ) -> Recording:
+        """Make the recording of what the sensors would show without errors."""
         rng = np.random.default_rng(seed) if isinstance(seed, int) else seed
         for n in gains or {}:
             self.sensors[n]
         # every sensor draws, so that the noise of one does not hang on what else is used
-        reading = self.sensors.measure(self.sensors.true(t, truth), rng, gains=gains)
+        reading = self.sensors.measure(shown, rng, gains=gains)
         known = power and (t, _windows(power[0], t.size), _windows(power[1], t.size))
         inputs: dict[str, Any] = {"jump": (t, jumps_at(t, dict.fromkeys(jumps, JUMP)))}
         if power_jumps:
@@ -229,11 +250,8 @@ class GasPathFilter(Parametric):
             DataError: as :func:`estimators.models.recording.record`.
         """
         # what a filter can know: the reading's own standard deviation
-        sigma = {
-            n: np.broadcast_to(self.sensors.sigma(n, v), v.shape)
-            for n, (_, v) in readings.items()
-            if n in self.sensors
-        }
+        own = {n: tv for n, tv in readings.items() if n in self.sensors}
+        sigma = {n: spread(self.sensors[n], *tv) for n, tv in own.items()}
         held: dict[str, Any] = {}
         for n in ("Wf", "PW") if self.known_power else ("Wf",):
             t, v, s = power if n == "PW" and power is not None else (*readings[n], sigma[n])
@@ -316,9 +334,10 @@ def gas_path_filter(
         SignalError: unknown parameter in ``free``.
     """
     gg = GasGenerator() if gg is None else gg
-    if missing := [n for n in ("Wf", "PW") if n not in sensors]:
+    held = ("Wf", "PW") if power == "measured" else ("Wf",)
+    if missing := [n for n in held if n not in sensors]:
         raise ParameterError(f"a gas-path filter takes {missing[0]} as an input: no sensor of it")
-    if late := [n for n in ("Wf", "PW") if sensors[n].tau]:
+    if late := [n for n in held if sensors[n].tau]:
         raise ParameterError(f"sensor {late[0]}: the lag of a measured input is not modelled")
     named = (sensors.uncertain if gains else ()) if isinstance(gains, bool) else tuple(gains)
     sigma = {"N": N_SIGMA} | dict.fromkeys(HEALTH, health_sigma)
@@ -326,19 +345,22 @@ def gas_path_filter(
     if power == "unknown":
         sigma["PW"] = PW_PRIOR[1]
         walks["PW"] = PW_WALK
-    sigma |= {f"gain_{n}": math.hypot(sensors[n].gain, model_error) for n in named}
+    sigma |= {f"gain_{n}": math.hypot(sensors[n].unsure("gain"), model_error) for n in named}
+    biased, consider = _offsets(sensors, named, (*sensors.outputs, *held))
+    sigma |= {f"bias_{s.name}": s.bias for s in biased}
+    walks |= {f"bias_{s.name}": s.drift for s in biased if s.drift}
     if inertia is not None and power == "measured":
         named = (*named, "J")
         sigma["gain_J"] = inertia
-    consider: tuple[str, ...] = ()
     if eta is not None:
-        named, consider = (*named, "PW"), ("gain_PW",) if consider_eta else ()
+        named, consider = (*named, "PW"), (*consider, *(["gain_PW"] if consider_eta else []))
         sigma["gain_PW"] = eta
     sigma |= {s.name: LAG_SIGMA * s.signal.nominal for s in sensors.sensors if s.tau}
     model = gas_path_model(
         gg,
         power=power,
         gains=named,
+        biases=tuple(s.name for s in biased),
         consider=consider,
         walks=tuple((walks | dict(walk or {})).items()),
         governed=governed,
@@ -348,6 +370,16 @@ def gas_path_filter(
     )
     sigma |= {n: FREE_SIGMA * model.x[n].nominal for n in free or {}}
     return GasPathFilter(gg, sensors, model, sigma)
+
+
+def _offsets(
+    sensors: SensorSet, gained: Sequence[str], used: Sequence[str]
+) -> tuple[list[Sensor], tuple[str, ...]]:
+    """Sensors whose offset is a state, and states that are considered: of gains and offsets."""
+    biased = [s for s in sensors.sensors if s.biased and s.name in used]
+    consider = [f"gain_{n}" for n in gained if sensors[n].gain_as == "considered"]
+    consider += [f"bias_{s.name}" for s in biased if s.bias_as == "considered"]
+    return biased, tuple(consider)
 
 
 def samples(ds: xr.Dataset, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
@@ -368,10 +400,18 @@ def samples(ds: xr.Dataset, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:
     return t, rows
 
 
-def true_readings(sensors: SensorSet, ds: xr.Dataset) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def true_readings(
+    sensors: SensorSet, ds: xr.Dataset, seed: int | None = None
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the filter's instants in a joint run, and what the sensors would read without errors.
 
-    The shaft power is the mean of the window from an instant to the next.
+    Each lags and is late as it declares.  The shaft power is the mean of the window from an instant
+    to the next.
+
+    Args:
+        sensors: the set.
+        ds: the run.
+        seed: of the jitter of their instants; None: none.
 
     Raises:
         DataError: the run has no samples 20 ms apart.
@@ -379,8 +419,13 @@ def true_readings(sensors: SensorSet, ds: xr.Dataset) -> tuple[np.ndarray, dict[
     t, rows = samples(ds)
     time = np.asarray(ds["time"].values, float)
     there = {n: np.asarray(ds[n].values, float) for s in sensors.sensors for n in s.reads}
-    truth = {n: v[rows] for n, v in sensors.true(time, there).items()}
-    return t, truth | {"PW": window_means(time, ds["PW"].values, t)}
+    of, late = Draws(seed), [s.name for s in sensors.sensors if s.delay or s.jitter]
+    truth = {
+        n: sampled(sensors[n], time, v, t, of) if n in late else v[rows]
+        for n, v in sensors.true(time, there).items()
+    }
+    delay = sensors["PW"].delay if "PW" in sensors else 0.0
+    return t, truth | {"PW": window_means(time, ds["PW"].values, t - delay)}
 
 
 def window_means(time: np.ndarray, held: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -114,10 +114,17 @@ def _relative(name: str, doc: str, default: float | None = 0.0) -> Signal:
     return Signal(name, "1", doc, default=default, nominal=0.01)
 
 
-def _states(known: bool, gains: Sequence[str], sensors: Sequence[Sensor]) -> Signals:
+def _states(
+    known: bool, gains: Sequence[str], biases: Sequence[str], sensors: Sequence[Sensor]
+) -> Signals:
     power = () if known else (dataclasses.replace(U["PW"], default=None),)
     docs = {n: _GAIN_DOCS.get(n, f"relative gain error of the sensor of {n}") for n in gains}
     errors = [_relative(f"gain_{n}", doc) for n, doc in docs.items()]
+    signals = {s.name: s for s in (*U, *(s.signal for s in sensors))}
+    errors += [
+        Signal(f"bias_{n}", s.unit, f"offset of the sensor of {n}", 0.0, 0.01 * s.nominal)
+        for n, s in ((n, signals[n]) for n in biases)
+    ]
     lags = [dataclasses.replace(s.signal, default=None) for s in sensors if s.tau]
     return Signals([*X, *THETA, *power, *errors, *lags])
 
@@ -173,6 +180,7 @@ def gas_path_model(
     *,
     power: str = "measured",
     gains: tuple[str, ...] = GAINED,
+    biases: tuple[str, ...] = (),
     consider: tuple[str, ...] = (),
     walks: tuple[tuple[str, float], ...] = (),
     governed: Governor | None = None,
@@ -191,6 +199,7 @@ def gas_path_model(
         power: ``"measured"``: PW is an input; ``"unknown"``: a state with a random walk.
         gains: sensors whose relative gain error is a state: of outputs (N excepted), Wf, PW; and J,
             the inertia, of which a relative error is a state in the same way.
+        biases: sensors whose offset is a state.
         consider: which states are considered, not estimated.
         walks: pairs of state name and random walk, unit of the state per sqrt(s).
         governed: law that the fuel follows within a step (limits left out); None: it is held.
@@ -210,7 +219,7 @@ def gas_path_model(
     _check_gains(power, gains, consider, power_jumps, {s.name for s in sensors})
     engines = gg.by_parameters if free else gg.family
     how: dict[str, Any] = {"power": power, "gains": gains, "consider": consider, "walks": walks}
-    how |= {"governed": governed, "power_jumps": power_jumps, "sensors": sensors}
+    how |= {"biases": biases, "governed": governed, "power_jumps": power_jumps, "sensors": sensors}
     made = _family(engines, **how).member(gg.held)
     return augment(made, dict(free)) if free else made
 
@@ -221,6 +230,7 @@ def _family(
     *,
     power: str,
     gains: tuple[str, ...],
+    biases: tuple[str, ...],
     consider: tuple[str, ...],
     walks: tuple[tuple[str, float], ...],
     governed: Governor | None,
@@ -229,7 +239,10 @@ def _family(
 ) -> FilterModel:
     """The model of all engines of a structure, with their numbers as known parameters."""
     known, numbers = power == "measured", Signals(engines.theta[len(THETA) :])
-    states, (inputs_of, noises) = _states(known, gains, sensors), _inputs(known, power_jumps)
+    states, (inputs_of, noises) = (
+        _states(known, gains, biases, sensors),
+        _inputs(known, power_jumps),
+    )
     signals = states, inputs_of, numbers, noises, Signals([s.signal for s in sensors])
     x, u, p, w = (ca.MX.sym(n, len(s)) for n, s in zip("xupw", signals, strict=False))
     dt = ca.MX.sym("dt")
@@ -238,8 +251,10 @@ def _family(
         for s, v in ((states, x), (inputs_of, u), (noises, w))
     )
 
-    def true(name: str) -> Any:  # reading = (1 + gain) true + sigma w
+    def true(name: str) -> Any:  # reading = (1 + gain) true + bias + sigma w
         error = given[f"sigma_{name}"] * noise[f"w_{name}"]
+        if name in biases:
+            error += at[f"bias_{name}"]
         return (given[name] - error) / (1 + at.get(f"gain_{name}", 0.0))
 
     reads = dict.fromkeys(n for s in sensors for n in s.reads if n not in X.names)
@@ -254,6 +269,10 @@ def _family(
     seen = {"N": N} | {n: y[i] for i, n in enumerate(reads)}
     own = {s: at[s.name] if s.tau else s.of(seen) for s in sensors}
     readings = [v * (1 + at.get(f"gain_{s.name}", 0.0)) for s, v in own.items()]
+    readings = [
+        v + at[f"bias_{s.name}"] if s.name in biases else v
+        for s, v in zip(own, readings, strict=True)
+    ]
     # a jump happens at the beginning of the step, after the sample
     at |= {n: at[n] + given["jump"] * noise[f"w_{n}"] for n in HEALTH}
     if power_jumps:

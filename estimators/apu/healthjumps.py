@@ -7,6 +7,7 @@ opened for it where the innovations say so (:func:`track_jumps`).
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,12 +38,15 @@ class JumpTest:
             samples and windows, so that the true rate is lower.
         margin: factor on the threshold for what the model does not hold.
         hold: samples after a jump, or after the start, in which no new alarm is raised.
+        limit: an innovation counts no more than this many standard deviations, so that a single
+            wild reading is no jump.
     """
 
     windows: tuple[int, ...] = (1, 3, 10, 30)
     rate: float = 1.0
     margin: float = 1.25
     hold: int = 25
+    limit: float = math.inf
 
     def threshold(self, ny: int, dt: float = DT) -> float:
         """Threshold of the statistic for ``ny`` outputs."""
@@ -51,7 +55,7 @@ class JumpTest:
 
     def first(self, result: FilterResult, start: int) -> tuple[int, int] | None:
         """Return the first alarm at or after sample ``start``: (alarm, onset), or None."""
-        e = whitened(result)
+        e = whitened(result, self.limit)
         total = np.concatenate([np.zeros((1, e.shape[1])), np.cumsum(e, axis=0)])
         K = e.shape[0]
         best = np.zeros(K)
@@ -69,15 +73,18 @@ class JumpTest:
         return k, k + 1 - int(lengths[int(stat.argmax())])
 
 
-def whitened(result: FilterResult) -> np.ndarray:
+def whitened(result: FilterResult, limit: float = math.inf) -> np.ndarray:
     """Innovations made uncorrelated and of unit variance, shape (K, ny); 0 where not measured.
+
+    Each counts no more than ``limit`` of its own standard deviations.
 
     Raises:
         EstimationError: the filter did not keep the innovations' covariances.
     """
     if result.innovation_cov is None:
         raise EstimationError("whitened innovations need a filter run with full=True")
-    nu = np.nan_to_num(result.innovation.T)
+    most = limit * np.sqrt(np.nan_to_num(result.innovation_variance, nan=1.0).T)
+    nu = np.clip(np.nan_to_num(result.innovation.T), -most, most)
     L = np.linalg.cholesky(result.innovation_cov)
     return np.asarray(np.linalg.solve(L, nu[..., None])[..., 0])
 
@@ -90,11 +97,14 @@ class Tracked:
         result: every sample's belief is what was known then: before an alarm from the run without
             that jump.
         alarms, onsets: samples of the alarms, and the last samples before the jumps they report.
+        data, prior: what the filter was run on, with the jumps, and began with; None: its own.
     """
 
     result: FilterResult
     alarms: tuple[int, ...]
     onsets: tuple[int, ...]
+    data: Recording
+    prior: Belief | None = None
 
 
 def track_jumps(
@@ -136,7 +146,7 @@ def track_jumps(
         data = Recording(data.t, u, data.y, data.variance, data.p)
         result = _spliced(result, filt.run(data, prior=prior, step=step, backend=backend), k)
         start = k + test.hold
-    return Tracked(result, tuple(alarms), tuple(onsets))
+    return Tracked(result, tuple(alarms), tuple(onsets), data, prior)
 
 
 def _spliced(before: FilterResult, after: FilterResult, k: int) -> FilterResult:

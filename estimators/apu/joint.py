@@ -51,6 +51,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
+from estimators.apu.priorfile import Prior
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, StepMaker, run
@@ -63,6 +64,7 @@ __all__ = [
     "ETA_SIGMA",
     "ElectricalSide",
     "JointCase",
+    "beside_truth",
     "better_speed",
     "cross_talk",
     "electrical_samples",
@@ -140,7 +142,8 @@ def loosened(sensors: SensorSet) -> SensorSet:
     noise = {}
     for s in sensors.sensors:
         size = rated.get(s.name, rated.get(s.name[0])) if s.name != "w_r" else 0.0
-        noise[s.name] = math.hypot(s.noise, s.gain * float(size or 0.0) / math.sqrt(2))
+        gain = s.unsure("gain") * float(size or 0.0) / math.sqrt(2)
+        noise[s.name] = math.hypot(s.noise, gain, s.unsure("bias"))
     return sensors.change(**noise)
 
 
@@ -279,7 +282,7 @@ def electrical_side(
     for k in changes:
         begin = max([v for v in resets if v <= t[k] + 1e-9] + [float(t[0])])
         # whole windows: from the beginning of the one in which the machine changed
-        first = int(np.floor((begin - t[0]) / DT + 1e-6))
+        first = min(int(np.floor((begin - t[0]) / DT + 1e-6)), k - 1)
         _, P_k, var_k, _ = windows((PHASES[phase[k] - 1],), float(t[first]))
         last = k
         while last + 1 < K and phase[last + 1] == phase[k]:
@@ -358,7 +361,7 @@ def estimate_joint(
     """
     apu = Apu() if apu is None else apu
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
-    t, rows = samples(ds)
+    t, _ = samples(ds)
     measured = electrical_samples(ds, apu, rng, sensors=electrical_sensors, gains=electrical_gains)
     how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend}
     also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
@@ -378,7 +381,7 @@ def estimate_joint(
         efficiency_error=(gas_gains or {}).get("PW", 0.0),
         **how,
     )
-    return _as_dataset(ds, t, rows, side, gas, tracked)
+    return beside_truth(ds, side, gas, tracked)
 
 
 def fused(
@@ -392,10 +395,12 @@ def fused(
     power: bool = True,
     efficiency_error: float = 0.0,
     prior: Mapping[str, float] | None = None,
+    spread: Prior | None = None,
     inputs: Mapping[str, Any] | None = None,
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
     step: StepMaker | None = None,
+    test: JumpTest = TEST,
     backend: str | None = None,
     max_dt: float = math.inf,
 ) -> tuple[GasPathFilter, Tracked]:
@@ -411,7 +416,9 @@ def fused(
         power: whether the filter gets the shaft power.
         efficiency_error: actual relative error of the generators' efficiency.
         prior: means of the start by state.
+        spread: of which the standard deviations are taken.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
+        test: of jumps of the health.
         eta, gain_errors, step, backend: as for :func:`estimate_joint`.
     """
     gas = _gas_filter(apu, sensors, power, gain_errors, eta)
@@ -434,8 +441,10 @@ def fused(
         N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
         N[rows], N_sigma[rows] = speed_from_generators(*speed, speed_sigma, data.t[rows], apu)
         data = better_speed(gas, data, N, N_sigma)
-    start = gas.prior(**(prior or {}))
-    return gas, track_jumps(gas, data, test=TEST, prior=start, step=step, backend=backend)
+    if spread is not None:
+        spread.check(gas.model.x)
+    start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
+    return gas, track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
 
 
 def _gas_filter(
@@ -453,16 +462,18 @@ def _gas_filter(
     )
 
 
-def _as_dataset(
-    ds: xr.Dataset,
-    t: np.ndarray,
-    rows: np.ndarray,
-    side: ElectricalSide,
-    gas: GasPathFilter,
-    tracked: Tracked,
+def beside_truth(
+    ds: xr.Dataset, side: ElectricalSide, gas: GasPathFilter, tracked: Tracked
 ) -> xr.Dataset:
-    """Put estimates beside the truth."""
-    r = tracked.result
+    """Put estimates beside the truth of a run, as :func:`estimate_joint` returns them.
+
+    Args:
+        ds: the run.
+        side: of one machine; its instants are those of the result.
+        gas, tracked: filter and result of the gas path.
+    """
+    r, t = tracked.result, side.t
+    rows, k = (np.searchsorted(v, t + 1e-7) - 1 for v in (ds["time"].values, r.t))
     values: dict[str, Any] = {}
     signals: list[Signal] = []
 
@@ -473,7 +484,8 @@ def _as_dataset(
 
     for name in ("N", *HEALTH):
         x = gas.model.x[name]
-        put(name, x.unit, x.doc, *r[name], ds[name].values[rows])
+        mean, sigma = r[name]
+        put(name, x.unit, x.doc, mean[k], sigma[k], ds[name].values[rows])
     true_phase = _phase_of(ds)
     h, h_sigma = side.severities
     for i, phase in enumerate(PHASES):
@@ -488,11 +500,11 @@ def _as_dataset(
         Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c"),
         Signal("nis", "1", "normalised innovation squared of the gas-path filter"),
     ]
-    values |= {"faulty_phase": side.phase, "nis": r.nis}
+    values |= {"faulty_phase": side.phase, "nis": r.nis[k]}
     at = {
         "resets": side.resets,
-        "alarms": [float(t[i]) for i in tracked.alarms],
-        "onsets": [float(t[i]) for i in tracked.onsets],
+        "alarms": [float(r.t[i]) for i in tracked.alarms],
+        "onsets": [float(r.t[i]) for i in tracked.onsets],
     }
     attrs = {n: json.dumps(v) for n, v in at.items()}
     return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)

@@ -1,100 +1,40 @@
-"""Recordings made from runs: what the sensors of a table read, with noise and gain errors.
+"""Recordings made from runs: what the sensors of a set read, with all that they declare.
 
 The gas path is sampled every 20 ms, the generators at the instants of the run's waveforms.  A file
-of sensors changes single numbers, or adds a sensor that is known:
-
-    [T5]
-    noise = 0.004          # of the reading, where the table's is
-    gain = 0.0
-    rate = 10              # Hz
-    [T41]                  # another sensor
-    [i_a]
-    noise = 2.0            # A
+of sensors changes the set (:mod:`estimators.apu.sensorfile`).
 
 The draws are those of the joint estimation: gain errors of ``(seed, 0)``, noise of the generators'
-sensors of ``(seed, 1)``, of the gas path's of ``(seed, 2)``.
+sensors of ``(seed, 1)``, of the gas path's of ``(seed, 2)``; offsets, drifts and jitter of
+``(seed, 3)`` and the sensor's name.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, ParameterError, nearest
+from apu_casadi.core.resultformats import frames, save_frame
 from apu_casadi.core.results import GENERATOR, generators_of, of_generator, save
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.gaspath import true_readings
 from estimators.apu.joint import electrical_samples, unit_of
-from estimators.apu.sensors import ELECTRICAL, KNOWN, SensorSet, gas_path_table
+from estimators.apu.sensorchain import Draws, disturbed, sampled_wave
+from estimators.apu.sensorfile import SensorFile, read_sensors
+from estimators.apu.sensors import SensorSet
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["SensorFile", "measure_run", "read_sensors", "write_recording"]
+__all__ = ["SensorFile", "drawn_gains", "measure_run", "read_sensors", "write_recording"]
 
-KEYS = ("noise", "gain", "rate")
 FORMATS = (".csv", ".parquet", ".nc")
-
-
-@dataclass(frozen=True)
-class SensorFile:
-    """What is measured how well, and how often.
-
-    Args:
-        gas_path, electrical: 1-sigma tables.
-        rates: of sensors that are read less often than the others, Hz.
-    """
-
-    gas_path: SensorSet = field(default_factory=gas_path_table)
-    electrical: SensorSet = ELECTRICAL
-    rates: Mapping[str, float] = field(default_factory=dict)
-
-
-def read_sensors(path: str | Path | None) -> SensorFile:
-    """Read a file of sensors; None gives the tables as they are.
-
-    Raises:
-        DataError: no such file, no TOML, an unknown sensor or key, no number.
-    """
-    sets, rates = [gas_path_table(), ELECTRICAL], dict[str, float]()
-    if path is None:
-        return SensorFile(sets[0], sets[1])
-    try:
-        data = tomllib.loads(files.read_text(path))
-    except tomllib.TOMLDecodeError as e:
-        raise DataError(f"{path}: no TOML: {e}") from None
-    valid = (*KNOWN, *ELECTRICAL.names)
-    for name, row in data.items():
-        if name not in valid:
-            raise DataError(f"{path}: unknown sensor {name!r} {nearest(name, valid)}")
-        if not isinstance(row, dict):
-            raise DataError(f"{path}: a table [{name}] is expected, got {row!r:.40}")
-        for key, v in row.items():
-            if key not in KEYS:
-                raise DataError(f"{path}, {name}: unknown key {key!r} {nearest(key, KEYS)}")
-            least = "> 0" if key == "rate" else ">= 0"
-            if isinstance(v, bool) or not isinstance(v, int | float) or not 0 <= v < 1e12:
-                raise DataError(f"{path}, {name}: {key} must be a number {least}, got {v!r:.40}")
-        k = int(name in ELECTRICAL)
-        sets[k] = sets[k] if k else sets[k].including(name)
-        numbers: dict[str, Any] = {n: float(v) for n, v in row.items() if n != "rate"}
-        new = dataclasses.replace(sets[k][name], **numbers, source=str(path))
-        sets[k] = SensorSet(tuple(new if s.name == name else s for s in sets[k].sensors))
-        if "rate" in row:
-            if not row["rate"] > 0:
-                raise DataError(f"{path}, {name}: rate must be a number > 0, got {row['rate']}")
-            rates[name] = float(row["rate"])
-    return SensorFile(sets[0], sets[1], rates)
 
 
 def measure_run(
@@ -110,9 +50,9 @@ def measure_run(
     Args:
         ds: the run.
         apu: the unit, for the gears.
-        seed: of gain errors and noise; None: neither.
+        seed: of all that is drawn; None: nothing.
         sensors: what is measured; the tables by default.
-        gains: whether there are gain errors.
+        gains: whether constant errors, gains and offsets, are drawn.
 
     Returns:
         ``gaspath`` and, where the run has waveforms, ``electrical``: readings on ``time``, gaps
@@ -128,16 +68,24 @@ def measure_run(
     if missing:
         raise DataError(f"the run has no {', '.join(missing)} to be measured")
     with_gains = draws[0] if gains else None
-    gas_gains = _drawn(s.gas_path, (*s.gas_path.uncertain, "PW"), with_gains)
-    t, truth = true_readings(s.gas_path, ds)
-    made = {"gaspath": s.gas_path.measure(truth, draws[2], gains=gas_gains)}
+    t, truth = true_readings(s.gas_path, ds, seed)
+    truth = {n: v for n, v in truth.items() if n in s.gas_path}
+    read = s.gas_path.measure(truth, draws[2], gains=_drawn(s.gas_path, _gained(s), with_gains))
+    made = {"gaspath": disturbed(s.gas_path, t, read, Draws(seed), errors=gains)}
     times = {"gaspath": t}
-    if "time_w" in ds:
+    if "time_w" in ds and s.electrical.sensors:
         made["electrical"] = {}
-        for ending, one, view in _machines(ds, apu):
-            own = _drawn(s.electrical, GAIN_SENSORS, with_gains)
-            read = electrical_samples(view, one, draws[1], sensors=s.electrical, gains=own)
-            times["electrical"] = read.pop("t")
+        for number, (ending, one, view) in enumerate(_machines(ds, apu), 1):
+            own, of = _drawn(s.electrical, GAIN_SENSORS, with_gains), Draws(seed, number)
+            true = electrical_samples(view, one, None)
+            times["electrical"] = t_w = true.pop("t")
+            here = {
+                n: sampled_wave(s.electrical[n], t_w, true[n], of)
+                for n in true
+                if n in s.electrical
+            }
+            read = s.electrical.measure(here, draws[1], gains=own)
+            read = disturbed(s.electrical, t_w, read, of, errors=gains)
             made["electrical"] |= {f"{n}{ending}": v for n, v in read.items()}
     for n in s.rates:
         if not any(n in read for read in made.values()):
@@ -148,10 +96,25 @@ def measure_run(
     }
 
 
+def drawn_gains(sensors: SensorFile, seed: int) -> dict[str, float]:
+    """Return the gain errors of the gas path that :func:`measure_run` draws for a seed.
+
+    That of ``PW`` is the error of the generators' efficiency.
+    """
+    return _drawn(sensors.gas_path, _gained(sensors), np.random.default_rng([seed, 0]))
+
+
+def _gained(sensors: SensorFile) -> tuple[str, ...]:
+    return (*sensors.gas_path.uncertain, "PW")
+
+
 def _drawn(
-    table: SensorSet, names: tuple[str, ...], rng: np.random.Generator | None
+    table: SensorSet, names: Sequence[str], rng: np.random.Generator | None
 ) -> dict[str, float]:
-    return {} if rng is None else table.draw_gains(rng, names)
+    """Return gain errors: the expected ones, and what is drawn of those named."""
+    drawn = {} if rng is None else table.draw_gains(rng, [n for n in names if n in table])
+    means = {s.name: s.gain_mean for s in table.sensors if s.gain_mean}
+    return drawn | {n: m + drawn.get(n, 0.0) for n, m in means.items()}
 
 
 def _machines(ds: xr.Dataset, apu: Apu) -> list[tuple[str, Apu, xr.Dataset]]:
@@ -218,15 +181,5 @@ def write_recording(readings: Mapping[str, xr.Dataset], path: str | Path) -> lis
         if ending == ".nc":
             made.append(save(ds, target))
             continue
-        named: dict[Any, str] = {n: f"{n} [{ds[n].attrs['units']}]" for n in ("time", *ds)}
-        frame = ds.to_dataframe().reset_index().rename(columns=named)
-        if ending == ".csv":
-            made.append(files.write_text(target, frame.to_csv(index=False, float_format="%.12g")))
-            continue
-        with files.whole(target) as part:
-            try:
-                frame.to_parquet(part, index=False)
-            except ImportError as e:
-                raise DataError(f"{target}: Parquet needs pyarrow: {e}") from None
-        made.append(target)
+        made.append(save_frame(frames(ds)["time"], target))
     return made

@@ -15,8 +15,9 @@ believed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,29 +25,41 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
-from apu_casadi.gaspath.health import HEALTH
-from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
+from estimators.apu.believable import (
+    Doubt,
+    channel_doubts,
+    gas_causes,
+    gas_doubts,
+    machine_causes,
+    machine_doubts,
+)
+from estimators.apu.declared import as_declared, tables
+from estimators.apu.electrical.causes import Causes
 from estimators.apu.electrical.electricalfilter import window_starts
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
 from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES_V, VOLTAGES
-from estimators.apu.gaspath import N_SIGMA, GasPathFilter, gas_path_filter
+from estimators.apu.electrical.wild import wild_samples
+from estimators.apu.gaspath import (
+    ITERATED,
+    ITERATIONS,
+    N_SIGMA,
+    GasPathFilter,
+    gas_path_filter,
+)
 from estimators.apu.gaspathmodel import DT
-from estimators.apu.healthjumps import Tracked, track_jumps
+from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.joint import (
     ETA_SIGMA,
-    H_FLOOR,
-    H_GAIN,
     ElectricalSide,
     electrical_side,
     fused,
     unit_of,
 )
+from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
-    SURE,
-    Z95,
     gas_dataset,
     gas_report,
     machine_report,
@@ -55,15 +68,17 @@ from estimators.apu.recorded_report import (
     words,
 )
 from estimators.apu.recordings.measured import Measurements
-from estimators.apu.recordings.plausible import WAVES, clipped, plain
-from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
+from estimators.apu.sensorfile import SensorFile
+from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
-from estimators.information.consistency import exceeded
+from estimators.filters.robust import limit_of, robust_ekf_step
+from estimators.models.recording import Recording
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["PARTS", "RecordedEstimate", "estimate"]
+__all__ = ["PARTS", "RecordedEstimate", "estimate", "gas_path_data"]
 
 PARTS = ("gaspath", "electrical")
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -72,10 +87,10 @@ PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
-RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
-STILL = 25  # equal readings in a row that noise does not give
 FEWEST = 20  # innovations that a verdict takes
-STEEP = 0.1  # change of a factor beyond which no filter was tried
+#: The gas path's filter step, and its test of jumps, that single wild readings do not reach.
+ROBUST = partial(robust_ekf_step, iterations=ITERATIONS, iterated=ITERATED)
+JUMPS = JumpTest(limit=limit_of())
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +106,9 @@ class RecordedEstimate:
         notes: how the recording was understood, and what was assumed.
         doubts: why the estimates are not to be believed.
         result: of the gas-path filter; None: not estimated.
+        path: the gas-path filter and its result with the jumps that it found.
+        sides: what the electrical filters say, by machine.
+        causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
     """
 
     gaspath: xr.Dataset | None
@@ -101,6 +119,9 @@ class RecordedEstimate:
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
     result: FilterResult | None = field(default=None, repr=False)
+    path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
+    sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
+    causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -119,6 +140,7 @@ class RecordedEstimate:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
+        out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
         return out | {"lacking": dict(self.lacking), "notes": list(self.notes)}
 
     def summary(self) -> str:
@@ -131,9 +153,11 @@ def estimate(
     engine: Apu | str | Path | None = None,
     *,
     only: str | None = None,
-    sensors: SensorSet | None = None,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
     electrical_sensors: SensorSet = ELECTRICAL,
     ambient: Mapping[str, float] | None = None,
+    prior: Prior | str | Path | None = None,
+    efficiency_error: float = 0.0,
     backend: str | None = None,
 ) -> RecordedEstimate:
     """Estimate what the channels of a recording suffice for.
@@ -142,11 +166,14 @@ def estimate(
         m: of :func:`estimators.apu.recordings.measured.read_recording`.
         engine: the unit as the filters know it, or its file or name; the paper's by default.
         only: ``"gaspath"`` or ``"electrical"``; both by default.
-        sensors: 1-sigma table of the gas path; default: :func:`gas_path_table` and whatever known
-            sensor was measured besides.
-        electrical_sensors: the same of the generators.
+        sensors: of the gas path, or of all, or their file; default: :func:`gas_path_table` and
+            whatever known sensor was measured besides.
+        electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
+        prior: means and standard deviations of states of the gas-path filter, or their file.
+        efficiency_error: actual relative error of the generators' efficiency, where the shaft power
+            comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
 
     Raises:
@@ -157,47 +184,85 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
     lacking: dict[str, str] = {}
-    notes, doubts = list(m.notes), list(_odd_channels(m, table))
+    ready = as_declared(m, *tables(m, sensors, electrical_sensors))
+    m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
+    notes = [*m.notes, *ready.notes]
+    doubts = list[str]([*ready.doubts, *channel_doubts(m, table, ready.coarse)])
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
-    reason = None if only == "electrical" else _no_gas_path(m, table)
-    gas = reason is None and only != "electrical"
+    causes: dict[str, tuple[Causes, ...]] = {}
+    reason = _no_gas_path(m, table) if only != "electrical" else "it was not asked for"
+    gas = reason is None
     if only != "electrical" and reason is not None and (m.gaspath or only):
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
-    if only != "gaspath" and m.electrical:
-        for k in _machines(m):
-            waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
-            found |= waves.sequences(lacking)
-            side = waves.side(begin, lacking, doubts)
-            if side is not None:
-                sides[k] = side
-    elif only == "electrical":
+    for k in _machines(m) if only != "gaspath" and m.electrical else ():
+        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
+        found |= waves.sequences(lacking)
+        side = waves.side(begin, lacking, doubts, notes, causes)
+        if side is not None:
+            sides[k] = side
+    if only == "electrical" and not m.electrical:
         lacking["generators"] = "nothing of them was measured"
-    tracked: Tracked | None = None
-    e = None
+    found_by, e = None, None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
-        path = _GasPath(m, apu, table, ambient or {}, notes, doubts, backend)
-        filt, tracked = path.run(fusable, electrical_sensors)
+        given = ambient or {}, notes, doubts, backend, start, efficiency_error
+        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
         e = gas_dataset(filt, tracked)
-        _judge_gas(filt, tracked, list(sides.values()), doubts)
+        doubts += gas_doubts(filt, tracked, list(sides.values()))
+        causes["gas path"], odd = _told(gas_causes(filt, tracked))
+        doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
-    if apu.alike and 0 < len(sides) < len(apu.machines):
-        notes.append(
-            f"only machine {', '.join(map(str, sides))} is estimated; power is that of "
-            f"{len(apu.machines)} equal ones"
-        )
+    if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
+        some = ", ".join(map(str, sides))
+        notes.append(f"only machine {some} is estimated; power is that of {n} equal ones")
     machines = {k: side_dataset(s) for k, s in sides.items()}
-    result = None if tracked is None else tracked.result
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, result)
+    end: Any = found_by and found_by[1].result, found_by, sides, causes
+    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
+
+
+def gas_path_data(
+    m: Measurements,
+    engine: Apu | str | Path | None = None,
+    *,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
+    ambient: Mapping[str, float] | None = None,
+    prior: Prior | str | Path | None = None,
+) -> tuple[GasPathFilter, Recording, Belief, tuple[str, ...]]:
+    """Return the gas-path filter that a recording suffices for, its data, its prior, and notes.
+
+    Args:
+        m, engine, sensors, ambient, prior: as of :func:`estimate`.
+
+    Raises:
+        ParameterError, DataError: as of :func:`estimate`; the recording has no gas path.
+    """
+    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    ready = as_declared(m, *tables(m, sensors, ELECTRICAL))
+    if reason := _no_gas_path(ready.m, ready.gas_path):
+        raise DataError(f"no gas path: {reason}")
+    notes = [*m.notes, *ready.notes, *ready.doubts]
+    given = ambient or {}, notes, notes, None, start, 0.0
+    path = _GasPath(ready.m, apu, ready.gas_path, *given)
+    filt, data, begin = path.alone()
+    return filt, data, begin, tuple(dict.fromkeys(notes))
+
+
+def _told(
+    found: Iterable[tuple[Causes, Doubt | None]],
+) -> tuple[tuple[Causes, ...], list[Doubt]]:
+    """Part causes from the doubts that they raise."""
+    both = list(found)
+    return tuple(c for c, _ in both), [d for _, d in both if d is not None]
 
 
 def _fusable(
@@ -227,36 +292,11 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     """Say why there is no gas-path estimate; None if there is one."""
     if "Wf" not in m or not np.isfinite(m["Wf"].values).any():
         return "the filter takes the fuel flow Wf as an input, which was not measured"
+    if "Wf" not in table:
+        return "the filter takes the fuel flow Wf as an input, which the file of sensors lacks"
     if not [n for n in table.outputs if n in m and n != "N"]:
         return f"none of {', '.join(n for n in table.outputs if n != 'N')} was measured"
     return None
-
-
-def _odd_channels(m: Measurements, table: SensorSet) -> Iterator[str]:
-    """Say which sensors stand still while most others move, or are clipped."""
-    used = (*table.names, *m.electrical)
-    sensors = {n: c for n, c in m.items() if n in used and np.isfinite(c.values).any()}
-    for n, c in sensors.items():
-        others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
-        rows = _still(c.values, others)
-        if rows is not None:
-            yield f"{c.source}: {n} stands still from {c.t[rows[0]]:g} to {c.t[rows[1]]:g} s"
-        count = clipped(c.values) if plain(n) in WAVES else 0
-        if count:
-            yield f"{c.source}: {count} samples of {n} are clipped"
-
-
-def _still(values: np.ndarray, others: Sequence[np.ndarray]) -> tuple[int, int] | None:
-    """First and last row of the longest run of one reading, if most others change in it."""
-    change = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
-    length = np.diff(np.append(change, values.size))
-    k = int(length.argmax())
-    if length[k] < STILL:
-        return None
-    part = slice(change[k], change[k] + length[k])
-    there = [o[part][np.isfinite(o[part])] for o in others]
-    moving = [np.ptp(o) > 0 for o in there if o.size]
-    return (int(change[k]), int(part.stop) - 1) if moving and np.mean(moving) > 0.5 else None
 
 
 def _machines(m: Measurements) -> list[int]:
@@ -307,11 +347,16 @@ class _Waves:
             )
 
     def side(
-        self, begin: float, lacking: dict[str, str], doubts: list[str]
+        self,
+        begin: float,
+        lacking: dict[str, str],
+        doubts: list[str],
+        notes: list[str],
+        causes: dict[str, tuple[Causes, ...]],
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
         what = f"severity, machine {self.number}"
-        no = self.m.lacking(NEEDED)
+        no = [n for n in NEEDED if n not in self.m or n not in self.sensors]
         if no:
             lacking[what] = f"the electrical filter needs {', '.join(no)} too"
             return None
@@ -334,17 +379,28 @@ class _Waves:
             a = {n: v[a["t"] >= begin - 1e-9] for n, v in a.items()}
             if a["t"].size < 2 or a["t"][-1] - a["t"][0] < DT:
                 raise DataError(f"the waveforms hold no window of {DT * 1e3:g} ms")
+            a = self._tame(a, notes)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
             side = electrical_side(self.apu, self.sensors, a, t, backend=self.backend)
         except (DataError, EstimationError) as e:
             lacking[what] = str(e)
             return None
-        # gain errors are taken for noise, so that they are there as offsets
-        found = [(v - DT, v + DT) for v in (side.t[0], *side.resets)]
-        odd = _unexplained(side.result, found, offset=3.0)
-        doubts += (f"machine {self.number}, {text}" for text in (*odd, *_restless(side)))
+        how, name = (side, self.apu.generator.machine, self.sensors, a), f"machine {self.number}"
+        causes[name], odd = _told(machine_causes(*how))
+        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
         return side
+
+    def _tame(self, a: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
+        """Take single wild samples of the waveforms for missing."""
+        names = (*PHASES_V, *PHASES_I)
+        sigma = {n: self.sensors.sigma(n, 0.0) for n in names}
+        w = float(np.nanmedian(a["w_r"]))
+        wild = wild_samples(a["t"], {n: a[n] for n in names}, w, sigma)
+        told = ", ".join(f"{int(v.sum())} of {n}" for n, v in wild.items() if v.any())
+        if told:
+            notes.append(f"machine {self.number}: single wild samples are taken for gaps: {told}")
+        return a | {n: np.where(v, np.nan, a[n]) for n, v in wild.items() if v.any()}
 
 
 # ------------------------------------------------------------------------------ gas path
@@ -361,22 +417,18 @@ class _GasPath:
     notes: list[str]
     doubts: list[str]
     backend: str | None
+    prior: Prior
+    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
     ) -> tuple[GasPathFilter, Tracked]:
         """Filter, with the power of the electrical side where there is one."""
         sides = list(of.values())
-        power = bool(sides) or "PW" in self.m
-        # speed and the measured inputs stay in the table
-        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
-        sensors = self.table.only([n for n in self.table.names if n not in absent])
-        inputs = self._inputs()
+        power = bool(sides) or self._power_measured
+        sensors, inputs = self._there(), self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
-        gg = self.apu.gas_generator
-        if not power:
-            self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
             own = self.m.machine(next(iter(of))).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
@@ -388,21 +440,51 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors),
+                prior=self._start(readings, sensors) | dict(self.prior.mean),
+                spread=self.prior,
+                efficiency_error=self.efficiency_error,
                 inputs=inputs,
+                step=ROBUST,
+                test=JUMPS,
                 backend=self.backend,
                 max_dt=STEP,
             )
+        filt, data, start = self._ready(sensors, readings, inputs, power)
+        how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
+        return filt, track_jumps(filt, data, prior=start, **how)
+
+    def alone(self) -> tuple[GasPathFilter, Recording, Belief]:
+        """Return the filter without an electrical side, its recording, and its prior."""
+        sensors, power, inputs = self._there(), self._power_measured, self._inputs()
+        span = (-math.inf, math.inf)
+        readings = self._readings(sensors, inputs, span, known_power=power)
+        return self._ready(sensors, readings, inputs, power)
+
+    @property
+    def _power_measured(self) -> bool:
+        return "PW" in self.m and "PW" in self.table
+
+    def _there(self) -> SensorSet:
+        """The sensors that were measured; speed and the measured inputs stay in the table."""
+        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
+        return self.table.only([n for n in self.table.names if n not in absent])
+
+    def _ready(
+        self, sensors: SensorSet, readings: Streams, inputs: Mapping[str, Any], power: bool
+    ) -> tuple[GasPathFilter, Recording, Belief]:
+        if not power:
+            self.notes.append("no shaft power was measured: it is a random walk")
         filt = gas_path_filter(
-            gg,
+            self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
             eta=ETA_SIGMA if power else None,
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        start = filt.prior(**self._start(readings, sensors))
-        return filt, track_jumps(filt, data, prior=start, backend=self.backend)
+        self.prior.check(filt.model.x)
+        means = self._start(readings, sensors) | dict(self.prior.mean)
+        return filt, data, filt.prior(self.prior.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""
@@ -481,75 +563,3 @@ class _GasPath:
                 out["N"] = N
                 self.notes.append(f"the start is at {N:.1f} rad/s, not at the governed speed")
         return out
-
-
-# ------------------------------------------------------------------------------ judging
-
-
-def _unexplained(
-    r: FilterResult, explained: Sequence[tuple[float, float]], *, offset: float = 0.0
-) -> Iterator[str]:
-    """Say which sensors the model and the stated noise do not explain, by their innovations.
-
-    Args:
-        r: of the filter.
-        explained: intervals that a report explains, s.
-        offset: constant offsets of the sensors that must be allowed for, sigmas.
-    """
-    quiet = np.ones(r.t.size, bool)
-    for begin, end in explained:
-        quiet &= (r.t <= begin + 1e-9) | (r.t > end + 1e-9)
-    for name, e, s in zip(r.y.names, r.innovation, r.innovation_variance, strict=True):
-        z = (e / np.sqrt(s))[quiet & np.isfinite(e)]
-        if z.size < FEWEST:
-            continue
-        if (z @ z) > (1.25 + offset**2) * exceeded(1e-4, z.size):
-            yield (
-                f"{name}: its innovations are {math.sqrt(z @ z / z.size):.2f} times what model "
-                "and stated noise explain"
-            )
-        # white, if the filter is right
-        elif abs(z.mean()) > offset + 6 / math.sqrt(z.size):
-            yield f"{name}: its innovations have a mean of {z.mean():+.2f} sigma"
-
-
-def _restless(side: ElectricalSide) -> Iterator[str]:
-    """Say where the electrical filter starts again and again, or finds several phases faulty."""
-    often = [v for k, v in enumerate(side.resets[2:]) if v - side.resets[k] <= RESTLESS]
-    if often:
-        yield (
-            f"its filter began anew {len(side.resets)} times up to {side.resets[-1]:g} s, as after "
-            "a step of load or a fault: no model of one step fits, and reports around are doubtful"
-        )
-    h, s = side.severities
-    second = np.sort((h - H_FLOOR) / s, axis=0)[-2]
-    several = np.flatnonzero((side.phase > 0) & (second > 5))
-    if several.size:
-        yield (
-            f"at {side.t[several[0]]:g} s several phases look faulty at once, which is no short "
-            "circuit of one phase"
-        )
-
-
-def _judge_gas(
-    filt: GasPathFilter, tracked: Tracked, sides: list[ElectricalSide], doubts: list[str]
-) -> None:
-    """Say why the gas-path estimate is not to be believed."""
-    r = tracked.result
-    each = zip(tracked.onsets, tracked.alarms, strict=True)
-    doubts += _unexplained(r, [(float(r.t[i]), float(r.t[k]) + 0.1) for i, k in each])
-    if len(tracked.alarms) >= 8:
-        doubts.append("8 changes of health were reported, and further ones were not looked for")
-    x, s = (np.array([r[n][k][-1] for n in HEALTH]) for k in (0, 1))
-    for n, v in zip(HEALTH, x, strict=True):
-        if abs(v - 1) > STEEP:
-            doubts.append(f"{n} = {v:.3f} is farther from 1 than any that the filter was tried on")
-    changed = bool(tracked.alarms) or bool((np.abs(x - 1) > SURE * s).any())
-    for side in sides:
-        h, h_sigma = side.severities[:, :, -1]
-        i = int((h / np.hypot(h_sigma, H_GAIN)).argmax())
-        if changed and not side.phase[-1] and h[i] > 2 * h_sigma[i]:
-            doubts.append(
-                f"a short circuit of h_{PHASES[i]} = {h[i]:.1e} +- {Z95 * h_sigma[i]:.1e} may be "
-                "there, too small to be told from gain errors; the change of health may be its loss"
-            )

@@ -159,6 +159,11 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
         if not s["alarms"]:
             few = f"{s['windows']} windows are too few to look for a change"
             yield "  no change of it" if s["reference_windows"] else f"  {few}"
+    for n, told in r["causes"].items():
+        for c in told:
+            likely = sorted(c["probability"].items(), key=lambda x: -x[1])[:3]
+            shown = ", ".join(f"{what} {100 * p:.0f} %" for what, p in likely if p > 0.005)
+            yield f"{n}: the change at {c['t']:g} s is: {shown}"
     yield from (f"not estimated: {n}: {why}" for n, why in r["lacking"].items())
     yield from (f"read: {n}" for n in r["notes"])
     yield from (f"doubt: {d}" for d in r["doubts"])

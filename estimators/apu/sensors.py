@@ -1,10 +1,11 @@
 """What is measured, and how well: every sensor is one entry of a table.
 
-An entry says what a sensor reads, its noise and gain error, the range of its readings, and the time
-constant of one that lags.  Filters, fits, identifiability, recorded files and studies take their
-lists from the tables: :data:`GAS_PATH` and :data:`ELECTRICAL`, whose numbers all studies use, and
-:data:`KNOWN`, all gas-path sensors by name.  A table is data: sensors are added by
-:meth:`SensorSet.add`, and their noise changed by :meth:`SensorSet.change`.
+An entry declares what a sensor reads, how often and how late, and all its errors; measurements are
+made by it (:mod:`estimators.apu.sensorchain`) and filters take it for what they do not know.
+Filters, fits, identifiability, recorded files and studies take their lists from the tables:
+:data:`GAS_PATH` and :data:`ELECTRICAL`, whose numbers all studies use, and :data:`KNOWN`, all
+gas-path sensors by name.  A table is data: sensors are added by :meth:`SensorSet.add`, their noise
+changed by :meth:`SensorSet.change`, and whole sets are files (:mod:`estimators.apu.sensorfile`).
 
 >>> round(GAS_PATH.sigma("P3", 800e3))
 4000
@@ -48,6 +49,7 @@ __all__ = [
     "Sensor",
     "SensorSet",
     "gas_path_table",
+    "known",
     "register",
     "respond",
     "unregister",
@@ -56,6 +58,11 @@ __all__ = [
 
 def _itself(value: Any) -> Any:
     return value
+
+
+#: What a filter makes of a constant error: a state, one that is considered, or nothing.
+WAYS = ("estimated", "considered", "known")
+_POSITIVE = ("noise", "gain", "tau", "bias", "drift", "delay", "jitter", "quantum", "extra")
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,20 @@ class Sensor:
         reads: outputs of the model; its own name by default.
         value: its reading from those outputs, an expression; the one output itself by default.
         tau: time constant of a first-order lag, s; its state is one more of a filter.
+        rate: of its readings, Hz; None: at every instant that is sampled.
+        gain_mean: expected gain error, of which readings are corrected.
+        gain_as: the rest of the gain error is ``"estimated"``, ``"considered"`` or taken for
+            ``"known"``, which is nothing.  An electrical filter takes what is not known for noise.
+        bias: standard deviation of its constant offset, unit.
+        bias_mean, bias_as: the same of the offset.
+        drift: random walk of the offset, unit per sqrt(s).
+        delay: by which a reading is older than its stamp, s.
+        jitter: standard deviation of the instant of each sample, s, independent.
+        quantum: step of its digits, unit.
+        limits: lowest and highest value that it can show, unit; there it saturates.
+        factor: reading over what it reads: ``unit`` over that of the output.
+        fails: whether it can fail; hypotheses of failures are about those that can.
+        extra: further white noise in a recording, unit: what jitter makes of its fastest change.
 
     Raises:
         ParameterError: a number out of range, several outputs without ``value``.
@@ -88,14 +109,40 @@ class Sensor:
     reads: tuple[str, ...] = ()
     value: Callable[..., Any] | None = None
     tau: float = 0.0
+    rate: float | None = None
+    gain_mean: float = 0.0
+    gain_as: str = "estimated"
+    bias: float = 0.0
+    bias_mean: float = 0.0
+    bias_as: str = "estimated"
+    drift: float = 0.0
+    delay: float = 0.0
+    jitter: float = 0.0
+    quantum: float = 0.0
+    limits: tuple[float, float] | None = None
+    factor: float = 1.0
+    fails: bool = True
+    extra: float = 0.0
 
     def __post_init__(self) -> None:
-        for label in ("noise", "gain", "tau"):
+        for label in _POSITIVE:
             v = number(f"sensor {self.name}: {label}", getattr(self, label), error=ParameterError)
             if not (math.isfinite(v) and v >= 0):
                 raise ParameterError(f"sensor {self.name}: {label} must be >= 0, got {v!r}")
-        if self.plausible is not None and not self.plausible[0] < self.plausible[1]:
-            raise ParameterError(f"sensor {self.name}: no range: {self.plausible!r}")
+        for label in ("gain_mean", "bias_mean", "factor", *(["rate"] if self.rate else [])):
+            v = number(f"sensor {self.name}: {label}", getattr(self, label), error=ParameterError)
+            least = {"gain_mean": -1.0, "rate": 0.0}.get(label, -math.inf)
+            if not (math.isfinite(v) and v > least and (v or label != "factor")):
+                raise ParameterError(f"sensor {self.name}: impossible {label}: {v!r}")
+        for what, span in (("range", self.plausible), ("limits", self.limits)):
+            if span is not None and not span[0] < span[1]:
+                raise ParameterError(f"sensor {self.name}: no {what}: {span!r}")
+        for label in ("gain_as", "bias_as"):
+            if getattr(self, label) not in WAYS:
+                way = getattr(self, label)
+                raise ParameterError(f"sensor {self.name}: {label} {way!r} {nearest(way, WAYS)}")
+        if self.drift and self.bias_as != "estimated":
+            raise ParameterError(f"sensor {self.name}: a bias that drifts must be estimated")
         object.__setattr__(self, "reads", tuple(self.reads) or (self.name,))
         if self.value is None and len(self.reads) > 1:
             raise ParameterError(
@@ -106,7 +153,17 @@ class Sensor:
     @property
     def direct(self) -> bool:
         """Whether it reads the output of its own name at once."""
-        return self.reads == (self.name,) and self.value is None and not self.tau
+        plain = self.value is None and self.factor == 1.0
+        return self.reads == (self.name,) and plain and not self.tau
+
+    @property
+    def biased(self) -> bool:
+        """Whether a filter of the gas path carries its offset."""
+        return bool(self.bias or self.drift) and self.bias_as != "known"
+
+    def unsure(self, error: str) -> float:
+        """Return what a filter is not sure of, of ``"gain"`` or ``"bias"``: standard deviation."""
+        return 0.0 if getattr(self, f"{error}_as") == "known" else float(getattr(self, error))
 
     @property
     def signal(self) -> Signal:
@@ -115,6 +172,7 @@ class Sensor:
         if self.direct and self.name in Y.names:
             return Y[self.name]
         nominal = next((Y[n].nominal for n in self.reads if Y[n].unit == self.unit), 1.0)
+        nominal = nominal if self.factor == 1.0 else abs(self.factor) * Y[self.reads[0]].nominal
         return Signal(self.name, self.unit, f"reading of {', '.join(self.reads)}", nominal=nominal)
 
     @property
@@ -124,15 +182,38 @@ class Sensor:
 
     def of(self, y: Mapping[str, Any]) -> Any:
         """Return what it reads of outputs by name, its lag left out: numbers or expressions."""
-        return self.expression(*(y[n] for n in self.reads))
+        v = self.expression(*(y[n] for n in self.reads))
+        return v if self.factor == 1.0 else self.factor * v
+
+    def white(self, reading: Any) -> Any:
+        """Return the standard deviation of the noise itself at a reading, in its unit."""
+        return self.noise * abs(reading) if self.relative else self.noise
+
+    @property
+    def rest(self) -> float:
+        """Standard deviation of what is white beside its noise: digits, and jitter (``extra``)."""
+        return math.hypot(self.quantum / math.sqrt(12), self.extra)
 
     def sigma(self, reading: Any) -> Any:
-        """Return the standard deviation of the noise at a reading, in its unit."""
-        return self.noise * abs(reading) if self.relative else self.noise
+        """Return the standard deviation of all that is white at a reading, in its unit."""
+        noise = self.white(reading)
+        return np.hypot(noise, self.rest) if self.rest else noise
+
+    def more(self) -> dict[str, str]:
+        """Return in words what it declares beside noise and gain, by name."""
+        units = {"tau": "s", "rate": "Hz", "delay": "s", "jitter": "s", "bias": self.unit}
+        units |= {"drift": f"{self.unit}/sqrt(s)", "quantum": self.unit, "bias_mean": self.unit}
+        out = {n: f"{getattr(self, n):g} {u}" for n, u in units.items() if getattr(self, n)}
+        out |= {"gain_mean": f"{self.gain_mean:g}"} if self.gain_mean else {}
+        if self.limits is not None:
+            out["range"] = f"{self.limits[0]:g} to {self.limits[1]:g} {self.unit}"
+        ways = {n: getattr(self, n) for n in ("gain_as", "bias_as")}
+        return out | {n: way for n, way in ways.items() if way != WAYS[0]}
 
     def model(self) -> Sensor:
         """Return the sensor with what its equations hang on, its errors left out."""
-        return dataclasses.replace(self, noise=0.0, gain=0.0, source="", plausible=None)
+        kept = {n: getattr(self, n) for n in ("reads", "value", "tau", "factor")}
+        return Sensor(self.name, 0.0, self.relative, 0.0, self.unit, "", **kept)
 
 
 @dataclass(frozen=True)
@@ -155,9 +236,12 @@ class SensorSet:
     def uncertain(self) -> tuple[str, ...]:
         """Sensors whose gain error a filter may estimate.
 
-        A counted speed has none, and that of the shaft power is the generators' efficiency.
+        A counted speed has none, unless one is declared, and that of the shaft power is the
+        generators' efficiency.
         """
-        return tuple(n for n in self.names if n != "PW" and n not in GasGenerator.X.names)
+        exact = {s.name for s in self.sensors if {*s.reads} <= {*GasGenerator.X.names}}
+        exact -= {s.name for s in self.sensors if s.unsure("gain")}
+        return tuple(n for n in self.names if n != "PW" and n not in exact)
 
     def __getitem__(self, name: str) -> Sensor:
         """Return a sensor; ParameterError with the nearest name if there is none."""
@@ -216,21 +300,21 @@ class SensorSet:
     def table(self) -> list[dict[str, Any]]:
         """Return one row for each sensor, for printing."""
         shown = ("name", "noise", "relative", "gain", "unit", "source")
-        return [{n: getattr(s, n) for n in shown} for s in self.sensors]
+        return [{n: getattr(s, n) for n in shown} | s.more() for s in self.sensors]
 
     def true(self, t: np.ndarray, y: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Return what the sensors would read without errors.
 
         Args:
             t: instants, s, (K,).
-            y: outputs of the model by name, (K,); where a lagging sensor's own name is among them,
-                that is taken.
+            y: outputs of the model by name, (K,); where the name of a sensor of other outputs is
+                among them, that is taken.
         """
         out = {}
         for s in self.sensors:
-            known = s.name in y and not s.direct
-            v = np.asarray(y[s.name] if known else s.of(y), float)
-            out[s.name] = respond(t, v, s.tau) if s.tau and not known else v
+            there = s.name in y and s.name not in s.reads
+            v = np.asarray(y[s.name] if there else s.of(y), float)
+            out[s.name] = respond(t, v, s.tau) if s.tau and not there else v
         return out
 
     def measure(
@@ -256,7 +340,7 @@ class SensorSet:
         for name, v in true.items():
             gain = (gains or {}).get(name, 0.0)
             size = v if noise_of == "true" or not gain else (1.0 + gain) * v
-            sigma = self.sigma(name, size)
+            sigma = self[name].white(size)
             out[name] = measure(v, sigma / math.sqrt(averaged), rng, gain=gain)
         return out
 
@@ -351,6 +435,7 @@ KNOWN: dict[str, Sensor] = {s.name: s for s in (*GAS_PATH.sensors, *MORE)}
 #: Range of the readings of each of them, SI.
 RANGES: dict[str, tuple[float, float]] = {n: s.plausible for n, s in KNOWN.items() if s.plausible}
 _registered: dict[str, Sensor] = {}
+_named: set[str] = set()
 
 
 def register(sensor: Sensor) -> Sensor:
@@ -364,7 +449,7 @@ def register(sensor: Sensor) -> Sensor:
             raise ParameterError(
                 f"sensor {sensor.name}: no output {n!r} {nearest(n, GasGenerator.Y.names)}"
             )
-    if sensor.name in KNOWN and sensor.name not in _registered:
+    if sensor.name in KNOWN and sensor.name not in {*_registered, *_named}:
         raise ParameterError(f"a sensor {sensor.name!r} is known already: take another name")
     KNOWN[sensor.name] = _registered[sensor.name] = sensor
     if sensor.plausible is not None:
@@ -372,9 +457,23 @@ def register(sensor: Sensor) -> Sensor:
     return sensor
 
 
+def known(sensor: Sensor) -> Sensor:
+    """Let files name a sensor's readings, without putting it into the default table; returns it.
+
+    Raises:
+        ParameterError: as :func:`register`.
+    """
+    if KNOWN.get(sensor.name) != sensor:
+        added = register(sensor)
+        del _registered[sensor.name]
+        _named.add(added.name)
+    return sensor
+
+
 def unregister(name: str) -> None:
-    """Forget a sensor that was registered; one of the tables stays."""
-    if _registered.pop(name, None) is not None:
+    """Forget a sensor that was registered or named; one of the tables stays."""
+    if _registered.pop(name, None) is not None or name in _named:
+        _named.discard(name)
         del KNOWN[name]
         RANGES.pop(name, None)
 

@@ -32,7 +32,9 @@ from scipy.sparse.linalg import splu
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
 from apu_casadi.core.sharing import Rebuilt, building
 from estimators.batch.fitresult import FitResult, FittedRecording, Profile
+from estimators.batch.programs import full, program
 from estimators.batch.transcription import Solution, Transcription
+from estimators.batch.undetermined import invert
 from estimators.filters.belief import Belief
 from estimators.information.consistency import sigmas
 from estimators.models.filtermodel import FilterModel
@@ -41,10 +43,6 @@ from estimators.models.recording import Recording
 
 __all__ = ["FitProblem", "fit", "profile"]
 
-#: Eigenvalue of the information, parameters scaled to unit information each, below which a
-#: direction counts as undetermined; and below which it is reported as hardly determined.
-RANK_TOL = 1e-10
-WEAK_TOL = 1e-4
 _AT_BOUND = 1e-6  # of the parameter's magnitude
 
 
@@ -120,7 +118,7 @@ class FitProblem(Rebuilt):
                 "parameters and name them in consider"
             )
         self.estimate, self.own, self.consider = tuple(estimate), tuple(own), tuple(consider)
-        self.program = Transcription(
+        self.program = program(
             self.lifted,
             sizes,
             (*estimate, *consider),
@@ -240,8 +238,9 @@ class FitProblem(Rebuilt):
         each = list(beliefs) if beliefs else [None] * len(recordings)
         x = [self._states(r, b, g) for r, b, g in zip(recordings, each, given, strict=True)]
         z_lower, z_upper = self._limits(lower, upper)
-        data = program.data(recordings, mean=mean, weight=weight, beliefs=beliefs)
-        z0 = program.guess(recordings, theta, x)
+        told = full(self.lifted, recordings)
+        data = program.data(told, mean=mean, weight=weight, beliefs=beliefs)
+        z0 = program.guess(told, theta, x)
         found = program.solve(data, z0, z_lower, z_upper, max_iterations=max_iterations)
         return self._result(found, recordings, weight, sigma_c, z_lower, z_upper, exact)
 
@@ -302,7 +301,7 @@ class FitProblem(Rebuilt):
         stuck = [i for i in a if edge[i]]
         moving = [i for i in a if not edge[i]]
         names = p.theta_names
-        cov, undetermined, weak = _invert(info[np.ix_(moving, moving)], [names[i] for i in moving])
+        cov, undetermined, weak = invert(info[np.ix_(moving, moving)], [names[i] for i in moving])
         where = [a.index(i) for i in moving]
         noise = np.zeros((len(a), len(a)))
         noise[np.ix_(where, where)] = cov
@@ -345,7 +344,11 @@ class FitProblem(Rebuilt):
     def _fitted(self, s: Solution, recordings: Sequence[Recording]) -> tuple[FittedRecording, ...]:
         return tuple(
             FittedRecording(
-                r.t, l.x, l.w, l.y, (r.y - l.y) / np.where(np.isnan(r.y), 1.0, np.sqrt(r.variance))
+                r.t,
+                l.x,
+                l.w,
+                l.y,
+                self.model.innovation(r.y, l.y) / np.where(np.isnan(r.y), 1.0, np.sqrt(r.variance)),
             )
             for r, l in zip(recordings, self.program.locals_of(s), strict=True)
         )
@@ -404,58 +407,6 @@ class FitProblem(Rebuilt):
             step /= p.theta_scale
             out[:n, j], out[n:, j] = step, follow @ step
         return out
-
-
-def _invert(
-    info: np.ndarray, names: Sequence[str]
-) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """Covariance from information; directions without information are named, not inverted."""
-    n = len(names)
-    size = np.sqrt(np.maximum(np.diag(info), 0.0))
-    # relative to nothing but the information itself: a parameter that does not show has none
-    largest = size.max(initial=0.0)
-    blind = size <= 1e-12 * largest if largest > 0 else np.ones(n, bool)
-    words = [f"nothing measured depends on {names[int(i)]}" for i in np.flatnonzero(blind)]
-    cov = np.full((n, n), math.nan)
-    cov[np.diag_indices(n)] = math.inf
-    seen = np.flatnonzero(~blind)
-    if not seen.size:
-        return cov, tuple(words), ()
-    d = size[seen]
-    value, vector = np.linalg.eigh(info[np.ix_(seen, seen)] / np.outer(d, d))
-    open_ = value <= RANK_TOL * max(1.0, value.max())
-    told = [names[int(i)] for i in seen]
-    words += [_confounded(vector[:, k], told) for k in np.flatnonzero(open_)]
-    weak = [
-        _confounded(vector[:, k], told, value[k])
-        for k in np.flatnonzero(~open_ & (value <= WEAK_TOL))
-    ]
-    # what takes no part in an open direction is determined all the same
-    free = np.abs(vector[:, open_]).max(axis=1, initial=0.0) > 1e-5
-    good = vector[:, ~open_]
-    part = (good / value[~open_]) @ good.T / np.outer(d, d)
-    part[free, :] = part[:, free] = math.nan
-    part[free, free] = math.inf
-    cov[np.ix_(seen, seen)] = part
-    return cov, tuple(words), tuple(weak)
-
-
-def _confounded(v: np.ndarray, names: Sequence[str], value: float | None = None) -> str:
-    """Say which parameters cannot be told apart; weights in units of each one's own effect."""
-    order = [int(i) for i in np.argsort(-np.abs(v)) if abs(v[i]) >= 0.05]
-    parts = [names[i] for i in order]
-    sign = np.sign(v[order[0]])
-    mix = " ".join(f"{sign * v[i]:+.2f} {names[i]}" for i in order)
-    listed = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
-    if value is None:
-        return (
-            f"{listed} cannot be told apart: the change {mix} (each in units of its own effect) "
-            "shows in no measurement"
-        )
-    return (
-        f"{listed} can hardly be told apart: the change {mix} (each in units of its own effect) "
-        f"shows {math.sqrt(value):.1e} as strongly as each alone"
-    )
 
 
 def fit(

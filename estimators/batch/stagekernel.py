@@ -21,7 +21,7 @@ class Kernel(NamedTuple):
         value: (q, d) -> (e, c): normalised residuals (y - g)/sigma, w, xi; next state, constraints.
         first: (q, d) -> (e, c, nonzeros of de/dq, nonzeros of dc/dq, e' de/dq).
         second: (q, d, lam_e, lam_c) -> nonzeros of the upper triangle of the Hessian of lam_e/2
-            |e|^2 + lam_c' c.
+            e'e + lam_c' c.
         check: (q, d) -> residual of what is solved for inside, outputs in their units.
         J_e, J_c, H: the sparsities.
         sizes: of x, s, w, xi, theta.
@@ -66,7 +66,7 @@ def kernel(lifted: Lifted, names: tuple[str, ...]) -> Kernel:
         spread[i, j] = model.walk[i]
     if moving:
         x1 = x1 + ca.sqrt(dt) * ca.mtimes(spread, xi)
-    e = ca.vertcat((y - g) * weight, w, xi)
+    e = ca.vertcat(model.innovation(y, g) * weight, w, xi)
     c = ca.vertcat(x1 / model.x.nominals, c)
     J_e, J_c = ca.jacobian(e, q), ca.jacobian(c, q)
     le, lc = kind.sym("le"), kind.sym("lc", c.shape[0])

@@ -4,7 +4,7 @@ The unknowns are all there is: shared parameters, own parameters of each recordi
 sample its state, lifted unknowns and noises (direct multiple shooting with one step an interval;
 Bock and Plitt 1984).  With e all of unit variance,
 
-    minimise   1/2 |e|^2,     e = ((y - g)/sigma, w, xi, xi0, (theta - mean)/sigma)
+    minimise   1/2 e'e,       e = ((y - g)/sigma, w, xi, xi0, (theta - mean)/sigma)
     so that    x(k+1) = f(x(k), u(k), p, w(k), dt(k)) + sqrt(dt(k)) walk xi(k)
                x(0)   = m0 + L0 xi0          where a recording has a prior of its first state
                0      = c(x(k), s(k), ...)   what the model leaves to the optimiser
@@ -69,9 +69,13 @@ class Solution:
     """Where the optimiser ended; used only after :meth:`Transcription.verify`.
 
     Args:
-        z: scaled unknowns. data : parameters of the program.
-        cost: 1/2 |e|^2. lam_g, lam_z : multipliers.
-        status, iterations: the solver's.
+        z: scaled unknowns.
+        data: parameters of the program.
+        cost: 1/2 e'e.
+        lam_g: multipliers of the constraints.
+        lam_z: multipliers of the bounds.
+        status: the solver's word.
+        iterations: how many it took.
     """
 
     z: np.ndarray

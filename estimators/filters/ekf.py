@@ -155,7 +155,7 @@ def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> 
     def update(H: Any, e: Any) -> Corrected:
         return correct(Pa, H, e, R, fixed)
 
-    found = iterated_update(outputs, update, prior, (u, p, y), nx, iterations, iterated)
+    found = iterated_update(model, outputs, update, prior, (u, p, y), iterations, iterated)
     moved, check, nu, first, done = found
     at = projected(moved, done.P, model.lower, model.upper, fixed)
     x1, F, c = forecast(at, u, p, dt)

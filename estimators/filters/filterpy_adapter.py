@@ -14,6 +14,9 @@ What to know of filterpy (2.0.0):
   in a sample is refused here.
 - ``rts_smoother`` of the unscented filter ignores its argument ``Qs``: it takes the last ``Q`` for
   all steps.  Use :func:`estimators.batch.smoother.rts_smoother`.
+- ``FixedLagSmoother`` begins its gains with the covariance after the sample instead of before it,
+  and takes the present gain for all lags: on a random system of three states it is off by standard
+  deviations.  Use :func:`estimators.batch.smoother.fixed_lag_smoother`.
 - ``MMAEFilterBank`` takes single components of the mean for the mean when it forms the covariance;
   ``IMMEstimator`` calls ``update(z)``, which extended filters do not have.  The extended filter
   here does.
@@ -160,6 +163,13 @@ def _check_prior(model: FilterModel, prior: Belief) -> None:
         )
 
 
+def _mean(model: FilterModel) -> Any:
+    """Mean of outputs at weighted points, angles about the first; None: filterpy's own."""
+    if not model.angles:
+        return None
+    return lambda z, weights: z[0] + weights @ model.innovation(z.T, z[:1].T).T
+
+
 def filterpy_ukf(
     model: FilterModel,
     prior: Belief,
@@ -227,6 +237,8 @@ def filterpy_ukf(
         lambda x, u=None: ours.output(x, u),
         lambda x, dt, u=None: ours.transition(x, u, dt),
         MerweScaledSigmaPoints(nx, alpha, beta, kappa),
+        z_mean_fn=_mean(model),
+        residual_z=model.innovation if model.angles else None,
     )
     kf.x, kf.P, kf.R = prior.mean.copy(), prior.cov.copy(), ours.noise(sigma)
     return kf
@@ -276,6 +288,7 @@ def filterpy_ekf(
                 more.pop("HJacobian", lambda x: ours.output_jacobian(x, u)),
                 more.pop("Hx", lambda x: ours.output(x, u)),
                 R,
+                residual=more.pop("residual", model.innovation if model.angles else np.subtract),
                 **more,
             )
 

@@ -17,9 +17,10 @@ differ in outputs, parameters or constants only, the two are the same.)
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -45,12 +46,13 @@ from estimators.filters.filtering import (
     padded,
     run,
 )
-from estimators.filters.mixing import log_sum, plain_mixer, root_mixer
+from estimators.filters.mixing import log_sum, plain_mixer, root_mixer, squared, stacks
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
 __all__ = [
     "ImmResult",
+    "ModeBeliefs",
     "ModelProbabilities",
     "interacting_multiple_models",
     "log_normalised",
@@ -175,6 +177,25 @@ def _logs(p: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
+class ModeBeliefs:
+    """What one mode's filter knew along a recording of K instants, its n states.
+
+    Args:
+        x: its states.
+        mean, cov: after each sample, (n, K) and (K, n, n).
+        mean_next, cov_next: carried to the next sample by this mode, not mixed yet.
+        cross: covariance of the state after the sample and the next one, (K, n, n).
+    """
+
+    x: Signals
+    mean: np.ndarray
+    cov: np.ndarray
+    mean_next: np.ndarray
+    cov_next: np.ndarray
+    cross: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class ImmResult:
     """What interacting filters believed along a recording of K instants.
 
@@ -187,6 +208,9 @@ class ImmResult:
         mode_mean: each mode's own filtered mean, all its states, (nx_j, K).
         loglik: log-likelihood of the recording.
         final: each mode's belief at the last instant, after its sample.
+        modes: what each mode's filter knew; None unless kept.
+        log_transition: logarithms of the transition probabilities into each sample, (K, M, M), from
+            mode (row) to mode; None unless kept.
     """
 
     names: tuple[str, ...]
@@ -198,6 +222,8 @@ class ImmResult:
     mode_mean: tuple[np.ndarray, ...]
     loglik: float
     final: tuple[Belief, ...]
+    modes: tuple[ModeBeliefs, ...] | None = field(default=None, repr=False)
+    log_transition: np.ndarray | None = field(default=None, repr=False)
 
     @property
     def probability(self) -> np.ndarray:
@@ -256,31 +282,34 @@ def _block(
     others: tuple[FilterStep, ...],
     common: Signals,
     roots: bool,
+    full: bool,
     backend: str | None,
     _in_use: str,
 ) -> ca.Function:
     """``BLOCK`` cycles of mixing, filtering and weighing in one function.
 
     (logs, m, P, logT, u, y, R, dt, p) -> (logs, m, P) for the next block, and for each sample logs,
-    the predicted m, P, the filtered m, P, mean and variance of the mixture, and log-likelihood with
-    checks; m, P of all modes stacked.
+    the predicted m, P, the filtered m, P, mean and variance of the mixture, log-likelihood with
+    checks, diagonals of S, and, if ``full``, the cross-covariances; m, P, p of all modes stacked.
     """
     steps = (first, *others)
     models = [s.model for s in steps]
     x = [m.x for m in models]
     n = [len(s) for s in x]
-    _, nu, np_, _, ny = models[0].sizes
+    at_p = np.cumsum([0, *(len(m.p) for m in models)]).tolist()
+    _, nu, _, _, ny = models[0].sizes
     shapes = {"logs": len(n), "m": sum(n), "P": sum(k * k for k in n), "logT": len(n) ** 2}
-    shapes |= {"u": nu, "y": ny, "R": ny, "dt": 1, "p": np_}
+    shapes |= {"u": nu, "y": ny, "R": ny, "dt": 1, "p": at_p[-1]}
     s = {k: ca.MX.sym(k, v) for k, v in shapes.items()}
     mixer = root_mixer if roots else plain_mixer
     logs, m, P = mixer(x)(s["logs"], s["m"], s["P"], s["logT"])
     ms = ca.vertsplit(m, [0, *np.cumsum(n).tolist()])
     Ps = ca.vertsplit(P, [0, *np.cumsum([k * k for k in n]).tolist()])
+    ps = ca.vertsplit(s["p"], at_p)
     # covariances are mixed, so filters that carry square roots hand them over as such
     outs = [
         (_with_roots(step) if roots else step.plain).function(
-            ms[i], ca.reshape(Ps[i], n[i], n[i]), s["u"], s["p"], s["y"], s["R"], s["dt"]
+            ms[i], ca.reshape(Ps[i], n[i], n[i]), s["u"], ps[i], s["y"], s["R"], s["dt"]
         )
         for i, step in enumerate(steps)
     ]
@@ -292,7 +321,8 @@ def _block(
     carried = [new, ca.vertcat(*(o[0] for o in outs)), ca.vertcat(*(ca.vec(o[1]) for o in outs))]
     S = ca.vertcat(*(ca.diag(o[6]) for o in outs))
     kept = [*carried, m_f, P_f, mean, var, ca.vertcat(total, check), S]
-    name = "imm_roots" if roots else "imm"
+    kept += [ca.vertcat(*(ca.vec(o[4]) for o in outs))] if full else []
+    name = f"imm{'_roots' if roots else ''}{'_full' if full else ''}"
     one = ca.Function(f"{name}_one", list(s.values()), [*carried, *kept])
     return compiled(block_of(one, name, len(carried)), backend=backend)
 
@@ -374,6 +404,7 @@ def interacting_multiple_models(
     transition: Any = None,
     rates: Any = None,
     prior_probability: Mapping[str, float] | None = None,
+    full: bool = False,
     backend: str | None = None,
 ) -> ImmResult:
     """Filter a recording with a mode that may change.
@@ -388,6 +419,7 @@ def interacting_multiple_models(
         rates: instead, (M, M) transition rates, 1/s, rows summing to zero: the matrix exponential
             over each step, so that samples may come at any instants.
         prior_probability: of the modes at the first sample, equal by default.
+        full: keep what :func:`estimators.batch.immsmoother.imm_smoother` needs.
         backend: see :func:`apu_casadi.core.backend.compiled`.
 
     Raises:
@@ -410,28 +442,46 @@ def interacting_multiple_models(
     # a padded sample changes no mode
     logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
     logs = _log_prior(names, prior_probability)
-    passes = _Passes([*steps.values()], priors, logs, common, backend)
-    kept: list[list[np.ndarray]] = [[], [], [], [], []]
+    passes = _Passes([*steps.values()], priors, logs, common, full, backend)
+    p = np.concatenate([step.full(data.p) for step in steps.values()])
+    columns = (0, 3, 5, 6, 7, 1, 2, 4, 9) if full else (0, 3, 5, 6, 7)
+    kept: list[list[np.ndarray]] = [[] for _ in columns]
     for start in range(0, K + pad, BLOCK):
         s = slice(start, start + BLOCK)
-        out = passes.block(logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], data.p, K - start)
-        for target, i in zip(kept, (0, 3, 5, 6, 7), strict=True):
-            target.append(out[i].copy())
+        out = passes.block(logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], p, K - start)
+        for target, i in zip(kept, columns, strict=True):
+            root = i == 2 and passes.rooted
+            target.append(squared(out[i], n) if root else out[i].copy())
         _believable(names, n, data, out[1], out[2], out[7], start)
         last = out[4][:, -1].copy()  # what is padded may be carried on
-    logp, m_f, mean, var, stats = (np.concatenate(k, axis=1) for k in kept)
+    logp, m_f, mean, var, stats, *more = (np.concatenate(k, axis=1) for k in kept)
     means = np.split(m_f, np.cumsum(n)[:-1])
     final = []
-    for b, m, cov in zip(priors, means, _square(last, n), strict=True):
+    for b, m, (cov,) in zip(priors, means, stacks(last[:, None], n), strict=True):
         final.append(Belief(b.x, m[:, -1].copy(), (cov + cov.T) / 2))
     loglik = float(stats[0].sum())
-    return ImmResult(names, common, data.t, logp, mean, var, tuple(means), loglik, tuple(final))
+    result = ImmResult(names, common, data.t, logp, mean, var, tuple(means), loglik, tuple(final))
+    if not full:
+        return result
+    log_T = logT[:, :K].T.reshape(K, len(n), len(n)).transpose(0, 2, 1)
+    modes = _modes([b.x for b in priors], means, *more)
+    return dataclasses.replace(result, modes=modes, log_transition=log_T)
 
 
-def _square(columns: np.ndarray, n: list[int]) -> list[np.ndarray]:
-    """Matrices of n x n, stacked as one column in column-major order."""
-    ends = np.cumsum([k * k for k in n])[:-1]
-    return [c.reshape(k, k).T for c, k in zip(np.split(columns, ends), n, strict=True)]
+def _modes(
+    x: Sequence[Signals],
+    means: Sequence[np.ndarray],
+    m1: np.ndarray,
+    P1: np.ndarray,
+    P_f: np.ndarray,
+    cross: np.ndarray,
+) -> tuple[ModeBeliefs, ...]:
+    """Part what was kept of all modes, matrices as columns one below the other."""
+    n = [len(s) for s in x]
+    nexts = np.split(m1, np.cumsum(n)[:-1])
+    covs, cov_nexts, crosses = (stacks(a, n) for a in (P_f, P1, cross))
+    each = zip(x, means, covs, nexts, cov_nexts, crosses, strict=True)
+    return tuple(ModeBeliefs(*one) for one in each)
 
 
 def _check(steps: Mapping[str, FilterStep], priors: Sequence[Belief]) -> None:
@@ -458,7 +508,7 @@ class _Passes:
     Args:
         steps, priors: of the modes.
         logs: logarithms of the modes' probabilities at the first sample.
-        common, backend: as of :func:`_block`.
+        common, full, backend: as of :func:`_block`.
     """
 
     def __init__(
@@ -467,9 +517,12 @@ class _Passes:
         priors: list[Belief],
         logs: np.ndarray,
         common: Signals,
+        full: bool,
         backend: str | None,
     ) -> None:
-        self.steps, self.common, self.backend = steps, common, backend
+        # the modes' families: another unit's modes have other numbers in p, and the same functions
+        self.steps = [step.shared for step in steps]
+        self.common, self.full, self.backend = common, full, backend
         self.n = [len(b.x) for b in priors]
         # what a filter without square-root form lacks, mixing cannot give back
         self.able = all(step.root or step.wide is not None for step in steps)
@@ -483,7 +536,7 @@ class _Passes:
     def _caller(self) -> Caller:
         # the buffers are this run's own, as in estimators.filters.filtering
         first, *others = self.steps
-        how = self.rooted, self.backend, backend_in_use()
+        how = self.rooted, self.full, self.backend, backend_in_use()
         return Caller(_block(first, tuple(others), self.common, *how), copy=False)
 
     def block(self, *given: Any) -> list[np.ndarray]:
@@ -493,7 +546,7 @@ class _Passes:
         if self.able and not self.rooted:
             R, P1 = data[3][:, :K], out[2].ravel()
             if _needs_roots(self.n, P1, out[7][:, :K], out[11][:, :K], R):
-                roots = [root_of(P) for P in _square(self.P, self.n)]
+                roots = [root_of(P) for (P,) in stacks(self.P[:, None], self.n)]
                 self.P = np.concatenate([L.ravel(order="F") for L in roots])
                 self.rooted = True
                 self._call = self._caller()

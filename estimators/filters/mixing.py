@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import casadi as ca
+import numpy as np
 
 from apu_casadi.core.signals import Signals
 from estimators.filters.algebra import graded_lower
 
-__all__ = ["log_sum", "plain_mixer", "root_mixer"]
+__all__ = ["log_sum", "plain_mixer", "root_mixer", "squared", "stacks"]
 
 
 def log_sum(v: ca.SX) -> ca.SX:
@@ -100,3 +101,15 @@ def root_mixer(x: Sequence[Signals]) -> ca.Function:
     m_in, L_in = ca.vertcat(*ms), ca.vertcat(*(ca.vec(L) for L in dense))
     out = [ca.vertcat(*predicted), ca.vertcat(*m_out), ca.vertcat(*L_out)]
     return ca.Function("root_mix", [logs, m_in, L_in, logT], [ca.densify(o) for o in ca.cse(out)])
+
+
+def stacks(columns: np.ndarray, n: Sequence[int]) -> list[np.ndarray]:
+    """Return matrices (K, n, n) of each mode, from K columns of all modes, each column-major."""
+    parts = np.split(columns, np.cumsum([k * k for k in n])[:-1])
+    return [c.T.reshape(-1, k, k).transpose(0, 2, 1) for c, k in zip(parts, n, strict=True)]
+
+
+def squared(columns: np.ndarray, n: Sequence[int]) -> np.ndarray:
+    """Return L L' of lower triangular roots, columns as in :func:`stacks`."""
+    squares = [L @ L.transpose(0, 2, 1) for L in stacks(columns, n)]
+    return np.concatenate([P.reshape(P.shape[0], -1).T for P in squares])

@@ -98,7 +98,7 @@ def ekf_root_step(model: FilterModel, iterations: int = 1, iterated: str = "all"
 
     outputs, forecast = linearisation(model, kind, u, p, dt)
     moved, check, nu, first, (_, La, *_) = iterated_update(
-        outputs, lambda H, e: update(low, H, e, R), prior, (u, p, y), nx, iterations, iterated
+        model, outputs, lambda H, e: update(low, H, e, R), prior, (u, p, y), iterations, iterated
     )
     own = La[:nx, :nx]
     P_f = ca.mtimes(own, own.T)

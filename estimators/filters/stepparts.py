@@ -85,33 +85,35 @@ def linearisation(
 
 
 def iterated_update(
+    model: FilterModel,
     outputs: ca.Function,
     update: Callable[[Any, Any], T],
     prior: Any,
     given: tuple[Any, Any, Any],
-    nx: int,
     iterations: int,
     iterated: str,
 ) -> tuple[Any, Any, Any, T, T]:
     """Correct a mean by Gauss-Newton: linearised at the iterate, but always an update of the prior.
 
     Args:
+        model: whose outputs these are.
         outputs: of :func:`linearisation`.
         update: (H, innovation) -> the update, whose first part is the change of the mean.
         prior: state and noise before the sample.
         given: u, p, y.
-        nx: number of states.
         iterations, iterated: see :func:`~estimators.filters.ekf.ekf_step`.
 
     Returns:
         The corrected mean, the sum of the checks, the innovation, the first and the last update.
     """
     u, p, y = given
+    nx = len(model.x)
     at, check, nu, done = prior, type(prior)(0), None, []
     for _ in range(iterations):
         h, H, c = outputs(at, u, p)
-        done.append(update(H, y - h + H @ (at - prior)))
-        nu = y - h if nu is None else nu
+        e = model.innovation(y, h)
+        done.append(update(H, e + H @ (at - prior)))
+        nu = e if nu is None else nu
         moved, check = prior + done[-1][0], check + c
         at = moved if iterated == "all" else ca.vertcat(prior[:nx], moved[nx:])
     return moved, check, nu, done[0], done[-1]

@@ -223,7 +223,7 @@ def _built(
     first = ca.Function("first", [m, P], [g.at(start, La)])
 
     values, y, R = ca.SX.sym("g", ny + 1, g.count), ca.SX.sym("y", ny), ca.SX.sym("R", ny)
-    mean, La, nu_, S, stats = _updated(g, start, La, values, y, R, fixed)
+    mean, La, nu_, S, stats = _updated(model, g, start, La, values, y, R, fixed)
     P_f = ca.tril(La[:nx, :nx] @ La[:nx, :nx].T)
     P_f = P_f + ca.tril(P_f, False).T
     mean = projected(mean, La @ La[:nx, :].T, model.lower, model.upper, fixed)
@@ -258,15 +258,40 @@ def _built(
     return FilterStep(model, ca.Function(name, s, out, STEP_IN, names), root=True)
 
 
+def _unwrapped(model: FilterModel, g: _Mapped, values: ca.SX) -> ca.SX:
+    """Outputs at the points with angles within half a turn of their circular mean.
+
+    Mardia and Jupp (2000), Directional Statistics, section 2.2.1: the direction of the sum of unit
+    vectors.  All points are moved by the same number of turns where they lie on one side, so that
+    nothing is rounded; an output that is linear counts turns and needs none of this.
+    """
+    for name, period in model.angles:
+        i = model.y.index(name)
+        if i in g.straight:
+            continue
+        v, turn = values[i, :], 2 * math.pi / period
+        mean = ca.atan2(ca.sum2(ca.sin(turn * v)), ca.sum2(ca.cos(turn * v))) / turn
+        turns = ca.floor((v - mean) / period + 0.5)
+        values[i, :] = v - period * (turns - turns[0])
+    return values
+
+
 def _updated(
-    g: _Mapped, mean: ca.SX, L: ca.SX, values: ca.SX, y: ca.SX, R: ca.SX, fixed: tuple[int, ...]
+    model: FilterModel,
+    g: _Mapped,
+    mean: ca.SX,
+    L: ca.SX,
+    values: ca.SX,
+    y: ca.SX,
+    R: ca.SX,
+    fixed: tuple[int, ...],
 ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
     """(mean, root, innovation, its covariance, stats) after a sample."""
     ny = y.shape[0]
     there = R >= 0
-    expected, D, Q, check = g.transform(values)
+    expected, D, Q, check = g.transform(_unwrapped(model, g, ca.SX(values)))
     # what is not measured: no innovation, no sensitivity, unit noise
-    nu = ca.if_else(there, y - expected, 0)
+    nu = ca.if_else(there, model.innovation(y, expected), 0)
     D, Q = (ca.sparsify(ca.diag(there) @ M) for M in (D, Q))
     noise = ca.diag(ca.sqrt(ca.if_else(there, R, 1)))
     W = qr_lower(ca.horzcat(noise, Q)) if Q.nnz() else noise

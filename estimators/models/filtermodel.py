@@ -8,7 +8,9 @@ taken, then the state goes on to the next sample:
 
 with w(k), xi(k) white and of unit variance, and v(k) of the variances that come with the data.  The
 *same* w(k) enters output and transition: the error of a measured input does so too, and a filter
-that forgets it claims a wrong variance.
+that forgets it claims a wrong variance.  An output that
+:func:`~estimators.models.angles.angular` declares is read modulo its period: y - g is then taken
+the short way round, by every estimator alike.
 
 :func:`discretise` makes a model from any :class:`~apu_casadi.core.statespace.StateSpace`; the other
 functions return changed models: :func:`measure` (which outputs there are), :func:`noisy_inputs`,
@@ -103,10 +105,11 @@ class FilterModel(Parametric):
         walk: random-walk standard deviations, unit of x per sqrt(s), shape (nx,).
         lower, upper: bounds of x, shape (nx,).
         consider: states whose mean and variance the measurements do not touch.
+        angles: outputs that are read modulo a period, (name, period in its unit).
 
     Raises:
         SignalError: a function's or vector's shape does not match the declared signals; a walk, a
-            pair of bounds or a considered state is impossible.
+            pair of bounds or a considered state is impossible; an angle is no output.
     """
 
     name: str
@@ -121,6 +124,7 @@ class FilterModel(Parametric):
     lower: np.ndarray
     upper: np.ndarray
     consider: tuple[str, ...] = ()
+    angles: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         nx, nu, np_, nw, ny = (len(s) for s in (self.x, self.u, self.p, self.w, self.y))
@@ -152,6 +156,7 @@ class FilterModel(Parametric):
                 )
             if i in fixed and self.walk[i]:
                 raise SignalError(f"{self.name}: {s.name} is considered, its walk must be 0")
+        self.y.indices([n for n, _ in self.angles])
 
     @classmethod
     def of(
@@ -174,8 +179,8 @@ class FilterModel(Parametric):
             symbols: (x, u, p, w, dt).
             transition: next state and check.
             output: outputs and check.
-            like: the model whose walk, bounds and considered states the first states have; without,
-                none of them.
+            like: the model whose walk, bounds and considered states the first states have, and
+                whose angles the outputs of the same name are; without, none of them.
             more: the same of the last states, by name.
             consider: further considered states.
             cse: look for common parts of the expressions.
@@ -193,7 +198,8 @@ class FilterModel(Parametric):
         held = (*held, *consider, *(n for n, k in more.items() if k.consider))
         x, u, p, w, y = signals
         walk, lower, upper = all_of
-        return cls(name, x, u, p, w, y, f, g, walk, lower, upper, held)
+        angles = () if like is None else _among(like.angles, y)
+        return cls(name, x, u, p, w, y, f, g, walk, lower, upper, held, angles)
 
     @property
     def family(self) -> FilterModel | None:
@@ -249,6 +255,20 @@ class FilterModel(Parametric):
         """(nx, nu, np, nw, ny)."""
         return len(self.x), len(self.u), len(self.p), len(self.w), len(self.y)
 
+    def innovation(self, y: Any, expected: Any) -> Any:
+        """Return y - expected, (ny,) or (ny, K), of an angle the short way round; also of symbols.
+
+        The period is taken off as often as the difference holds it, rounded: a difference of less
+        than half a period stays as it is, to the last bit.
+        """
+        e = y - expected
+        floor = np.floor if isinstance(e, np.ndarray) else ca.floor
+        for name, period in self.angles:
+            row: Any = self.y.index(name)
+            row = row if getattr(e, "ndim", 2) == 1 else (row, slice(None))
+            e[row] = e[row] - period * floor(e[row] / period + 0.5)
+        return e
+
     def symbols(self, kind: Any = ca.MX) -> tuple[Any, Any, Any, Any, Any]:
         """Fresh symbols (x, u, p, w, dt) of CasADi type ``kind``."""
         nx, nu, np_, nw, _ = self.sizes
@@ -288,6 +308,10 @@ class FilterModel(Parametric):
         return dataclasses.replace(
             self, transition=scalar(self.transition), output=scalar(self.output)
         )
+
+
+def _among(angles: tuple[tuple[str, float], ...], y: Signals) -> tuple[tuple[str, float], ...]:
+    return tuple((n, period) for n, period in angles if n in y)
 
 
 @remade
@@ -353,7 +377,8 @@ def measure(model: FilterModel, names: Sequence[str]) -> FilterModel:
     s = model.symbols()
     y, check = model.output(*s[:4])
     output = ca.Function(f"{model.name}_g", [*s[:4]], [y[rows], check], *_OUTPUT)
-    return dataclasses.replace(model, y=Signals([model.y[i] for i in rows]), output=output)
+    kept = Signals([model.y[i] for i in rows])
+    return dataclasses.replace(model, y=kept, output=output, angles=_among(model.angles, kept))
 
 
 @remade

@@ -20,7 +20,7 @@ from apu_casadi.core.errors import DataError, nearest
 from apu_casadi.core.signals import Signals
 from estimators.models.filtermodel import FilterModel
 
-__all__ = ["Recording", "plain_numbers", "record"]
+__all__ = ["SAME_TIME", "Recording", "plain_numbers", "record"]
 
 
 def plain_numbers(data: Any, what: str, *, gaps: bool = False) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Run many joint scenarios with random faults over all cores, and collect their summaries.
 
-Health factors, severity (mu, k_rf, kappa), phase and time of the short circuit are drawn at random.
+Health factors, severity (mu, k_rf, kappa), phase and time of the short circuit are drawn at random;
+with --growing a share of the faults grows instead of stepping.
 Each finished run is kept in DIR/runs.jsonl at once: after an interruption the same command goes on.
 The result is DIR/campaign.nc, with the reason of every run that was refused.  While another
 campaign works in DIR this one waits, and takes over what that one has done.
@@ -30,6 +31,7 @@ OPTIONS = f"""
 --runs int =1000       | number of runs (default 1000)
 --seed int =0          | of the random numbers (default 0)
 --base SCENARIO =joint | scenario that is varied (joint)
+--growing float SHARE =0.0 | share of the faults that grow, 0 to 1; the others are steps (default 0)
 {given.WHOLE}
 --workers int          | processes (default: all cores)
 --out DIR =results/campaign | folder (results/campaign)
@@ -53,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     usage.count("--runs", args.runs)
     usage.count("--workers", args.workers, most=1024)
     base = given.scenario(args, args.base)
-    runs = campaigns.random_faults(args.runs, args.seed, base=base)
+    runs = campaigns.random_faults(args.runs, args.seed, base=base, growing=args.growing)
     t = time.perf_counter()
     kept = 0
 
@@ -78,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
     t = time.perf_counter() - t
     report = {"runs": args.runs, "seed": args.seed, "seconds": t, "counts": campaigns.counts(ds)}
     report |= {k: v for k, v in (("engine", base.engine), ("governor", base.governor)) if v}
+    report |= {"growing": args.growing} if args.growing else {}
     report |= {"base": base.name, "ambient": dataclasses.asdict(base.ambient)}
     report |= {"solver": ds.attrs["solver"], "exchange": base.exchange}
     report |= {"apu_casadi_version": ds.attrs["apu_casadi_version"], "reasons": _told(ds, "reason")}
@@ -109,8 +112,9 @@ def _print(r: dict[str, Any]) -> None:
     if r["warnings"]:
         print(f"{len(r['warnings'])} runs come with warnings, in the file")
     unit = f"unit {r['engine']}, " if "engine" in r else ""
+    grown = f"{100 * r['growing']:g} % of the faults grow, " if "growing" in r else ""
     print(
-        f"{unit}base {r['base']}, seed {r['seed']}, {day_words(r['ambient'])}, "
+        f"{unit}base {r['base']}, seed {r['seed']}, {grown}{day_words(r['ambient'])}, "
         f"solver {r['solver']}, exchange {r['exchange']}, apu-casadi {r['apu_casadi_version']}"
     )
     print(f"written: {r['file']}")

@@ -32,6 +32,7 @@ KEPT = "docs/estimation"
 _OUT = f"--out DIR ={KEPT} | where results are kept (default %(default)s)"
 _JOINT = f"""
 --scenario NAME|FILE =joint | what is true: of the library, .toml or .py (default %(default)s)
+--sensors FILE              | what measures it (TOML); default: apu estimate sensors
 {given.WHOLE}
 --seed int N =1             | of all errors (default 1)
 --out DIR                   | folder (default results/estimate_NAME)
@@ -44,7 +45,8 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 {given.UNIT}
 {readingoptions.OPTIONS.strip()}
 --only {{gaspath,electrical}} | one of the two
---sensors FILE | noise and gain of sensors (TOML, as apu measure); default: apu estimate sensors
+--sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
+--prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep estimates, JSON and figure there
 --figures =on  | draw estimates and bands into it (default)
@@ -54,6 +56,8 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 _STUDY = f"""
 study NAME    | all, or one of {", ".join(names())}
 --seeds int N | fresh seeds (default: the study's own)
+--first-seed int N | the first of them (default: the study's own)
+--only WORDS  | parts whose names contain one of these words, as realistic,large; default: all
 {_OUT}
 --again       | also run what is kept
 --json        | print the claims as JSON
@@ -66,7 +70,10 @@ _PAGE = f"""
 """
 _SENSORS = f"""
 {given.PARTS}
---json | print JSON
+--sensors FILE | those of a file (TOML) instead of the tables
+--toml   | print a file of them: a start for your own
+--schema | print the JSON schema of such a file, for editors
+--json   | print JSON
 """
 
 
@@ -105,9 +112,9 @@ def _data(args: argparse.Namespace) -> int:
     """Estimate from recorded data what its channels suffice for, with bands and verdicts."""
     from apu_casadi.core import results
     from apu_casadi.core.files import save_figure, write_text
-    from estimators.apu.measuring import read_sensors
     from estimators.apu.recorded_estimate import estimate
     from estimators.apu.recordings.measured import read_recording
+    from estimators.apu.sensorfile import read_sensors
     from scenarios import registry
     from scenarios.figures.recordedplot import plot_recorded
     from scenarios.shell import progress
@@ -122,9 +129,9 @@ def _data(args: argparse.Namespace) -> int:
         m,
         apu,
         only=args.only,
-        sensors=sensors.gas_path.including(*m.gaspath),
-        electrical_sensors=sensors.electrical,
+        sensors=sensors,
         ambient=_day(args, m),
+        prior=args.prior,
     )
     report = e.report() | {"files": args.files, **given.own(args), **given.assumed(args)}
     made = []
@@ -160,6 +167,7 @@ def _joint(args: argparse.Namespace) -> int:
     from apu_casadi.core import results
     from apu_casadi.core.errors import ScenarioError
     from apu_casadi.core.files import write_text
+    from estimators.apu.sensorfile import read_sensors
     from scenarios import registry
     from scenarios.shell import notices
     from scenarios.studies import jointrun
@@ -167,13 +175,14 @@ def _joint(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise ScenarioError(f"--seed must be >= 0, got {args.seed}")
     s = given.scenario(args, args.scenario)
+    sensors = read_sensors(args.sensors)
     folder = registry.prepare(args.out or f"results/estimate_{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(f"{s.name}, truth", s.duration, show=show) as progress:
         truth = jointrun.truth(s, progress=progress)
     if show:
         print("estimating ...", file=sys.stderr)
-    e = jointrun.estimate(truth, args.seed)
+    e = jointrun.estimate(truth, args.seed, sensors=sensors, folder=folder)
     report = jointrun.report(e) | given.assumed(args)
     notices.tell(report["warnings"] or [])
     made = [results.save(e, folder / f"estimate_{s.name}.nc")]
@@ -210,17 +219,21 @@ def _study(args: argparse.Namespace) -> int:
     if args.seeds is not None and args.seeds < 2:
         raise ParameterError(f"--seeds must be >= 2, got {args.seeds}")
     usage.count("--seeds", args.seeds, least=2)
+    usage.count("--first-seed", args.first_seed, least=0, most=2**31)
     folder = registry.prepare(args.out)
     show = not args.quiet and sys.stderr.isatty()
     found: dict[str, list[Any]] = {}
     for name in chosen:
-        study = catalogue.get(name)
+        study = catalogue.from_seed(catalogue.get(name), args.first_seed)
         n = args.seeds or study.seeds
-        todo = list(study.parts) if args.again else catalogue.pending(study, folder, n)
+        how = {"seed0": args.first_seed, "only": args.only, "again": args.again}
+        todo = catalogue.parts_with(study, args.only)
+        if not args.again:
+            todo = [p for p in catalogue.pending(study, folder, n) if p in todo]
         if not args.json:
             print(f"{name}: {', '.join(todo) if todo else 'kept'}", flush=True)
         with _study_bar(name, show=show) as progress:
-            record = catalogue.run(name, folder, n_seeds=n, again=args.again, progress=progress)
+            record = catalogue.run(name, folder, n_seeds=n, progress=progress, **how)
         with understood(name):
             found[name] = study.report.claims(catalogue.results(record))
         if not args.json:
@@ -287,11 +300,18 @@ def _page(args: argparse.Namespace) -> int:
 
 
 def _sensors(args: argparse.Namespace) -> int:
-    """Print the 1-sigma tables with their sources."""
+    """Print what is measured and how well, with sources; or a file of it, or its schema."""
     given.parts(args)
-    from estimators.apu.sensors import ELECTRICAL, GAS_PATH
+    from estimators.apu.sensorfile import read_sensors, sensor_schema, to_toml
 
-    sets = {"gas path, every 20 ms": GAS_PATH, "electrical, at 10 kHz": ELECTRICAL}
+    if args.schema:
+        jsontext.show(sensor_schema())
+        return 0
+    found = read_sensors(args.sensors)
+    if args.toml:
+        print(to_toml(found), end="")
+        return 0
+    sets = {"gas path, every 20 ms": found.gas_path, "electrical, at 10 kHz": found.electrical}
     if args.json:
         jsontext.show({k: v.table() for k, v in sets.items()})
         return 0
@@ -300,7 +320,8 @@ def _sensors(args: argparse.Namespace) -> int:
         for s in table.sensors:
             noise = f"{100 * s.noise:g} %" if s.relative else f"{s.noise:g} {s.unit}"
             gain = f"{100 * s.gain:g} %" if s.gain else "-"
-            print(f"  {s.name:<5} noise {noise:<8} gain {gain:<6} {s.source}")
+            more = "".join(f"{n} {v}, " for n, v in s.more().items())
+            print(f"  {s.name:<5} noise {noise:<8} gain {gain:<6} {more}{s.source}")
         print()
     print("1 sigma; noise in per cent is of the reading, a gain error is constant")
     return 0

@@ -20,10 +20,6 @@ from scenarios.commands import given
 from scenarios.shell import jsontext, progress, usage
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from apu_casadi.machine.faults.fault import Fault
-    from apu_casadi.machine.loads.load import Load
     from scenarios.export.cfunctions import Asked
 
 NAME = "export"
@@ -73,44 +69,12 @@ def run(args: argparse.Namespace) -> int:
 def _asked(args: argparse.Namespace) -> Asked:
     from apu_casadi.unit.events import Ambient
     from scenarios.export.cfunctions import Asked
-    from scenarios.reading import read_load
 
     unit = given.unit(args)
-    loads: list[Load] = [
-        given.power_load(unit, x) if isinstance(x, float) else _still(read_load(x, "--load"))
-        for x in args.load or [unit.generator.machine.P_rated]
-    ]
-    load = loads[0] if len(loads) == 1 else loads
-    faults = _faults(args.fault, len(unit.machines))
+    args.load = args.load or [unit.generator.machine.P_rated]
+    use = "what is exported"
+    load, faults = given.loads(args, unit, use), given.faults(args, unit, use)
     return Asked(unit, load, faults, Ambient(**given.ambient_of(args)))
-
-
-def _faults(tables: Sequence[Any], n: int) -> list[Fault | None]:
-    """Return the fault of each of the n generators."""
-    from apu_casadi.core.errors import ScenarioError
-    from scenarios.reading import read_fault
-
-    found: list[Fault | None] = [None] * n
-    for table in tables:
-        own = dict(table) if isinstance(table, dict) else table
-        which = own.pop("generator", None) if isinstance(own, dict) else None
-        if which not in (None, *range(1, n + 1)):
-            raise ScenarioError(f"--fault: generator = {which!r}: the unit has 1 to {n}")
-        fault = _still(read_fault(own, "--fault"))
-        for k in range(n) if which is None else [which - 1]:
-            if found[k] is not None:
-                raise ScenarioError(f"--fault: two faults of generator {k + 1}")
-            found[k] = fault
-    return found
-
-
-def _still(part: Any) -> Any:
-    from apu_casadi.core.errors import ScenarioError
-    from apu_casadi.core.profiles.profile import Varying
-
-    if isinstance(part, Varying):
-        raise ScenarioError(f"{part.label}: what is exported starts with a value that stays")
-    return part
 
 
 def _c(args: argparse.Namespace) -> int:

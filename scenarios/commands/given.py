@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.errors import ApuWarning, ParameterError, nearest
 from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import CONDITIONS, DEFAULT_DAY, assumed_words, day_words
+from apu_casadi.unit.usual import LOAD_SHARE
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from apu_casadi.gaspath.steady.steadypoint import Limits
     from apu_casadi.machine.faults.fault import Fault
     from apu_casadi.machine.loads.load import Load
+    from apu_casadi.machine.machinedata import MachineParameters
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.enginefile import Engine
     from scenarios.schema import Scenario
@@ -156,44 +159,78 @@ def unit(args: Namespace, parts_of_it: Sequence[str] | None = None) -> Apu:
     return engine_file(args, parts_of_it).unit.change(law)
 
 
-def load(args: Namespace) -> Load:
-    """Return the load of each generator that ``--load`` describes by the keys of a scenario."""
-    from apu_casadi.core.profiles.profile import Varying
-    from scenarios.reading import PlacedError, read_load
+def loads(args: Namespace, unit: Apu, use: str = "a steady state") -> Load | list[Load]:
+    """Return the load of each generator that ``--load`` gives, W or by the keys of a scenario.
+
+    Given more than once they are those of generators 1, 2, ..., in a list.
+
+    Args:
+        use: what takes them, for the message about one that changes in time.
+    """
+    from apu_casadi.core.profiles.profile import fixed
+    from scenarios.reading import read_load
 
     parts(args)
-    load = read_load(args.load, "--load")
-    if isinstance(load, Varying):
-        raise PlacedError("--load", f"must not change in time here, got {load.label}")
-    return load
+    factor, found = getattr(args, "power_factor", 1.0), []
+    machines = [g.machine for g in unit.generators]
+    for x, machine in zip(args.load, (machines * len(args.load)), strict=False):
+        power = isinstance(x, float)
+        load = power_load(machine, x, factor) if power else read_load(x, "--load")
+        found.append(fixed(load, "--load", use))
+    return found[0] if len(found) == 1 else list(unit.each("--load", found))
 
 
-def fault(args: Namespace) -> Fault | dict[int, Fault] | None:
+def faults(args: Namespace, unit: Apu, use: str = "a steady state") -> list[Fault | None]:
     """Return the fault of each generator that ``--fault`` describes by the keys of a scenario.
 
-    With ``generator`` among them it is that of one, by its number.
+    With ``generator`` among them it is that of one, by its number, else that of all.
     """
-    from apu_casadi.core.profiles.profile import Varying
-    from scenarios.reading import PlacedError, number_of, read_fault
+    from apu_casadi.core.errors import ScenarioError
+    from apu_casadi.core.profiles.profile import fixed
+    from scenarios.reading import number_of, read_fault
 
     parts(args)
-    if args.fault is None:
-        return None
-    own = {k: v for k, v in args.fault.items() if k != "generator"}
-    found = read_fault(own, "--fault")
-    if isinstance(found, Varying):
-        raise PlacedError("--fault", f"must not change in time here, got {found.label}")
-    if own == args.fault:
-        return found
-    return {number_of(args.fault["generator"], "--fault.generator"): found}
+    n = len(unit.machines)
+    found: list[Fault | None] = [None] * n
+    for table in args.fault:
+        own = dict(table) if isinstance(table, dict) else table
+        which = own.pop("generator", None) if isinstance(own, dict) else None
+        which = None if which is None else number_of(which, "--fault.generator")
+        if which not in (None, *range(1, n + 1)):
+            raise ScenarioError(f"--fault: generator = {which!r}: the unit has 1 to {n}")
+        fault: Fault | None = fixed(read_fault(own, "--fault"), "--fault", use)
+        for k in range(n) if which is None else [which - 1]:
+            if found[k] is not None:
+                raise ScenarioError(f"--fault: two faults of generator {k + 1}")
+            found[k] = fault
+    return found
 
 
-def power_load(unit: Apu, P: float, power_factor: float = 1.0) -> Load:
-    """Return the load that draws P, W, from the rated voltage of the unit's generators."""
+def of_each(
+    parts_of_it: Sequence[Any], words: Callable[[Any], str], each: str = "each generator"
+) -> str:
+    """Return in words what generators have: ``each: ...`` where all have the same."""
+    if all(p == parts_of_it[0] for p in parts_of_it):
+        return f"{each}: {words(parts_of_it[0])}"
+    own = enumerate(parts_of_it, 1)
+    return "; ".join(f"generator {k}: {words(p)}" for k, p in own if p is not None)
+
+
+def power_load(machine: MachineParameters, P: float, power_factor: float = 1.0) -> Load:
+    """Return the load that draws P, W, from the rated voltage of a machine."""
     from apu_casadi.machine.loads.series import SeriesLoad
 
-    m = unit.generator.machine
-    return SeriesLoad.from_power(P, power_factor, V_rms=m.V_rated_rms, f=m.f_rated)
+    V_rms, f, rated = machine.V_rated_rms, machine.f_rated, machine.P_rated
+    lo, hi = (s * rated for s in LOAD_SHARE)
+    usual(f"load = {P:g} W", P, lo, hi, f"a generator is rated {rated:g} W")
+    return SeriesLoad.from_power(P, power_factor, V_rms=V_rms, f=f)
+
+
+def usual(what: str, value: float, lo: float, hi: float, why: str) -> None:
+    """Warn of a number that is possible and most often one of another unit."""
+    if not lo <= value <= hi:
+        words = f"{what} is outside {lo:.4g} to {hi:.4g}, {why}; is the unit of the number right?"
+        warnings.warn(ApuWarning(words), stacklevel=3)
 
 
 def load_words(load: Load) -> str:
@@ -279,3 +316,18 @@ def pairs(items: Iterable[str], option: str, form: str = "NAME=VALUE") -> Iterat
 def numbers(items: Iterable[str], option: str) -> dict[str, float]:
     """Return the numbers of ``NAME=VALUE`` by name; errors as :func:`pairs` and :func:`number`."""
     return {p.name: number(p.value, option, p.item) for p in pairs(items, option)}
+
+
+def formats(text: str) -> tuple[str, ...]:
+    """Return the formats that results are asked for in, before they are computed.
+
+    Raises:
+        ParameterError: an unknown one.
+    """
+    from apu_casadi.core.resultformats import FORMATS
+
+    names = tuple(dict.fromkeys(n.strip() for n in text.split(",")))
+    for name in names:
+        if name not in FORMATS:
+            raise ParameterError(f"--format: unknown format {name!r} {nearest(name, FORMATS)}")
+    return names

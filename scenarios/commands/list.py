@@ -18,6 +18,7 @@ OPTIONS = f"""
 --engines | list the units alone
 --engine NAME | print the file of a unit, with the source of every number: a start for your own
 --schema | print the JSON schema of a scenario file, for editors
+--engine-schema | print the JSON schema of an engine's file
 {given.PARTS}
 """
 
@@ -27,11 +28,11 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.unit import shippedunits
     from scenarios.registry import list_scenarios
 
-    if args.schema:
-        from scenarios.fileschema import file_schema
+    if args.schema or args.engine_schema:
+        from scenarios.fileschema import engine_schema, file_schema
 
         given.parts(args)
-        jsontext.show(file_schema())
+        jsontext.show(file_schema() if args.schema else engine_schema())
         return 0
     if args.engine is not None:
         print(shippedunits.unit_path(args.engine).read_text(encoding="utf-8"), end="")

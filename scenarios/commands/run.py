@@ -22,6 +22,8 @@ OPTIONS = f"""
 scenario SCENARIO      | a name, a .toml or a .py file
 {given.WHOLE}
 --out DIR              | folder for the files (default results/NAME)
+--format NAMES =nc     | of the data, one or several with commas between: nc (netCDF 3), nc4
+                       | (compressed; waveforms in single precision), csv, parquet, mat
 --json                 | print the summary as JSON only
 --no-figures           | draw no figures
 --no-waveforms         | keep no waveforms: a small file, rms figures
@@ -50,12 +52,13 @@ def run(args: argparse.Namespace) -> int:
         s = s.change(exchange=args.exchange)
     if args.start_from is not None:
         s = s.change(start_from=args.start_from)
+    formats = given.formats(args.format)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(s.name, s.duration, show=show) as progress:
         how = {"solver": args.solver, "phasors": args.phasors, "strict": args.strict}
         ds = registry.run(s, progress=progress, **how)
-    made = registry.write(ds, folder, figures=not args.no_figures, name=s.name)
+    made = registry.write(ds, folder, figures=not args.no_figures, name=s.name, formats=formats)
     report = registry.summary(ds)
     notices.tell(report["warnings"])
     if args.json:
@@ -125,6 +128,7 @@ _OF_EACH = {
 def made_with(report: dict[str, Any]) -> list[str]:
     """Return the lines that tell what a run was made with, and whether the model holds."""
     from apu_casadi.gaspath.conditions import CONDITIONS, day_words
+    from apu_casadi.unit.departures import of_generators
     from apu_casadi.unit.validity import exchange_words
 
     solver, error = report["solver"] or {}, report["exchange_error"]
@@ -145,7 +149,8 @@ def made_with(report: dict[str, Any]) -> list[str]:
     if error is not None:
         lines.append(exchange_words(error, report["exchange"], report["dt"]))
     left = ", ".join(
-        f"{d['quantity']} for {d['duration']:.4g} s from t = {d['first']:.6g} s in {p['name']!r}"
+        f"{d['quantity']}{of_generators(d.get('generators'))} for {d['duration']:.4g} s from t = "
+        f"{d['first']:.6g} s in {p['name']!r}"
         for p in report["phases"]
         for d in p["beyond"]
     )

@@ -12,11 +12,12 @@ Two others instead, by the names of the outputs (SI units):
 The whole unit under an electrical load of each generator, or one generator at a terminal voltage:
 
   apu trim --load 225e3
+  apu trim --load 225e3 --load 'kind = "RL", power_kW = 100, power_factor = 0.9'
   apu trim --load 225e3 --voltage 230
 
 With a fault or an unbalanced load the state is periodic; means and rms values over a turn are told:
 
-  apu trim --load 225e3 --fault 'mu = 0.05, k_rf = 20'
+  apu trim --load 225e3 --fault 'generator = 2, mu = 0.05, k_rf = 20'
   apu trim --load 'kind = "open_phase", power_kW = 100, phase = "b"'
 """
 
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
     from apu_casadi.machine.atrest import GeneratorPoint
-    from apu_casadi.machine.loads.load import Load
-    from apu_casadi.unit.apu import Apu
 
 NAME = "trim"
 HELP = "solve a steady operating point"
@@ -47,10 +46,11 @@ OPTIONS = f"""
 {given.ambient_options()}
 --power float W      | shaft power, W
 --speed float RPM    | r/min (default: governed)
---load W part        | electrical load per generator, W; or by the keys of a scenario:
-                     | 'kind = "series", R_ohm = 1, L_mH = 1'
+--load W part ...    | electrical load per generator, W; or by the keys of a scenario:
+                     | 'kind = "series", R_ohm = 1, L_mH = 1'; given more than once, that of
+                     | generators 1, 2, ...
 --power-factor float PF =1.0 | of --load (default 1)
---fault KEYS part    | with --load: fault of each generator, by the keys of a scenario:
+--fault KEYS part ... | with --load: fault of each generator, by the keys of a scenario:
                      | 'mu = 0.05, k_rf = 20, phase = "b"'; of one with 'generator = 2, ...'
 --voltage float V    | with --load: one generator alone, V rms
 --field-voltage float V | with --load: one generator alone at a field voltage, V
@@ -89,7 +89,7 @@ def _mode(args: argparse.Namespace) -> str:
         )
     voltages = (("--voltage", args.voltage), ("--field-voltage", args.field_voltage))
     for option, value in (*voltages, ("--fault", args.fault)):
-        if value is not None and args.load is None:
+        if value not in (None, []) and not args.load:
             raise SignalError(f"{option} is that of a generator and needs --load")
     for option, value in (*voltages, ("--speed", args.speed)):
         if value is not None and not value > 0:
@@ -137,7 +137,8 @@ def _joint(args: argparse.Namespace, **how: Any) -> tuple[OperatingPoint, list[d
         raise SignalError("--load is solved at governed speed; leave --speed out")
     ambient = Ambient(**given.ambient_of(args))
     unit = given.unit(args)
-    joint = unit.steady_state(_load(args, unit), given.fault(args), ambient=ambient, **how)
+    load, fault = given.loads(args, unit), given.faults(args, unit)
+    joint = unit.steady_state(load, fault, ambient=ambient, **how)
     each = (joint.generator, *joint.others)
     return joint.gas, [_values(g) for g in each]
 
@@ -150,6 +151,16 @@ def _alone(
 
     gg = given.engine(args, given.LIMITED)
     N = gg.parameters.N if args.speed is None else args.speed * RPM
+    if args.speed is not None:
+        lines, own = gg.compressor_map, gg.parameters.N / RPM
+        lo, hi = (float(lines.table.N[k]) / lines.N_map_des * own for k in (0, -1))
+        why = f"the speeds of the compressor map, design {own:.0f} r/min"
+        given.usual(f"--speed = {args.speed:g} r/min", args.speed, lo, hi, why)
+    if mode == "--power" and args.power:
+        own = gg.design.values["P_turb"]
+        given.usual(
+            f"--power = {args.power:g} W", abs(args.power), 1e-3 * own, own, "the turbine's"
+        )
     how: dict[str, Any] = {"theta": health, "limits": limits, **given.ambient_of(args)}
     if mode == "--max-power":
         values = given.numbers([args.max_power], "--max-power")
@@ -180,7 +191,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
             "inputs": {**given.ambient_of(args), "health": health},
             "assumed": given.ambient_assumed(args),
             "load": _asked(args),
-            **({"fault": args.fault} if args.fault else {}),
+            **_told(args),
             "limits": dataclasses.asdict(limits),
             "apu_casadi_version": installed(),
             **given.own(args),
@@ -193,7 +204,7 @@ def _gas(args: argparse.Namespace, mode: str) -> int:
     print(_table(values, list(values) if args.all else ["N_rpm", *SHOWN]))
     for k, own in enumerate(extra, 1):
         head = "each generator" if len(extra) == 1 else f"generator {k}"
-        print(f"\n{head}\n{_table(own, list(own))}")
+        print(f"\n{head}\n{_table(own, list(own), _electrical())}")
     print(f"\nresidual {point.residual:.1e}, {point.iterations} Newton steps")
     if point.second is not None:
         print(_second(point.second))
@@ -218,56 +229,61 @@ def _generator(args: argparse.Namespace) -> int:
     unit = given.unit(args, given.MACHINE)
     w_r = None if args.speed is None else unit.w_r(args.speed * RPM)
     how = {"w_r": w_r, "V_t": args.voltage, "V_fd": args.field_voltage}
-    fault = given.fault(args)
-    if isinstance(fault, dict):
+    if len(args.load) > 1 or any("generator" in f for f in args.fault if isinstance(f, dict)):
         raise SignalError(
-            "--fault: with --voltage or --field-voltage one generator is solved alone; "
-            "leave out generator"
+            "--load, --fault: with --voltage or --field-voltage one generator is solved alone; "
+            "give one load, and leave out generator"
         )
-    point = unit.generator.steady_state(_load(args, unit), fault, **how)
+    load: Any = given.loads(args, unit)
+    point = unit.generator.steady_state(load, given.faults(args, unit)[0], **how)
     values = _values(point)
     if args.json:
         report = {"generator": values, "residual": point.residual, "load": _asked(args)}
-        report |= {"fault": args.fault} if args.fault else {}
+        report |= _told(args)
         report |= {"note": point.note} if point.note else {}
         report |= {"apu_casadi_version": installed(), **given.own(args), **given.assumed(args)}
         jsontext.show(report)
         return 0
-    print(_table(values, list(values)))
+    print(_table(values, list(values), _electrical()))
     print(f"\nresidual {point.residual:.1e} 1/s" + (f"; {point.note}" if point.note else ""))
     print(f"{_load_words(args)}{given.program(args)}")
     return 0
 
 
-def _load(args: argparse.Namespace, unit: Apu) -> Load:
-    if isinstance(args.load, Mapping):
-        return given.load(args)
-    return given.power_load(unit, args.load, args.power_factor)
+def _asked(args: argparse.Namespace) -> Any:
+    """The electrical load of each generator, or of all; None for the gas generator alone."""
+    factor = args.power_factor
+    each = [
+        x if isinstance(x, Mapping) else {"power": x, "power_factor": factor} for x in args.load
+    ]
+    return (each[0] if len(each) == 1 else each) if each else None
 
 
-def _asked(args: argparse.Namespace) -> Mapping[str, Any] | None:
-    """The electrical load of each generator; None for the gas generator alone."""
-    if args.load is None or isinstance(args.load, Mapping):
-        return args.load
-    return {"power": args.load, "power_factor": args.power_factor}
+def _told(args: argparse.Namespace) -> dict[str, Any]:
+    """Faults as they were asked for."""
+    return {"fault": args.fault[0] if len(args.fault) == 1 else args.fault} if args.fault else {}
 
 
 def _load_words(args: argparse.Namespace) -> str:
-    if args.load is None:
+    if not args.load:
         return ""
-    fault, of = given.fault(args), "each"
-    if isinstance(fault, dict):
-        ((number, fault),) = fault.items()
-        of = f"generator {number}"
-    return _load_alone(args) + ("" if fault is None else f"fault of {of}: {fault.label}; ")
+    unit = given.unit(args)
+    n, faults = len(unit.machines), given.faults(args, unit)
+    fed = unit.each("--load", given.loads(args, unit))
+    given_as = args.load * n if len(args.load) == 1 else args.load
+    rated = [g.machine.V_rated_rms for g in unit.generators]
 
+    def load(own: tuple[Any, Any, float]) -> str:
+        asked, made, V = own
+        if isinstance(asked, Mapping):
+            return given.load_words(made)
+        return f"{asked / 1e3:g} kW at {V:g} V, power factor {args.power_factor:g}"
 
-def _load_alone(args: argparse.Namespace) -> str:
-    if isinstance(args.load, Mapping):
-        return f"load of each generator: {given.load_words(given.load(args))}; "
-    rated = given.unit(args).generator.machine.V_rated_rms
-    kilowatts = f"{args.load / 1e3:g} kW at {rated:g} V"
-    return f"load of each generator: {kilowatts}, power factor {args.power_factor:g}; "
+    V = rated if len(args.load) > 1 else rated[:1] * n
+    words = f"load of {given.of_each(list(zip(given_as, fed, V, strict=True)), load)}; "
+    if any(faults):
+        words += f"fault of {given.of_each(faults, lambda f: f.label, 'each')}; "
+    return words
 
 
 def _values(point: GeneratorPoint) -> dict[str, float]:
@@ -275,13 +291,31 @@ def _values(point: GeneratorPoint) -> dict[str, float]:
     return {"V_t": point.V_t, "V_ref": point.V_ref, **point.summary}
 
 
-def _table(values: Mapping[str, float], names: list[str]) -> str:
+def _electrical() -> dict[str, tuple[str, str]]:
+    """Unit and meaning of a generator's outputs by name."""
+    from apu_casadi.machine.generator import Generator
+    from apu_casadi.unit.stepmeans import phasor_signals
+
+    model = Generator().state_space()
+    told = {s.name: (s.unit, s.doc) for s in (*model.u, *model.y, *phasor_signals())}
+    for q, what in (("v", "voltage"), ("i", "current")):
+        rms = ((p, told[f"{q}_{p}"][0]) for p in "abc")
+        told |= {f"{q.upper()}_{p}_rms": (u, f"phase {p} {what}, rms over a turn") for p, u in rms}
+    return told | {"i_fault_rms": ("A", "current of the fault branch, rms over a turn")}
+
+
+def _table(
+    values: Mapping[str, float],
+    names: list[str],
+    electrical: Mapping[str, tuple[str, str]] | None = None,
+) -> str:
     from apu_casadi.gaspath.stations import Y
 
+    told = {"N_rpm": ("r/min", "rotor speed"), **{s.name: (s.unit, s.doc) for s in Y}}
+    told = told if electrical is None else dict(electrical)
+    width = max(8, *map(len, names))
     rows = []
     for n in (n for n in names if n in values):
-        unit, doc = (Y[n].unit, Y[n].doc) if n in Y else ("", "")
-        if n == "N_rpm":
-            unit, doc = "r/min", "rotor speed"
-        rows.append(f"{n:<8} {values[n]:>14.6g}  {unit:<8} {doc}".rstrip())
+        unit, doc = told.get(n, ("", ""))
+        rows.append(f"{n:<{width}} {values[n]:>14.6g}  {unit:<8} {doc}".rstrip())
     return "\n".join(rows)

@@ -13,7 +13,7 @@ from apu_casadi.core.errors import DataError
 from apu_casadi.core.signals import Signals
 
 if TYPE_CHECKING:
-    from apu_casadi.unit.linearisation import LinearModel
+    from apu_casadi.unit.linearmodel import LinearModel
 
 KINDS = (".nc", ".mat")
 

@@ -13,7 +13,7 @@ from scenarios.figures import figstyle as fs
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from apu_casadi.unit.linearisation import LinearModel
+    from apu_casadi.unit.linearmodel import LinearModel
 
 _LINEAR = 0.3  # 1/s; between plus and minus this the axes are linear
 

@@ -103,7 +103,7 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
 def caption(fig: Figure, text: str) -> None:
     """Write a caption along the lower edge; one of many lines in small letters."""
     lines, size, y = textwrap.fill(text, 165), 8.2, 0.10 / fig.get_figheight()
-    if lines.count("\n") > 2:
+    if lines.count("\n") > 1:
         lines, size = textwrap.fill(text, 205), 6.6
     fig.text(0.012, y, lines, fontsize=size, color=MUTED, va="bottom")
 
@@ -188,12 +188,21 @@ def legend(ax: Axes, where: str, handles: Sequence[Any] | None = None, **more: A
     ax.legend(loc=where, frameon=True, **given, **look)
 
 
+def few_ticks(ax: Axes, last: float, most: int = 6) -> None:
+    """Have so few ticks along the time that their numbers, up to ``last`` s, do not touch."""
+    from matplotlib.ticker import MaxNLocator
+
+    ax.xaxis.set_major_locator(MaxNLocator(min(most, 6 if last < 100 else 4 if last < 1000 else 3)))
+
+
 def abc_legend(ax: Axes, where: str) -> None:
-    """Draw the legend of the three phases."""
+    """Draw the legend of the three phases; ``"below"`` puts it right of the label of the axis."""
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], color=ABC[p], lw=2.2, label=f"phase {p}") for p in "abc"]
-    tight = {"handlelength": 1.4, "columnspacing": 1.1, "borderpad": 0.3}
+    tight: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.1, "borderpad": 0.3}
+    if where == "below":
+        where, tight = "upper right", {**tight, "bbox_to_anchor": (1.005, -0.075), "borderpad": 0.0}
     legend(ax, where, handles, ncols=3, **tight)
 
 

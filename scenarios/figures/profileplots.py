@@ -66,6 +66,7 @@ def figure_profiles(ds: xr.Dataset) -> Figure:
             fs.roomy(ax, values[np.isfinite(values)], 0.1)
             ax.tick_params(labelbottom=k == len(curves) - 1)
         ax.set_xlabel("Time [s]")
+        fig.align_ylabels()
         name = scenario_of(ds).get("name", "")
         words = "Profiles that the run followed, held over each exchange step at mid-step."
         fs.caption(fig, words + (f" Scenario “{name}”." if name else ""))

@@ -11,6 +11,7 @@ import numpy as np
 from apu_casadi.core.results import RPM, generators_of, of_generator, phases
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures import figstyle as fs
+from scenarios.figures.chosen import quietest
 from scenarios.figures.runwords import SEVERITY, caption_of, fault_phase, scenario_of
 
 if TYPE_CHECKING:
@@ -25,18 +26,6 @@ Lane = list[tuple[float, float, str, tuple[str, str]]]
 """Stretches of a lane: start, end, words, ground and ink."""
 
 
-def _quietest(rows: Sequence[dict[str, Any]], t: np.ndarray, y: np.ndarray) -> int | None:
-    """Return the phase whose beginning moves ``y`` least, but visibly: it wants an enlargement."""
-    best, least = None, np.inf
-    whole = float(np.ptp(y))
-    for k, p in enumerate(rows[1:], 1):
-        inside = y[(t >= p["start"] - 0.1) & (t <= min(p["end"], p["start"] + 2.5))]
-        move = float(np.ptp(inside)) if inside.size else 0.0
-        if max(1e-3 * whole, 1e-5 * float(np.abs(y).max())) < move < least:
-            best, least = k, move
-    return best
-
-
 def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str]]) -> Figure:
     """Draw quantities (name, label, scale, colour) over time, each with an enlargement."""
     fs.need(ds, [c[0] for c in curves])
@@ -45,7 +34,7 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
     with fs.drawing():
         fig = fs.new_figure(6.3)
         data = [ds[name].values * scale for name, _, scale, _ in curves]
-        enlarged = [_quietest(rows, t, y) for y in data]
+        enlarged = [quietest(ds, rows, y) for y in data]
         two = any(k is not None for k in enlarged)
         widths = [3.1, 1.0] if two else [1.0]
         place = {"left": 0.085, "right": 0.985, "hspace": 0.27, "wspace": 0.2}
@@ -68,12 +57,14 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
             lo, hi = p["start"] - 0.25, min(p["end"], p["start"] + 2.5)
             inside = (t >= lo) & (t <= hi)
             fs.change(side, lo, p["start"], hi, k - 1)
+            fs.few_ticks(side, hi, 4)
             side.plot(t[inside], y[inside], color=colour, lw=1.7)
             side.set_xlim(lo, hi)
             fs.roomy(side, y[inside], 0.1)
             fs.above(side, fs.fit(f"enlarged: {p['name']}", 30), fs.phase_colours(k)[1])
             if last:
                 side.set_xlabel("Time [s]")
+        fig.align_ylabels(fig.axes[:: len(widths)])
         caption_of(fig, ds, key)
     return fig
 

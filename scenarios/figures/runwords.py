@@ -30,6 +30,8 @@ FIGURES = {
     "fig25_voltages": "Three-phase voltages of the starter/generator",
 }
 """File names (without ``.png``) and titles, in the paper's order."""
+PAPER = "joint"
+"""The scenario whose figures the paper has; those of others have no number."""
 
 
 def _rows(ds: xr.Dataset, name: str) -> list[dict[str, Any]]:
@@ -116,7 +118,9 @@ def _note_of(ds: xr.Dataset, number: int, *, of_all: bool) -> str:
 def caption_of(
     fig: Figure, ds: xr.Dataset, key: str, more: str = "", number: int | None = None
 ) -> None:
-    """Write number, title, scenario, severity and what the run was made with under a figure.
+    """Write title, scenario, severity and what the run was made with under a figure.
+
+    Figures of the paper's scenario have their number.
 
     Args:
         more: further words.
@@ -124,6 +128,7 @@ def caption_of(
     """
     name = scenario_of(ds).get("name", "")
     title = FIGURES[key] if number is None else f"{FIGURES[key]} {number}"
-    words = [f"Figure {key[3:5]}. {title}.", f"Scenario “{name}”." if name else ""]
+    number_of_it = f"Figure {key[3:5]}. " if name in ("", PAPER) else ""
+    words = [f"{number_of_it}{title}.", f"Scenario “{name}”." if name else ""]
     words += [_severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
     caption(fig, " ".join(w for w in words if w))

@@ -10,6 +10,7 @@ import numpy as np
 
 from apu_casadi.core.results import generators_of, of_generator, phases
 from scenarios.figures import figstyle as fs
+from scenarios.figures.chosen import largest
 from scenarios.figures.runwords import caption_of
 
 if TYPE_CHECKING:
@@ -88,14 +89,15 @@ def _three_phase(
     waves = "time_w" in ds.coords
     fs.need(ds, names + rms if waves else rms)
     rows = phases(ds)
-    events = rows[1:4]
+    events = largest(ds, rows, rms, 3)
+    shown = [0, *events]
     drawn: list[Callable[[Figure, Any], None]] = []
     if waves:
-        drawn.append(partial(_steady_row, ds=ds, names=names, shown=rows[:4], label=label))
+        drawn.append(partial(_steady_row, ds=ds, names=names, rows=rows, shown=shown, label=label))
     if waves and events:
-        drawn.append(partial(_event_row, ds=ds, names=names, events=events, label=label))
+        drawn.append(partial(_event_row, ds=ds, names=names, rows=rows, events=events, label=label))
     if events:
-        drawn.append(partial(_rms_row, ds=ds, rms=rms, events=events))
+        drawn.append(partial(_rms_row, ds=ds, rms=rms, rows=rows, events=events))
     heights = [2.5] + [1.75] * len(drawn)
     with fs.drawing():
         top, bottom, gap = 0.45, 0.95, 0.72
@@ -114,23 +116,32 @@ def _three_phase(
             ax.set_ylabel(f"{label}, rms")
         ax.margins(y=0.06)
         ax.set_xlabel("Time [s]", labelpad=2)
-        fs.abc_legend(ax, "center right" if waves else "best")
+        fs.abc_legend(ax, "below")
         for row, draw in enumerate(drawn, 1):
             draw(fig, outer[row])
         told = "Envelope: extremes of all samples. Enlarged rms: of each exchange step."
-        few = "First four phases enlarged." if len(rows) > 4 else ""
+        names_of = ", ".join(f"“{rows[k]['name']}”" for k in events)
+        few = f"Enlarged of {len(rows)} phases: {names_of}." if len(rows) > 4 else ""
         caption_of(fig, run, key, f"{told if waves else ''} {few}".strip(), number)
     return fig
 
 
 def _steady_row(
-    fig: Figure, spec: Any, *, ds: xr.Dataset, names: Sequence[str], shown: Any, label: str
+    fig: Figure,
+    spec: Any,
+    *,
+    ds: xr.Dataset,
+    names: Sequence[str],
+    rows: Sequence[dict[str, Any]],
+    shown: Sequence[int],
+    label: str,
 ) -> None:
-    """Draw three cycles at the end of every phase, on one scale."""
+    """Draw three cycles at the end of some phases, on one scale."""
     grid = spec.subgridspec(1, len(shown), wspace=0.09)
     first = None
-    for k, p in enumerate(shown):
-        ax = fig.add_subplot(grid[k], sharey=first)
+    for i, k in enumerate(shown):
+        p = rows[k]
+        ax = fig.add_subplot(grid[i], sharey=first)
         first = first or ax
         ax.set_facecolor(fs.phase_colours(k)[0])
         hi = p["end"] - 0.0125
@@ -141,23 +152,31 @@ def _steady_row(
             f"{fs.fit(p['name'], 84 // len(shown) - 1, 1)}, from {lo:.3f} s",
             fs.phase_colours(k)[1],
         )
-        ax.tick_params(labelleft=k == 0)
+        ax.tick_params(labelleft=i == 0)
         ax.set_xlabel("ms", labelpad=1)
-        if k == 0:
+        if i == 0:
             ax.set_ylabel(label)
 
 
 def _event_row(
-    fig: Figure, spec: Any, *, ds: xr.Dataset, names: Sequence[str], events: Any, label: str
+    fig: Figure,
+    spec: Any,
+    *,
+    ds: xr.Dataset,
+    names: Sequence[str],
+    rows: Sequence[dict[str, Any]],
+    events: Sequence[int],
+    label: str,
 ) -> None:
-    """Draw the waveforms around the beginning of every later phase."""
+    """Draw the waveforms around the beginning of some later phases."""
     from matplotlib.ticker import MultipleLocator
 
     grid = spec.subgridspec(1, len(events), wspace=0.23)
-    for k, p in enumerate(events):
-        ax = fig.add_subplot(grid[k])
-        ink = fs.phase_colours(k + 1)[1]
-        fs.change(ax, -100, 0, 100, k)
+    for i, k in enumerate(events):
+        p = rows[k]
+        ax = fig.add_subplot(grid[i])
+        ink = fs.phase_colours(k)[1]
+        fs.change(ax, -100, 0, 100, k - 1)
         _waves(ax, ds, names, p["start"] - 0.004, p["start"] + 0.008, p["start"])
         ax.margins(y=0.06)
         fs.above(
@@ -165,20 +184,30 @@ def _event_row(
         )
         ax.xaxis.set_major_locator(MultipleLocator(2))
         ax.set_xlabel("ms after the change", labelpad=1)
-        if k == 0:
+        if i == 0:
             ax.set_ylabel(label)
 
 
-def _rms_row(fig: Figure, spec: Any, *, ds: xr.Dataset, rms: Sequence[str], events: Any) -> None:
-    """Draw the rms values around the beginning of every later phase, each on its own scale."""
+def _rms_row(
+    fig: Figure,
+    spec: Any,
+    *,
+    ds: xr.Dataset,
+    rms: Sequence[str],
+    rows: Sequence[dict[str, Any]],
+    events: Sequence[int],
+) -> None:
+    """Draw the rms values around the beginning of some later phases, each on its own scale."""
     grid = spec.subgridspec(1, len(events), wspace=0.23)
     t = ds["time"].values
-    for k, p in enumerate(events):
-        ax = fig.add_subplot(grid[k])
-        ink = fs.phase_colours(k + 1)[1]
+    for i, k in enumerate(events):
+        p = rows[k]
+        ax = fig.add_subplot(grid[i])
+        ink = fs.phase_colours(k)[1]
         lo, hi = max(p["start"] - 0.2, t[0]), min(p["start"] + 1.6, p["end"])
         inside = (t >= lo - 1e-9) & (t <= hi + 1e-9)
-        fs.change(ax, lo, p["start"], hi, k)
+        fs.change(ax, lo, p["start"], hi, k - 1)
+        fs.few_ticks(ax, hi)
         drawn = []
         for name in rms:
             x, y = t[inside], ds[name].values[inside]
@@ -188,7 +217,7 @@ def _rms_row(fig: Figure, spec: Any, *, ds: xr.Dataset, rms: Sequence[str], even
         fs.roomy(ax, np.concatenate(drawn), 0.1)
         fs.above(ax, f"{fs.fit(p['name'], 84 // len(events), 1)}: rms, enlarged", ink)
         ax.set_xlabel("Time [s]", labelpad=1)
-        if k == 0:
+        if i == 0:
             unit = ds[rms[0]].attrs.get("units", "")
             ax.set_ylabel(f"rms [{unit}]")
 

@@ -8,7 +8,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from apu_casadi.core.errors import ScenarioError, nearest
 
@@ -21,6 +21,7 @@ class Parser(argparse.ArgumentParser):
         # an abbreviation that works today may be another option's name tomorrow
         super().__init__(*args, **{**options, "allow_abbrev": False})
         self.register("type", float, finite)
+        self.register("type", int, whole)
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -37,6 +38,16 @@ class Parser(argparse.ArgumentParser):
             known = [o for o in self._option_string_actions if o.startswith("--")]
             self.error(f"unrecognized arguments: {' '.join(unknown)} {nearest(option, known)}")
         return found, rest
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse what is none of an argument's choices; the nearest one is named."""
+        if action.choices is not None and value not in action.choices:
+            known = [str(c) for c in action.choices]
+            raise argparse.ArgumentError(action, f"unknown {value!r} {nearest(str(value), known)}")
+
+    def error(self, message: str) -> NoReturn:
+        """End with status 2 and one line: what is wrong, and where the rest is told."""
+        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Print help on stdout so that a full disk is noticed; argparse passes over it."""
@@ -55,6 +66,14 @@ def finite(text: str) -> float:
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"a finite number is expected, got {text!r}")
     return value
+
+
+def whole(text: str) -> int:
+    """Return a whole number; every option of type int is read so."""
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"a whole number is expected, got {text!r}") from None
 
 
 def count(option: str, value: int | None, *, least: int = 1, most: int = 1_000_000) -> None:
@@ -94,7 +113,10 @@ def part(text: str) -> float | dict[str, Any]:
     try:
         table: dict[str, Any] = tomllib.loads(f"part = {{ {keys} }}")["part"]
     except tomllib.TOMLDecodeError as e:
-        raise argparse.ArgumentTypeError(f"'key = value, ...' is expected ({e})") from None
+        raise argparse.ArgumentTypeError(
+            f"'key = value, ...' is expected, as TOML has it, words as in kind = \"RL\", got "
+            f"{text!r} ({e})"
+        ) from None
     return table
 
 

@@ -10,6 +10,7 @@ run with the same seeds and the same constants is not run again.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
 import re
@@ -158,6 +159,26 @@ def pending(study: Study, folder: str | Path, n_seeds: int) -> list[str]:
     return [name for name in study.parts if found[name] in PENDING]
 
 
+def from_seed(study: Study, seed0: int | None) -> Study:
+    """Return the study with another first seed; None: as it is."""
+    return study if seed0 is None else dataclasses.replace(study, seed0=seed0)
+
+
+def parts_with(study: Study, words: str | None) -> list[str]:
+    """Return the parts whose names contain one of some words, which commas part; None: all.
+
+    Raises:
+        ParameterError: no part has a word; the nearest name is told.
+    """
+    if words is None:
+        return list(study.parts)
+    asked = [w.strip() for w in words.split(",") if w.strip()]
+    for w in asked or [""]:
+        if not w or not any(w in name for name in study.parts):
+            raise ParameterError(f"study {study.name}: no part {w!r} {nearest(w, study.parts)}")
+    return [name for name in study.parts if any(w in name for w in asked)]
+
+
 def other_code(study: Study, record: Mapping[str, Any]) -> str:
     """Say which parts of a record were made with other filters than the code makes now; or ""."""
     found = states(study, record)
@@ -182,6 +203,8 @@ def run(
     folder: str | Path,
     *,
     n_seeds: int | None = None,
+    seed0: int | None = None,
+    only: str | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -193,6 +216,8 @@ def run(
         name: of the study.
         folder: where ``NAME.json`` is kept.
         n_seeds: fresh seeds; the study's own number by default.
+        seed0: the first of them; the study's own by default.
+        only: parts whose names contain one of these words; see :func:`parts_with`.
         again: run all parts, kept or not.
         progress: see :data:`Progress`.
 
@@ -200,18 +225,19 @@ def run(
         ParameterError: unknown study, fewer than two seeds.
         DataError: the folder cannot be used.
     """
-    study = get(name)
+    study = from_seed(get(name), seed0)
     n = study.seeds if n_seeds is None else n_seeds
     if n < 2:
         raise ParameterError(f"a study of {n} seeds says nothing: 2 at least")
+    some, tell = parts_with(study, only), progress or (lambda *_: None)
     with locked(Path(folder), f"{name}.lock"):
-        return _run(study, folder, n, again=again, progress=progress or (lambda *_: None))
+        return _run(study, folder, n, some, again=again, progress=tell)
 
 
 def _run(
-    study: Study, folder: str | Path, n: int, *, again: bool, progress: Progress
+    study: Study, folder: str | Path, n: int, some: list[str], *, again: bool, progress: Progress
 ) -> dict[str, Any]:
-    todo = list(study.parts) if again else pending(study, folder, n)
+    todo = some if again else [p for p in pending(study, folder, n) if p in some]
     record, fixed = read(study, folder), study.fixed()
     if not _holds(record["fixed"], fixed):
         record["parts"] = {}

@@ -18,15 +18,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core import files
-from apu_casadi.core.errors import ScenarioError
+from apu_casadi.core.errors import EstimationError, ScenarioError
 from apu_casadi.core.sharing import last
 from apu_casadi.gaspath.health import HEALTH, HEALTH_FACTORS
 from apu_casadi.machine.machinedata import require_linear
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT
-from estimators.apu.joint import GAIN_SHARE, estimate_joint, joint_case
-from estimators.apu.sensors import gas_path_table
+from estimators.apu.joint import GAIN_SHARE, beside_truth
+from estimators.apu.measuring import drawn_gains, measure_run, write_recording
+from estimators.apu.recorded_estimate import estimate as recorded_estimate
+from estimators.apu.recordings.measured import read_recording
+from estimators.apu.sensorfile import SensorFile, read_sensors
 from scenarios import registry
 from scenarios.schema import Scenario
 from scenarios.shell.template import Template
@@ -95,6 +98,9 @@ its 1 sigma of {sigma:.2f} %.
 @h moved
 The change of health at {onset:g} s moved {name} by {of_n:+.1e} within {seconds:.2g} s (1 sigma is
 {sigma_n:.1e}).
+
+@doubt
+NOT TO BE BELIEVED as it stands: {why}.
 
 @caption
 Scenario {scenario}, seed {seed}; gain errors drawn for all sensors.
@@ -166,21 +172,41 @@ def _simulated(s: Scenario, progress: Callable[[float, float], None] | None) -> 
     return ds
 
 
-def estimate(ds: xr.Dataset, seed: int, **options: Any) -> xr.Dataset:
-    """Measure a truth with the errors of a seed and estimate along it; see :func:`estimate_joint`.
+def estimate(
+    ds: xr.Dataset,
+    seed: int,
+    *,
+    sensors: SensorFile | str | Path | None = None,
+    folder: Path | None = None,
+) -> xr.Dataset:
+    """Measure a truth with the errors of a seed, and estimate from that recording alone.
 
-    The result carries scenario, phases and seed as attributes.
+    The estimate is that of :func:`estimators.apu.recorded_estimate.estimate`; beside it stands the
+    truth, as from :func:`~estimators.apu.joint.estimate_joint`.  It carries scenario, phases, seed,
+    doubts and what is lacking as attributes.
+
+    Args:
+        ds: the truth.
+        seed: of all errors.
+        sensors: what is measured, or its file; the tables by default.
+        folder: where the recording is written; nowhere by default.
 
     Raises:
-        DataError, EstimationError: as :func:`estimate_joint`.
+        DataError, EstimationError: no estimate of gas path and generators; as the estimate.
     """
-    case = joint_case(seed)
     s = json.loads(ds.attrs["scenario"])
     unit = registry.unit_for(Scenario.from_dict(s))
-    options.setdefault("gas_sensors", gas_path_table())
-    gains: dict[str, Any] = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
-    found = estimate_joint(ds, seed, apu=unit, **gains, **options)
-    found.attrs |= {n: json.dumps(v) for n, v in gains.items()} | {"seed": seed}
+    of = sensors if isinstance(sensors, SensorFile) else read_sensors(sensors)
+    made = measure_run(ds, unit, seed, of)
+    recorded = made.values() if folder is None else write_recording(made, folder / "recording.nc")
+    # the efficiency is no sensor's: its error is of the unit as the filters know it
+    error = drawn_gains(of, seed).get("PW", 0.0)
+    e = recorded_estimate(read_recording(*recorded), unit, sensors=of, efficiency_error=error)
+    if e.path is None or not e.sides:
+        raise EstimationError("; ".join(f"{n}: {why}" for n, why in e.lacking.items()))
+    found = beside_truth(ds, e.sides[min(e.sides)], *e.path)
+    told = {"doubts": list(e.doubts), "lacking": dict(e.lacking), "notes": list(e.notes)}
+    found.attrs |= {n: json.dumps(v) for n, v in told.items()} | {"seed": seed}
     found.attrs |= {n: ds.attrs[n] for n in ("scenario", "phases")}
     found.attrs |= {n: ds.attrs[n] for n in (*_TOLD, "apu_casadi_version") if n in ds.attrs}
     if "solver" in ds.attrs:
@@ -250,6 +276,8 @@ def report(e: xr.Dataset) -> dict[str, Any]:
     about = {"scenario": scenario["name"], "title": scenario.get("title", "")}
     about |= {k: scenario[k] for k in ("engine", "governor") if k in scenario}
     found_out = {"short_circuit": _short_circuit(e), "health": _health(e)}
+    doubts = json.loads(e.attrs.get("doubts", "[]"))
+    about |= {"believable": not doubts, "doubts": doubts}
     out = {**about, "seed": e.attrs["seed"], **made_with(e), "phases": rows, **found_out}
     return {**out, "cross_talk": _cross_talk(e)}
 
@@ -400,7 +428,7 @@ def words(r: Mapping[str, Any]) -> list[str]:
     for c in talk["health_on_h"]:
         n = max(c["change"], key=lambda n: abs(c["change"][n]))
         out.append(TEXT.text("h moved", name=n, of_n=c["change"][n], sigma_n=c["sigma"][n], **c))
-    return out
+    return [*out, *(TEXT.text("doubt", why=d) for d in r.get("doubts", ()))]
 
 
 def _short_circuit_words(s: Mapping[str, Any]) -> list[str]:

@@ -17,7 +17,7 @@ import csv
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -35,6 +35,8 @@ FILE_KEYS = ("file", "column", "time")
 """Keys of a profile that is read from a file; the last two have defaults."""
 LARGEST_FILE = 1 << 26
 """Largest file of a profile, bytes."""
+_BEFORE = "is before the profile begins; its time counts from 0 s, where its phase or event starts"
+_THRICE = "stands there three times; two make a jump, from the value before to that after"
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class OfPoints(Parametric, Profile):
     """Values at times; a base of kinds that say what holds in between.
 
     Args:
-        times: s, never decreasing, at least one.
+        times: s, from 0, never decreasing, at least one.
         points: a value for each.
         source: file and column that they are from.
     """
@@ -69,9 +71,14 @@ class OfPoints(Parametric, Profile):
             raise ScenarioError(
                 f"values: {len(self.points)} for {len(self.times)} times; one for each is expected"
             )
+        if self.times[0] < 0:
+            raise ScenarioError(f"times[1]: {self.times[0]:g} s {_BEFORE}")
         for i, (a, b) in enumerate(itertools.pairwise(self.times), 2):
             if b < a:
                 raise ScenarioError(f"times[{i}]: {b:g} s is before {a:g} s; times go on")
+        for i, (a, b) in enumerate(zip(self.times, self.times[2:], strict=False), 3):
+            if a == b:
+                raise ScenarioError(f"times[{i}]: {b:g} s {_THRICE}")
 
     @derived
     def arrays(self) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -136,6 +143,9 @@ class OfPoints(Parametric, Profile):
                 number or a time before the last one; with row and column.
         """
         rows = _read(path, (time, column))
+        row, (t, _) = rows[0]
+        if t < 0:
+            raise DataError(f"{path}: row {row}, column {time!r}: {t:g} s {_BEFORE}")
         for (_, (before, _)), (row, (t, _)) in itertools.pairwise(rows):
             if t < before:
                 raise DataError(
@@ -143,15 +153,17 @@ class OfPoints(Parametric, Profile):
                     "row before; sort the rows by time"
                 )
         times, points = zip(*(cells for _, cells in rows), strict=True)
+        for (_, (first, _)), (row, (t, _)) in zip(rows, rows[2:], strict=False):
+            if t == first:
+                raise DataError(f"{path}: row {row}, column {time!r}: {t:g} s {_THRICE}")
         return cls(times, points, f"{Path(path).name}, {column}")
 
 
 def _read(path: str | os.PathLike[str], wanted: tuple[str, str]) -> list[tuple[int, list[float]]]:
     """Return two columns of a file, each row with its number in the file."""
     text = files.read_text(path, "profile", LARGEST_FILE)
-    lines = csv.reader(text.split("\n"))
     header, rows = None, []
-    for row, cells in enumerate(lines, 1):
+    for row, cells in _cells(path, text):
         cells = [c.strip() for c in cells]
         if not any(cells) or cells[0].startswith("#"):
             continue
@@ -169,6 +181,16 @@ def _read(path: str | os.PathLike[str], wanted: tuple[str, str]) -> list[tuple[i
     if not rows:
         raise DataError(f"{path}: no rows: a header with {' and '.join(wanted)}, then numbers")
     return rows
+
+
+def _cells(path: Any, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of each row."""
+    row = 0
+    try:
+        for row, cells in enumerate(csv.reader(text.split("\n")), 1):
+            yield row, cells
+    except csv.Error as e:
+        raise DataError(f"{path}: row {row + 1}: no cells with commas between: {e}") from None
 
 
 def _column(path: Any, row: int, header: list[str], name: str) -> int:
@@ -198,7 +220,7 @@ class Points(OfPoints):
     """Straight lines between points; constant before the first and after the last.
 
     Args:
-        times: s, never decreasing; two equal ones are a jump.
+        times: s, from 0, never decreasing; two equal ones are a jump.
         points: a value for each.
         source: file and column that they are from.
 
@@ -231,12 +253,12 @@ class Steps(OfPoints):
     """Each value holds from its time on until the next one; the first also before.
 
     Args:
-        times: s, increasing.
+        times: s, from 0, never decreasing; of two equal ones the later counts.
         points: a value for each.
         source: file and column that they are from.
 
     Raises:
-        ScenarioError: no numbers, times that do not increase, or lists of different lengths.
+        ScenarioError: no numbers, times that go back, or lists of different lengths.
     """
 
     word = "steps"

@@ -132,7 +132,7 @@ def profile_from_table(
         return PROFILES[table["kind"]].from_table(rest, name, os.fspath(folder))
     found = next((cls for cls in PROFILES.classes if cls.told_by(table)), None)
     if found is None:
-        known = {k.name for cls in PROFILES.classes for k in cls.keys}
+        known = dict.fromkeys(k.name for cls in PROFILES.classes for k in cls.keys) | {"file": None}
         wrong = next((str(k) for k in table if k not in known), None)
         if wrong is not None:
             raise ScenarioError(f"{wrong}: unknown key of a profile {nearest(wrong, known)}")
@@ -309,6 +309,33 @@ def at(value: Any, t: Any) -> Any:
     if isinstance(value, Varying):
         return value.at(t)
     return value(t) if isinstance(value, Profile) else value
+
+
+def fixed(value: Any, what: str, use: str) -> Any:
+    """Return a value that does not change in time, for a use that is of one instant.
+
+    Args:
+        what, use: for the message, as ``"load"`` and ``"a steady state"``.
+
+    Raises:
+        ScenarioError: it changes; the text says what it is at its beginning and at its last corner.
+    """
+    if not isinstance(value, Varying | Profile):
+        return value
+    corners = value.corners(_LONG)
+    times = (0.0, *corners[-1:])
+    ends = ", ".join(f"{_words(at(value, t))} at t = {t:g} s" for t in times)
+    raise ScenarioError(
+        f"{what}: {value.label} changes in time, and {use} is of one instant: give what it is "
+        f"then, {ends}"
+    )
+
+
+_LONG = 3600.0  # s; the longest run
+
+
+def _words(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float | int) else getattr(value, "label", str(value))
 
 
 def held(

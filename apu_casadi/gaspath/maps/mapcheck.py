@@ -49,11 +49,13 @@ ORDER = 0.01  # of ln W or ln PR: a fall over speed that is no fall
 class Finding(NamedTuple):
     """One implausible number.
 
-    name : column, "W", "PR", "eta", "W_surge" or "PR_surge".
-    i, j : place in the table; j = -1 for a whole speed line, i = -1 for a whole beta line; for the
-        surge line its point and 0.
-    value, expected : what is there and what the neighbours say; of a line its mean.
-    excess : deviation over tolerance.
+    Args:
+        name: column, "W", "PR", "eta", "W_surge" or "PR_surge".
+        i: place in the table by speed; -1 for a whole beta line; of the surge line its point.
+        j: place by beta; -1 for a whole speed line; of the surge line 0.
+        value: what is there; of a line its mean.
+        expected: what the neighbours say.
+        excess: deviation over tolerance.
     """
 
     name: str

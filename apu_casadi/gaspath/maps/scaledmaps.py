@@ -56,11 +56,12 @@ N_CELL, N_SURGE_CELL = 4 + 3 * 16, 2 + 4  # numbers that describe a cell: its pl
 class MapPoint(NamedTuple):
     """What a map says at a point.
 
-    W : corrected flow, in the unit of the design value.
-    PR : pressure ratio, > 1.
-    eta : isentropic efficiency.
-    SM : stability margin PR_surge/PR - 1 at constant corrected flow; None for a turbine.
-    off : distance outside the table in table spans, the larger of N and beta; 0 inside.
+    Args:
+        W: corrected flow, in the unit of the design value.
+        PR: pressure ratio, > 1.
+        eta: isentropic efficiency.
+        SM: stability margin PR_surge/PR - 1 at constant corrected flow; None for a turbine.
+        off: distance outside the table in table spans, the larger of N and beta; 0 inside.
     """
 
     W: Any
@@ -233,10 +234,7 @@ def table_logs(table: MapTable) -> ca.Function:
 
 @kept
 def map_function(table: MapTable) -> ca.Function:
-    """Return the unscaled surface as a CasADi function (N, beta) -> (W, PR, eta).
-
-    N, beta : scalars in the table's units.  W, PR, eta : scalars in the table's units.
-    """
+    """Return the unscaled surface as a CasADi function (N, beta) -> (W, PR, eta) of the table."""
     N, beta = ca.MX.sym("N"), ca.MX.sym("beta")
     _, y = table_logs(table)(N, beta)
     out = [ca.exp(y[0]), 1 + ca.exp(y[1]), ca.exp(y[2])]

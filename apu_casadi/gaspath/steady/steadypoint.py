@@ -50,8 +50,15 @@ class LoadLaw:
             raise SignalError(f"load law needs finite numbers and N_ref > 0, got {self!r}")
 
 
-LIMIT_UNITS = {"T4_max": "K", "T5_max": "K", "Wf_min": "kg/s"}
-"""Units of the limits that are no ratios."""
+_LIMITS = {
+    "off_map": ("1", 0.0, math.inf), "SM_min": ("1", -math.inf, 1.0),
+    "T4_max": ("K", 250.0, math.inf), "T5_max": ("K", 250.0, math.inf),
+    "Mach8_max": ("1", 0.0, 2.0), "Wf_min": ("kg/s", 0.0, 100.0), "eta_max": ("1", 0.1, math.inf),
+}  # fmt: skip
+LIMIT_UNITS = {name: unit for name, (unit, *_) in _LIMITS.items()}
+"""Units of the limits by name."""
+LIMIT_RANGES = {name: (lo, hi) for name, (_, lo, hi) in _LIMITS.items()}
+"""Lowest and highest value that each may have."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +97,9 @@ class Limits:
             x = number(f"limit {f.name}", value)
             if math.isnan(x):
                 raise SignalError(f"limit {f.name} must be a number, got nan")
+            lo, hi = LIMIT_RANGES[f.name]
+            if not lo <= x <= hi:
+                raise SignalError(f"limit {f.name} must lie in [{lo:g}, {hi:g}], got {x:g}")
             object.__setattr__(self, f.name, x)
 
     @classmethod

@@ -40,8 +40,12 @@ _COUNT = 1e-12  # what one iteration adds to the counter, far below STEP_TOL
 class Output(NamedTuple):
     """Positions in what the kernel returns.
 
-    w : (z, N, Wf, PW), shape (14,).  y : outputs.  r : residuals of the cycle, the power balance
-    and the specifications that are not direct.  s : the unknowns as sought.  iterations : count.
+    Args:
+        w: (z, N, Wf, PW), shape (14,).
+        y: outputs.
+        r: residuals of the cycle, the power balance and the specifications that are not direct.
+        s: the unknowns as sought.
+        iterations: their number.
     """
 
     w: Any

@@ -16,6 +16,7 @@ import numpy as np
 
 from apu_casadi.core import backend
 from apu_casadi.core.errors import SignalError
+from apu_casadi.core.lanes import lanelibrary
 from apu_casadi.core.sharing import BUILDING, Rebuilt, building, keep, kept
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.cycle import Cycle
@@ -26,6 +27,7 @@ from apu_casadi.gaspath.steady.trimkernel import LAW, TrimKernel
 
 COMPILE_FROM = 300  # points from which compiling pays; below, a library is used if there is one
 FLOORS = (1e-3, 1e-5)  # smallest steps of a continuation; the second where the end is not clear
+STARTED = ("warm", "side", "equations")  # functions that take s before the rest
 HOT = (("N", "PW"), ("N", "Wf"), ("N", "T4"), ("N", "T5"), ("PW", "Wf"), (LAW, "Wf"))
 """Pairs worth compiling ahead of time, names sorted."""
 
@@ -66,6 +68,27 @@ class TrimCode(Rebuilt):
             self._made[(which, "c") if loaded else tried] = f
             return f
 
+    def wide(self, which: str, *, compile: bool) -> Any:
+        """Return the function for several points at once, as :meth:`function`; None: there is none.
+
+        The numbers of the engine, its last argument, are common to them.
+        """
+        if (lanes := lanelibrary.lanes_in_use()) == 1:
+            return None
+        made = self._made.get((which, f"{lanes} lanes"))
+        tried = (which, f"load {lanes} lanes")
+        if made is not None or (not compile and tried in self._made):
+            return made
+        with BUILDING:
+            made = lanelibrary.recalled(
+                f"{self._digest} {which}",
+                lambda: getattr(self.kernel, which),
+                common=(2 if which in STARTED else 1,),
+                compile_missing=compile,
+            )
+            self._made[tried if made is None else (which, f"{lanes} lanes")] = made
+        return made
+
     def one(self, which: str, *args: np.ndarray) -> tuple[np.ndarray, ...]:
         """Evaluate for one point; safe to call from several threads."""
         f = self.function(which, compile=False)
@@ -74,10 +97,20 @@ class TrimCode(Rebuilt):
     def many(
         self, which: str, *args: np.ndarray, n_threads: int | None, compile: bool = True
     ) -> tuple[np.ndarray, ...]:
-        """Evaluate for columns; safe to call from several threads."""
-        f = self.function(which, compile=compile)
-        many = keep(self, "many", (which, f, n_threads), lambda: backend.mapped(f, n_threads))
-        return many(*args)
+        """Evaluate for columns, in lanes where there are any; safe to call from several threads.
+
+        The last argument, the numbers of the engine, is common to them.
+        """
+        wide = self.wide(which, compile=compile)
+        f = self.function(which, compile=compile) if wide is None else wide
+
+        def made() -> backend.Mapped:
+            if wide is None:
+                return backend.mapped(f, n_threads)
+            lanes, last = wide.size2_out(0), wide.n_in() - 1
+            return backend.Mapped(wide, n_threads, width=lanes, common=(last,))
+
+        return keep(self, "many", (which, f, n_threads), made)(*args)
 
 
 @kept
@@ -141,6 +174,8 @@ def hot_functions(gg: GasGenerator | None = None) -> list[str]:
     for pair in HOT:
         code = code_of(gg.family.cycle, pair)
         names += [code.function(which, compile=True).name() for which in ("cold", "warm")]
+        wide = [code.wide(which, compile=True) for which in ("cold", "warm")]
+        names += [f.name() for f in wide if f is not None]
     return names
 
 

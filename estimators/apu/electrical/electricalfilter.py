@@ -26,6 +26,7 @@ from apu_casadi.machine.terminals import (
 )
 from estimators.apu.electrical.gaps import evened, filled, usable
 from estimators.apu.electrical.machinemodel import electrical_model
+from estimators.apu.electrical.sequences import fitted
 from estimators.apu.electrical.terminalsignals import (
     ADMITTANCE,
     GAIN_SENSORS,
@@ -51,6 +52,7 @@ from estimators.apu.electrical.tuning import (
     START_SIGMA,
     START_SIGMA_SHUNT,
 )
+from estimators.apu.sensorchain import spread
 from estimators.apu.sensors import ELECTRICAL, SensorSet
 from estimators.filters.belief import Belief
 from estimators.models.filtermodel import FilterModel, Unknown, augment
@@ -121,7 +123,9 @@ class ElectricalFilter(Parametric):
         t = a["t"]
         given = {n: a[n] for n in INPUTS.names}
         v = np.array([a[n] for n in PHASES_V])
-        given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=JUMP), strict=True))
+        # what is white beside the noise for which JUMP is made: jitter, digits
+        floor = max(JUMP, *(10 * self.sensors[n].rest for n in PHASES_V))
+        given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=floor), strict=True))
         jumped = np.any([given[n] > 0 for n in JUMP_SIZES.names], axis=0)
         mid = _middles(t, v, a["w_r"], jumped)
         given |= {n: np.maximum(given[n], off) for n in JUMP_SIZES.names}
@@ -136,8 +140,8 @@ class ElectricalFilter(Parametric):
             given["keep"][window_starts(t, 0.02 if window is None else window, start)] = 0.0
         u = self.model.u.pack(given)
         y = np.array([a[n] for n in MEASURED])
-        sigma = np.array([[self.sensors.sigma(n, 0.0)] for n in MEASURED])
-        variance = np.broadcast_to(sigma**2, y.shape).copy()
+        sigma = np.array([spread(self.sensors[n], t, a[n], wave=True) for n in MEASURED])
+        variance = sigma**2
         return Recording(t, u, y, variance, self.model.p.pack({}))
 
     def _filled(self, a: dict[str, np.ndarray]) -> np.ndarray:
@@ -284,28 +288,27 @@ class _FirstPeriod:
         a = {n: plain_numbers(samples[n], n, gaps=True) for n in names}
         a = usable(a, ("w_r", *VOLTAGES))
         start_at = a["t"][0]  # where the recording starts, complete or not
-        good = np.all([np.isfinite(v) for v in a.values()], axis=0)
+        good = np.isfinite(a["w_r"])
         a = {n: v[good] for n, v in a.items()}
-        if not a["t"].size:
-            raise DataError("no complete sample to start from")
         w = float(np.median(a["w_r"][: max(1, a["t"].size // 50)]))
         T = 2 * math.pi / abs(w) if period is None else period
         first = a["t"] < start_at + T * (1 - 1e-6)
-        if first.sum() < 8:
-            raise DataError(f"the first {T:.3g} s hold {int(first.sum())} samples; 8 are needed")
         a = {n: v[first] for n, v in a.items()}
+        least = min(names, key=lambda n: np.isfinite(a[n]).sum())
+        if (count := int(np.isfinite(a[least]).sum())) < 8:
+            raise DataError(f"the first {T:.3g} s hold {count} samples of {least}; 8 are needed")
         tau = a["t"] - start_at
         basis = np.column_stack([np.cos(w * tau), -np.sin(w * tau), np.ones_like(tau)])
 
         def phasors(names: Sequence[str]) -> np.ndarray:
-            c = np.linalg.lstsq(basis, np.column_stack([a[n] for n in names]), rcond=None)[0]
+            c = fitted(basis, np.column_stack([a[n] for n in names]))
             return np.asarray(c[0] + 1j * c[1])
 
         v, i = phasors(PHASES_V), phasors(PHASES_I)
         size = abs(complex(v @ TURN) / 3)
         if size < 0.05 * machine.V_rated_rms:
             raise DataError(f"no voltage to start from: positive sequence {size:.3g} V")
-        return cls(w, v, i, float(a["i_fd"].mean()))
+        return cls(w, v, i, float(np.nanmean(a["i_fd"])))
 
 
 def _middles(t: np.ndarray, v: np.ndarray, w_r: np.ndarray, jumped: np.ndarray) -> np.ndarray:

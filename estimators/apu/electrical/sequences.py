@@ -20,7 +20,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.means import fortescue
 
-__all__ = ["WINDOW", "Sequences", "sequences"]
+__all__ = ["WINDOW", "Sequences", "fitted", "sequences"]
 
 WINDOW = 0.1  # s, but PERIODS periods at least
 PERIODS = 4
@@ -60,23 +60,24 @@ def sequences(t: np.ndarray, phases: np.ndarray, *, rate: float = 1.0) -> Sequen
 
     Args:
         t: instants, s, (K,).
-        phases: samples of phases a, b, c, NaN where there is none, (3, K).
+        phases: samples of phases a, b, c, NaN where there is none, (3, K); each phase's own
+            samples are used.
         rate: false alarms an hour on a stationary machine, at most.
 
     Raises:
         DataError: too short, or no sinusoid in it.
     """
-    there = np.isfinite(phases).all(axis=0)
+    there = np.isfinite(phases).any(axis=0)
     t, x = np.asarray(t, float)[there], np.asarray(phases, float)[:, there]
-    if t.size < 16:
-        raise DataError(f"{t.size} instants with all three phases: 16 are needed at least")
+    if _fewest(x) < 16:
+        raise DataError(f"{_fewest(x)} samples of one of the phases: 16 are needed at least")
     f = _frequency(t, x)
     length = max(WINDOW, PERIODS / f)
     n = int((t[-1] - t[0]) / length * (1 + 1e-9))
     if n < 1:
         raise DataError(f"{t[-1] - t[0]:.3g} s hold no window of {length:.3g} s")
     edges = np.searchsorted(t, t[0] + length * np.arange(n + 1) - 1e-9)
-    rows = [(i, j) for i, j in pairwise(edges) if j - i >= 16]
+    rows = [(i, j) for i, j in pairwise(edges) if _fewest(x[:, i:j]) >= 16]
     found = [_window(t[i:j], x[:, i:j], f) for i, j in rows]
     if not found:
         raise DataError("no window has 16 samples of all three phases")
@@ -91,7 +92,8 @@ def _frequency(t: np.ndarray, x: np.ndarray) -> float:
     """Frequency of the largest line of the space vector, Hz."""
     step = float(np.median(np.diff(t)))
     even = np.arange(t[0], t[-1], step)[: 1 << 16]
-    space = sum(np.interp(even, t, v) * TURN**k for k, v in enumerate(x))
+    own = [(t[np.isfinite(v)], v[np.isfinite(v)]) for v in x]
+    space = sum(np.interp(even, *tv) * TURN**k for k, tv in enumerate(own))
     space = (space - space.mean()) * np.hanning(even.size)
     size = np.abs(np.fft.fft(space, 4 * even.size))
     f = float(abs(np.fft.fftfreq(size.size, step)[int(size.argmax())]))
@@ -104,15 +106,45 @@ def _phasors(t: np.ndarray, x: np.ndarray, f: float) -> tuple[np.ndarray, float]
     """Symmetrical components of a sinusoid in each phase, and what it leaves, rms."""
     w = 2 * math.pi * f * (t - t[0])
     basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
-    c = np.linalg.lstsq(basis, x.T, rcond=None)[0]
+    if np.isfinite(x).all():  # well conditioned, and faster
+        c = np.linalg.solve(basis.T @ basis, basis.T @ x.T)
+    else:
+        c = fitted(basis, x.T)
     parts = np.array(fortescue(c[0] + 1j * c[1]))
-    return parts, float(np.sqrt(np.mean((x.T - basis @ c) ** 2)))
+    return parts, float(np.sqrt(np.nanmean((x.T - basis @ c) ** 2)))
+
+
+def _share(t: np.ndarray, x: np.ndarray, f: float) -> float:
+    """Standard deviation of either part of a sequence over that of a sample."""
+    there = np.isfinite(x)
+    if there.all():
+        return math.sqrt(2 / x.size)
+    w = 2 * math.pi * f * (t - t[0])
+    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+    each = [np.linalg.inv(basis[r].T @ basis[r]) for r in there]
+    return math.sqrt(sum(c[0, 0] + c[1, 1] for c in each) / 2) / 3
+
+
+def fitted(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the least-squares coefficients of each column, of the rows that it has."""
+    there = np.isfinite(columns)
+    if there.all():
+        return np.asarray(np.linalg.lstsq(basis, columns, rcond=None)[0])
+    each = [
+        np.linalg.lstsq(basis[r], v[r], rcond=None)[0]
+        for r, v in zip(there.T, columns.T, strict=True)
+    ]
+    return np.column_stack(each)
+
+
+def _fewest(x: np.ndarray) -> int:
+    return int(np.isfinite(x).sum(axis=1).min())
 
 
 def _window(t: np.ndarray, x: np.ndarray, f: float) -> tuple[float, np.ndarray, float]:
     """Frequency, symmetrical components and noise of X_2/X_1 of one window."""
     half = t.size // 2
-    for _ in range(2):
+    for _ in range(2 if min(_fewest(x[:, :half]), _fewest(x[:, half:])) >= 4 else 0):
         first, second = (_phasors(t[s], x[:, s], f)[0] for s in (np.s_[:half], np.s_[half:]))
         k = int(np.abs(first[:2]).argmax())  # the order of the phases may be the other one
         turned = second[k] / first[k] * np.exp(-2j * math.pi * f * (t[half] - t[0]))
@@ -120,7 +152,7 @@ def _window(t: np.ndarray, x: np.ndarray, f: float) -> tuple[float, np.ndarray, 
     parts, rest = _phasors(t, x, f)
     if abs(parts[1]) > abs(parts[0]):
         parts = parts[[1, 0, 2]]
-    return f, parts, rest * math.sqrt(2 / (3 * t.size)) / max(abs(parts[0]), 1e-300)
+    return f, parts, rest * _share(t, x, f) / max(abs(parts[0]), 1e-300)
 
 
 def _changes(ratio: np.ndarray, sigma: np.ndarray, allowed: float) -> tuple[int, list[int]]:

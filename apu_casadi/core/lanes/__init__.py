@@ -1,0 +1,1 @@
+"""CasADi functions evaluated for many points at once in compiled vector code."""

@@ -1,0 +1,255 @@
+"""C code of CasADi functions on vectors: each operation acts on several points at once, its lanes.
+
+The instruction list of a function is a straight line, so each instruction becomes one operation on
+a vector of ``lanes`` doubles, by the vector extensions of GCC and Clang.  Lanes never meet: what is
+in one, NaN included, does not change another.
+
+Every operation is the one that CasADi's own C has, in the same order, and without fused
+multiply-add; what has no vector instruction of the same bits (exponentials, sines) calls the C
+library once for each lane.  So results are those of the scalar code to the last bit.
+
+Code is written in two widths: *wide*, on vectors, and *single*, on plain numbers, for a single
+evaluation whose maps are wide inside (:mod:`apu_casadi.core.lanes.lanegraph`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import casadi as ca
+
+from apu_casadi.core.errors import BackendError
+
+# {p} is the width's prefix, {a} and {b} are the operands
+_UNARY = """
+ASSIGN {a}|LIFT {a}|NEG -{a}|SQ {a}*{a}|TWICE 2.0*{a}|INV 1.0/{a}|NOT {p}num({a}==0.0)
+SIGN {p}sel({a}<0.0,{p}all(-1.0),{p}sel({a}>0.0,{p}all(1.0),{a}))
+"""
+_BINARY = """
+ADD {a}+{b}|SUB {a}-{b}|MUL {a}*{b}|DIV {a}/{b}|POW {p}pow({a},{b})|CONSTPOW {p}pow({a},{b})
+LT {p}num({a}<{b})|LE {p}num({a}<={b})|EQ {p}num({a}=={b})|NE {p}num({a}!={b})
+AND {p}num(({a}!=0.0)&({b}!=0.0))|OR {p}num(({a}!=0.0)|({b}!=0.0))
+IF_ELSE_ZERO {p}sel({a}!=0.0,{b},{p}all(0.0))
+"""
+#: Functions of one and of two arguments that the C library is asked for in each lane.
+_LIBM = """exp log sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh erf log1p expm1
+pow fmod atan2 hypot remainder copysign"""
+_CALLS_1, _CALLS_2 = (line.split() for line in _LIBM.split("\n"))
+_OWN_1, _OWN_2 = ["sqrt", "fabs", "floor", "ceil"], ["fmin", "fmax"]  # of the prelude
+
+
+def _table(text: str) -> dict[int, str]:
+    rows = (row.strip().split(" ", 1) for line in text.split("\n") for row in _parts(line))
+    return {getattr(ca, f"OP_{name}"): code for name, code in rows}
+
+
+def _parts(line: str) -> list[str]:
+    """Split a line of a table at bars that stand outside brackets."""
+    found, depth = [""], 0
+    for c in line:
+        depth += (c == "(") - (c == ")")
+        if c == "|" and not depth:
+            found.append("")
+        else:
+            found[-1] += c
+    return [f for f in found if f.strip()]
+
+
+UNARY = _table(_UNARY) | {
+    getattr(ca, f"OP_{n.upper()}"): f"{{p}}{n}({{a}})" for n in (*_CALLS_1, *_OWN_1)
+}
+BINARY = _table(_BINARY) | {
+    getattr(ca, f"OP_{n.upper()}"): f"{{p}}{n}({{a}},{{b}})" for n in (*_CALLS_2[1:], *_OWN_2)
+}
+NAMES = {getattr(ca, n): n for n in dir(ca) if n.startswith("OP_")}
+
+_PRELUDE = """
+#include <math.h>
+#include <stdint.h>
+#if defined(__SSE2__)
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+#define L LANES
+typedef double V __attribute__((vector_size(8*L)));
+typedef int64_t M __attribute__((vector_size(8*L)));
+typedef double S;
+#define IN static inline __attribute__((always_inline,unused))
+IN V v_all(double a){V r;for(int l=0;l<L;l++)r[l]=a;return r;}
+IN V v_sel(M m,V a,V b){return (V)((m&(M)a)|(~m&(M)b));}
+IN V v_num(M m){return (V)(m&(M)v_all(1.0));}
+IN int v_any(M m){int64_t r=0;for(int l=0;l<L;l++)r|=m[l];return r!=0;}
+IN S s_all(double a){return a;}
+IN S s_sel(int m,S a,S b){return m?a:b;}
+IN S s_num(int m){return m;}
+IN int s_any(int m){return m;}
+IN S s_sqrt(S a){return sqrt(a);}
+IN S s_fabs(S a){return fabs(a);}
+IN S s_floor(S a){return floor(a);}
+IN S s_ceil(S a){return ceil(a);}
+IN S s_fmin(S a,S b){return fmin(a,b);}
+IN S s_fmax(S a,S b){return fmax(a,b);}
+#if defined(__clang__)
+/* it has code of its own for these, which tells one zero from the other in its own way */
+IN V v_fmin(V a,V b){V r;for(int l=0;l<L;l++)r[l]=fmin(a[l],b[l]);return r;}
+IN V v_fmax(V a,V b){V r;for(int l=0;l<L;l++)r[l]=fmax(a[l],b[l]);return r;}
+#else
+/* as the C library says of numbers that are missing: the other one */
+IN V v_fmin(V a,V b){return v_sel((a<b)|(b!=b),a,b);}
+IN V v_fmax(V a,V b){return v_sel((a>b)|(b!=b),a,b);}
+#endif
+IN V v_fabs(V a){return (V)((M)a&~(M)v_all(-0.0));}
+#define EACH(f) static V v_##f(V a){V r;for(int l=0;l<L;l++)r[l]=f(a[l]);return r;}
+#if L==8 && defined(__AVX512F__)
+IN V v_sqrt(V a){return (V)_mm512_sqrt_pd((__m512d)a);}
+IN V v_floor(V a){return (V)_mm512_roundscale_pd((__m512d)a,_MM_FROUND_TO_NEG_INF|8);}
+IN V v_ceil(V a){return (V)_mm512_roundscale_pd((__m512d)a,_MM_FROUND_TO_POS_INF|8);}
+#elif L==4 && defined(__AVX__)
+IN V v_sqrt(V a){return (V)_mm256_sqrt_pd((__m256d)a);}
+IN V v_floor(V a){return (V)_mm256_floor_pd((__m256d)a);}
+IN V v_ceil(V a){return (V)_mm256_ceil_pd((__m256d)a);}
+#elif L==2 && defined(__SSE2__)
+IN V v_sqrt(V a){return (V)_mm_sqrt_pd((__m128d)a);}
+__attribute__((unused)) EACH(floor)
+__attribute__((unused)) EACH(ceil)
+#elif L==2 && defined(__aarch64__)
+IN V v_sqrt(V a){return (V)vsqrtq_f64((float64x2_t)a);}
+IN V v_floor(V a){return (V)vrndmq_f64((float64x2_t)a);}
+IN V v_ceil(V a){return (V)vrndpq_f64((float64x2_t)a);}
+#else
+__attribute__((unused)) EACH(sqrt)
+__attribute__((unused)) EACH(floor)
+__attribute__((unused)) EACH(ceil)
+#endif
+"""
+
+
+Fixed: TypeAlias = tuple[int, ...]
+Maker: TypeAlias = "Callable[[Writer, ca.Function, bool, str, Fixed], int]"
+
+
+class Written(NamedTuple):
+    """A C function ``name(arg, res, w)``: pointers to inputs and outputs, and work.
+
+    Args:
+        name: of the C function.
+        work: vectors (or numbers) of work that it needs.
+    """
+
+    name: str
+    work: int
+
+
+class Writer:
+    """Writes functions and what they call, each once for each width.
+
+    Args:
+        lanes: points at once.
+    """
+
+    def __init__(self, lanes: int) -> None:
+        self.lanes = lanes
+        self._text: list[str] = []
+        self._known: dict[tuple[int, bool, Fixed], Written] = {}
+        self._held: list[ca.Function] = []  # hashes are of objects that live
+        self._tables: dict[str, str] = {}
+        self._makers: dict[str, Maker] = {}
+        self.add("SXFunction", _straight_line)
+
+    def add(self, kind: str, make: Maker) -> None:
+        """Say who writes functions of a kind: (writer, function, wide, name, fixed) -> work."""
+        self._makers[kind] = make
+
+    def function(self, fun: ca.Function, wide: bool, fixed: Fixed = ()) -> Written:
+        """Write a function, or find it written.
+
+        Args:
+            fun, wide: the function, and whether on vectors.
+            fixed: inputs of a map that are the same for all its columns, and come once.
+
+        Raises:
+            BackendError: it holds something that has no form in lanes; the message names it.
+        """
+        key = (hash(fun), wide, fixed)
+        if key not in self._known:
+            make = self._makers.get(fun.class_name())
+            if make is None:
+                raise BackendError(
+                    f"{fun.name()} is of the kind {fun.class_name()}, which has no form in lanes; "
+                    "SX and MX functions, their maps and fast_newton have (expand() makes a "
+                    "function of scalar operations where that is possible)"
+                )
+            self._held.append(fun)
+            name = f"f{len(self._known)}_{len(self._held)}_{'v' if wide else 's'}"
+            self._known[key] = Written(name, make(self, fun, wide, name, fixed))
+        return self._known[key]
+
+    def put(self, text: str) -> None:
+        """Append a C function."""
+        self._text.append(text)
+
+    def table(self, kind: str, values: list[str]) -> str:
+        """Return the name of a constant array, one for equal contents."""
+        body = f"[{max(1, len(values))}]={{{','.join(values) or '0'}}};"
+        key = f"{kind} {body}"
+        if key not in self._tables:
+            self._tables[key] = f"t{len(self._tables)}"
+        return self._tables[key]
+
+    def source(self) -> str:
+        """Return all that was written."""
+        prelude = _PRELUDE.replace("LANES", str(self.lanes))
+        calls = [f"EACH({n})" for n in _CALLS_1]
+        two = "static V v_{0}(V a,V b){{V r;for(int l=0;l<L;l++)r[l]={0}(a[l],b[l]);return r;}}"
+        calls += [two.format(n) for n in _CALLS_2]
+        single = [f"IN S s_{n}(S a){{return {n}(a);}}" for n in _CALLS_1]
+        single += [f"IN S s_{n}(S a,S b){{return {n}(a,b);}}" for n in _CALLS_2]
+        tables = []
+        for key, name in self._tables.items():
+            kind, body = key.split(" ", 1)
+            tables.append(f"static const {kind} {name}{body}")
+        unused = [f"__attribute__((unused)) {c}" for c in calls]
+        return "\n".join([prelude, *unused, *single, *tables, *self._text, ""])
+
+
+def number(value: float) -> str:
+    """Return a double as C reads it back, to the last bit."""
+    if math.isfinite(value):
+        return repr(float(value))
+    return "NAN" if math.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
+
+
+def refused(fun: ca.Function, op: int) -> BackendError:
+    """Return the error for an operation that has no form in lanes."""
+    name = NAMES.get(op, str(op)).removeprefix("OP_")
+    return BackendError(
+        f"{fun.name()}: the operation {name} has no form in lanes; write it by others, or evaluate "
+        "this function by map"
+    )
+
+
+def _straight_line(writer: Writer, fun: ca.Function, wide: bool, name: str, _: Fixed) -> int:
+    """Write an SX function; it needs no work: compilers choose what stays in registers."""
+    p, T = ("v_", "V") if wide else ("s_", "S")
+    body = []
+    for k in range(fun.n_instructions()):
+        op, o, i = fun.instruction_id(k), fun.instruction_output(k), fun.instruction_input(k)
+        if op == ca.OP_CONST:
+            body.append(f"w{o[0]}={p}all({number(fun.instruction_constant(k))});")
+        elif op == ca.OP_INPUT:
+            body.append(f"w{o[0]}=a[{i[0]}][{i[1]}];")
+        elif op == ca.OP_OUTPUT:
+            body.append(f"r[{o[0]}][{o[1]}]=w{i[0]};")
+        elif op in UNARY:
+            body.append(f"w{o[0]}={UNARY[op].format(p=p, a=f'w{i[0]}')};")
+        elif op in BINARY:
+            body.append(f"w{o[0]}={BINARY[op].format(p=p, a=f'w{i[0]}', b=f'w{i[1]}')};")
+        else:
+            raise refused(fun, op)
+    names = ",".join(f"w{k}" for k in range(max(1, fun.sz_w())))
+    head = f"static void {name}(const {T}*const*a,{T}*const*r,{T}*w){{\n{T} {names};"
+    writer.put("\n".join([head, *body, "}"]))
+    return 0

@@ -1,0 +1,50 @@
+"""The site: ``python -m sphinx -W docs site``; no network is needed."""
+
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from apu_casadi import __version__
+
+project = "apu-casadi"
+author = "apu-casadi developers"
+copyright = "apu-casadi developers; Apache-2.0"
+release = version = __version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "myst_nb",
+    "sphinx_copybutton",
+    "site_parts",
+]
+templates_path = ["templates"]
+exclude_patterns = ["estimation/**", "templates/**"]
+
+html_theme = "furo"
+html_title = f"apu-casadi {version}"
+html_static_path = []
+html_math_renderer = "mathml"
+
+autosummary_generate = True
+# a script that runs under a Python of its own
+autodoc_mock_imports = ["openmdao", "pycycle"]
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
+myst_heading_anchors = 3
+# notebooks are run where the site is built; ``APU_DOCS_NOTEBOOKS=off`` shows them without output
+nb_execution_mode = os.environ.get("APU_DOCS_NOTEBOOKS", "auto")
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+suppress_warnings = ["myst.header"]
+linkcheck_anchors = False

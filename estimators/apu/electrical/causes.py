@@ -1,0 +1,242 @@
+"""What a change in the waveforms of a generator is: a short circuit, a sensor, a winding, a load.
+
+Each hypothesis is a filter, run over a short piece of recording around the change from the same
+start.  Its likelihood is that of all readings, unknowns and their priors included, so that
+likelihoods compare, and with prior odds give probabilities.
+
+=================== ============================================================================
+healthy             nothing that the filter does not know
+short circuit a     one phase has a severity, which comes with the change (b, c)
+hot winding         field and stator have other resistances
+sensor i_a          that current says nothing from the change on, stuck, biased or noisy (i_b, ...)
+voltage sensors     the same of the voltages, whose errors act as unknown steps
+harmonics           the currents have harmonics that the voltages have not
+=================== ============================================================================
+
+What a failed current sensor reads is taken for noise about the prediction of the other sensors,
+with the variance that is found, and harmonics have the amplitudes that are found; half the
+logarithm of the number of readings is taken off for each (Schwarz 1978, Annals of Statistics 6,
+461).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core.errors import ApuError
+from apu_casadi.machine.machinedata import MachineParameters
+from apu_casadi.machine.park import PHASES
+from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
+from estimators.apu.electrical.terminalsignals import JUMP_SIZES, MEASURED
+from estimators.apu.electrical.tuning import RESET_SIGMA
+from estimators.apu.sensors import SensorSet
+from estimators.filters.belief import Belief
+from estimators.filters.ekf import ekf_step
+from estimators.filters.filtering import FilterResult, run
+from estimators.models.filtermodel import Unknown
+from estimators.models.recording import Recording
+
+__all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "probabilities"]
+
+BEFORE, AFTER = 0.01, 0.03  # s of the piece around the change
+UNKNOWN = 1e4  # A; standard deviation of a reading that says nothing
+VOLTAGE_ERRORS = (10.0, 100.0)  # V
+ORDERS = (5, 7, 11)
+#: Prior weights of the hypotheses' kinds; a kind with several members shares its own.
+PRIOR = {
+    "healthy": 1.0,
+    "short circuit": 1.0,
+    "hot winding": 0.3,
+    "sensor": 0.3,
+    "voltage sensors": 0.3,
+    "harmonics": 0.3,
+}
+FEWEST = 100  # samples that a verdict takes
+
+
+@dataclass(frozen=True)
+class Causes:
+    """What a change is.
+
+    Args:
+        t: its instant, s.
+        probability: of each hypothesis.
+    """
+
+    t: float
+    probability: Mapping[str, float]
+
+    @property
+    def best(self) -> str:
+        """The most probable hypothesis."""
+        return max(self.probability, key=lambda n: self.probability[n])
+
+
+def probabilities(
+    loglik: Mapping[str, float], prior: Mapping[str, float] = PRIOR
+) -> dict[str, float]:
+    """Return posterior probabilities of hypotheses ``"KIND"`` or ``"KIND member"``.
+
+    Args:
+        loglik: logarithm of each one's likelihood; NaN and -inf: impossible.
+        prior: weights by kind.
+    """
+
+    def kind(name: str) -> str:
+        return next(k for k in prior if name == k or name.startswith(f"{k} "))
+
+    members = [kind(n) for n in loglik]
+    score = {
+        n: v + math.log(prior[k] / members.count(k)) if math.isfinite(v) else -math.inf
+        for (n, v), k in zip(loglik.items(), members, strict=True)
+    }
+    top = max(score.values())
+    weight = {n: math.exp(v - top) for n, v in score.items()}
+    total = sum(weight.values())
+    return {n: w / total for n, w in weight.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """The samples around a change, and filters run on them."""
+
+    machine: MachineParameters
+    sensors: SensorSet
+    samples: dict[str, np.ndarray]
+    change: float
+    backend: str | None
+
+    def filter(self, **how: Any) -> tuple[ElectricalFilter, Recording]:
+        """Return a filter and its recording."""
+        filt = electrical_filter(self.machine, sensors=self.sensors, gains="estimate", **how)
+        return filt, filt.recording(self.samples)
+
+    def run(
+        self, change: Callable[[Recording, ElectricalFilter], Recording] | None = None, **how: Any
+    ) -> tuple[FilterResult, Recording]:
+        """Run a filter with a changed recording."""
+        filt, data = self.filter(**how)
+        data = data if change is None else change(data, filt)
+        prior = filt.prior(self.samples)
+        return run(ekf_step(filt.model), prior, data, backend=self.backend), data
+
+    def shorted(self, phase: str) -> float:
+        """Log-likelihood of a short circuit that comes with the change, or was there before."""
+        filt, data = self.filter(phases=(phase,))
+        prior, step = filt.prior(self.samples), ekf_step(filt.model)
+        cut = int(np.searchsorted(data.t, self.change - 1e-9))
+        if cut < 1:
+            return float(run(step, prior, data, backend=self.backend).loglik)
+        upto = data.part(0, cut + 1)
+        y = upto.y.copy()
+        y[:, -1] = np.nan  # the sample of the change is of what follows
+        first = run(step, prior, replace(upto, y=y), backend=self.backend)
+        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in filt.model.x.names]
+        then = Belief(filt.model.x, first.final.mean, first.final.cov + np.diag(wide))
+        rest = run(step, then, data.part(cut, data.size), backend=self.backend)
+        return float(first.loglik + rest.loglik)
+
+    def late(self, data: Recording) -> np.ndarray:
+        """Samples after the change."""
+        return np.asarray(data.t >= self.change - 1e-9)
+
+    @cached_property
+    def healthy(self) -> FilterResult:
+        """What the healthy machine's filter says."""
+        return self.run(phases=())[0]
+
+    def without(self, row: int) -> float:
+        """Log-likelihood where one current says nothing after the change."""
+
+        def blind(data: Recording, _: ElectricalFilter) -> Recording:
+            variance = data.variance.copy()
+            variance[row, self.late(data)] = UNKNOWN**2
+            return replace(data, variance=variance)
+
+        r, data = self.run(blind, phases=())
+        at = self.late(data) & np.isfinite(r.innovation[row])
+        nu, S = r.innovation[row, at], r.innovation_variance[row, at]
+        found = max(float(np.mean(nu**2)), float(np.min(S)) * 1e-9)
+        own = -0.5 * (nu**2 / S + np.log(2 * math.pi * S)).sum()
+        instead = -0.5 * nu.size * (1 + math.log(2 * math.pi * found))
+        return float(r.loglik - own + instead) - 0.5 * math.log(max(nu.size, 2))
+
+    def voltages_off(self) -> float:
+        """Log-likelihood where the voltages have errors of the best of a few sizes."""
+
+        def off(size: float) -> Callable[[Recording, ElectricalFilter], Recording]:
+            def change(data: Recording, filt: ElectricalFilter) -> Recording:
+                u, late = data.u.copy(), self.late(data)
+                for n in JUMP_SIZES.names:
+                    i = filt.model.u.index(n)
+                    u[i] = np.where(late, np.maximum(u[i], size), u[i])
+                return replace(data, u=u)
+
+            return change
+
+        best = max(float(self.run(off(s), phases=())[0].loglik) for s in VOLTAGE_ERRORS)
+        return best - math.log(len(VOLTAGE_ERRORS))
+
+    def harmonics(self, r: FilterResult) -> float:
+        """Log-likelihood of a healthy machine whose currents have harmonics of their own."""
+        w = self.samples["w_r"]
+        angle = float(np.nanmedian(w)) * (r.t - r.t[0])
+        b = np.column_stack([f(m * angle) for m in ORDERS for f in (np.cos, np.sin)])
+        gain = 0.0
+        for row in range(3):
+            there = np.isfinite(r.innovation[row])
+            s = np.sqrt(r.innovation_variance[row, there])
+            z, B = r.innovation[row, there] / s, b[there] / s[:, None]
+            c = np.linalg.lstsq(B, z, rcond=None)[0]
+            gain += 0.5 * (z @ z - np.sum((z - B @ c) ** 2)) - 0.5 * b.shape[1] * math.log(z.size)
+        return float(r.loglik + gain)
+
+
+def causes_of_change(
+    machine: MachineParameters,
+    sensors: SensorSet,
+    samples: Mapping[str, np.ndarray],
+    change: float,
+    *,
+    backend: str | None = "vm",
+) -> Causes | None:
+    """Tell what a change of the waveforms is; None where there are too few samples around it.
+
+    Args:
+        machine, sensors: as the filter knows them; sensors with gain errors taken for noise.
+        samples: as :meth:`ElectricalFilter.recording` takes them.
+        change: its instant, s; that of the first sample where it was there from the start.
+        backend: see :func:`apu_casadi.core.backend.compiled`; the virtual machine is faster for
+            filters that are run once.
+    """
+    t = samples["t"]
+    at = (t >= change - BEFORE - 1e-9) & (t <= change + AFTER + 1e-9)
+    if at.sum() < FEWEST or (t[at] >= change).sum() < FEWEST // 4:
+        return None
+    piece = _Piece(machine, sensors, {n: v[at] for n, v in samples.items()}, change, backend)
+    found: dict[str, float] = {}
+
+    def judge(name: str, of: Callable[[], float]) -> None:
+        try:
+            found[name] = of()
+        except ApuError:  # a filter that loses itself explains nothing
+            found[name] = -math.inf
+
+    judge("healthy", lambda: piece.healthy.loglik)
+    for p in PHASES:
+        judge(f"short circuit {p}", lambda p=p: piece.shorted(p))  # type: ignore[misc]
+    warm = {f"machine.{n}": Unknown() for n in ("r_fd", "r_s")}
+    judge("hot winding", lambda: piece.run(phases=(), free=warm)[0].loglik)
+    for k, n in enumerate(MEASURED):
+        judge(f"sensor {n}", lambda k=k: piece.without(k))  # type: ignore[misc]
+    judge("voltage sensors", piece.voltages_off)
+    judge("harmonics", lambda: piece.harmonics(piece.healthy))
+    if not any(math.isfinite(v) for v in found.values()):
+        return None
+    return Causes(change, probabilities(found))

@@ -1,0 +1,138 @@
+"""Find noise by maximum likelihood: Q and R of the gas-path filter from a recording, with bands.
+
+FILE is read as apu estimate data reads it; several are one recording.  --noise names outputs whose
+noise is found (R), --walk states whose random walk is (Q), --inputs measured inputs; each start is
+what the table of sensors and the filter have.  A band is 95 %; what cannot be told from zero has an
+upper limit.  Whether the model explains the recording at all is said below: noise cannot.
+
+  apu tune run_gaspath.csv
+  apu tune run_gaspath.csv --noise P3,T5 --walk N,f_eta_c --out results/tune
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from scenarios.commands import given, readingoptions
+from scenarios.shell import jsontext
+
+if TYPE_CHECKING:
+    from estimators.batch.noisefit import NoiseFit
+
+NAME = "tune"
+HELP = "find noise of sensors and model from a recording, by maximum likelihood"
+OPTIONS = f"""
+files FILE + | recorded data of the gas path, CSV, Parquet or netCDF
+--noise A,B  | outputs whose noise is found (default: all that were measured)
+--walk A,B =N | states whose random walk is found (default %(default)s; empty: none)
+--inputs A,B = | measured inputs whose noise is found: Wf, PW
+{given.UNIT}
+{readingoptions.OPTIONS.strip()}
+--sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
+--prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
+{given.ambient_options("a column, what the run file says, else ")}
+--out DIR      | keep JSON and figure there
+--figures =on  | draw the estimates into it (default)
+--json         | print JSON only
+--quiet        | no list of files
+"""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, fit, print; return 0."""
+    from apu_casadi.core.files import save_figure, write_text
+    from estimators.apu.gaspath import ITERATED, ITERATIONS
+    from estimators.apu.recorded_estimate import gas_path_data
+    from estimators.apu.recordings.measured import read_recording
+    from estimators.apu.recordings.runfiles import recorded_ambient
+    from estimators.apu.sensorfile import read_sensors
+    from estimators.batch.noisefit import fit_noise
+    from scenarios import registry
+    from scenarios.figures.noiseplot import plot_noise
+    from scenarios.shell import progress
+
+    apu = given.engine_file(args).unit
+    reading, mapping = readingoptions.reading(args, apu.gas_generator)
+    columns = {n: c if u is None else f"{c}:{u}" for n, (c, u) in mapping.items()}
+    m = read_recording(*args.files, columns=columns, reading=reading)
+    said = {n: v for f in args.files for n, v in recorded_ambient(f).items() if n not in m}
+    day = said | {n: v for n, v in given.ambient_given(args).items() if v is not None}
+    sensors = read_sensors(args.sensors)
+    how: dict[str, Any] = {"sensors": sensors, "ambient": day, "prior": args.prior}
+    filt, data, prior, notes = gas_path_data(m, apu, **how)
+    measured = [n for n in filt.model.y.names if n in m]
+    progress.tell(f"fitting noise to {', '.join(m)}", quiet=args.quiet or args.json)
+    found = fit_noise(
+        filt.model,
+        prior,
+        data,
+        noise=measured if args.noise is None else given.names(args.noise),
+        walk=given.names(args.walk),
+        inputs=[f"w_{n}" for n in given.names(args.inputs)],
+        iterations=ITERATIONS,
+        iterated=ITERATED,
+    )
+    report = report_of(found) | {"notes": list(notes), "files": args.files}
+    report |= {**given.own(args), **given.assumed(args)}
+    made = []
+    if args.out is not None:
+        folder = registry.prepare(args.out)
+        made = [write_text(folder / "tune.json", jsontext.dumps(report) + "\n")]
+        if args.figures:
+            note = f"{', '.join(args.files)}; {given.program(args)}."
+            made.append(save_figure(plot_noise(report, note), folder / "tune.png"))
+    if args.json:
+        jsontext.show(report)
+        return 0
+    print(text(report))
+    if made and not args.quiet:
+        given.written(made)
+    return 0
+
+
+def report_of(found: NoiseFit) -> dict[str, Any]:
+    """Return a fit of noise, ready for JSON."""
+    import numpy as np
+
+    rows = []
+    each = zip(found.names, found.kinds, found.units, found.start, found.estimate, strict=True)
+    for i, (name, kind, unit, start, value) in enumerate(each):
+        low, high = found.interval()[i].tolist()
+        row: dict[str, Any] = {"name": name, "kind": kind, "label": found.labels[i], "unit": unit}
+        row |= {"start": start, "estimate": value}
+        row |= {"low": low, "high": high, "told_from_zero": bool(np.isnan(found.upper[i]))}
+        rows.append(row | {"spread": float(found.spread[i])})
+    correlation = {n: {"value": r, "white": s} for n, (r, s) in found.correlation.items()}
+    return {
+        "estimates": rows,
+        "loglik": found.loglik,
+        "loglik_start": found.loglik_start,
+        "nis": found.nis,
+        "correlation": correlation,
+        "doubts": list(found.doubts),
+        "iterations": found.iterations,
+    }
+
+
+def text(report: Mapping[str, Any]) -> str:
+    """Return the report as text."""
+    lines = [f"{'':<24}  {'start':>10}  {'estimate':>10}  {'95 % band':>22}  unit"]
+    for r in report["estimates"]:
+        band = f"{r['low']:.4g} to {r['high']:.4g}"
+        if not r["told_from_zero"]:
+            band = f"below {r['high']:.4g}"
+        numbers = f"{r['start']:>10.4g}  {r['estimate']:>10.4g}  {band:>22}"
+        unit = "of the stated" if r["kind"] == "input" else r["unit"]
+        lines.append(f"{r['label']:<24}  {numbers}  {unit}")
+    gain = report["loglik"] - report["loglik_start"]
+    lines += [
+        "",
+        f"log-likelihood {report['loglik']:.2f}, {gain:.2f} above the start's; "
+        f"mean NIS over readings {report['nis']:.3f} (1 is right)",
+    ]
+    limits = [r["label"] for r in report["estimates"] if not r["told_from_zero"]]
+    lines += [f"cannot be told from zero: {', '.join(limits)}"] if limits else []
+    lines += [f"doubt: {d}" for d in report["doubts"]]
+    return "\n".join([*lines, *(f"note: {n}" for n in report["notes"])])
