@@ -9,7 +9,7 @@ between call and mover need know of ensembles, if it changes nothing before the 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
@@ -100,10 +100,17 @@ class Together:
     Args:
         fun: as compiled for one call.
         of: what it was compiled from, with dense inputs and outputs.
+        one: evaluates one call; a ``Caller`` of ``fun`` if not given.
     """
 
-    def __init__(self, fun: ca.Function, of: ca.Function) -> None:
-        self.fun, self._one, self.of = fun, Caller(fun, copy=False), of
+    def __init__(
+        self,
+        fun: ca.Function,
+        of: ca.Function,
+        one: Callable[..., tuple[np.ndarray, ...]] | None = None,
+    ) -> None:
+        self.fun, self.of = fun, of
+        self._one = Caller(fun, copy=False) if one is None else one
         self._wide: Caller | None = None
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
