@@ -309,6 +309,10 @@ def gas_doubts(
     for i, k in zip(tracked.onsets, tracked.alarms, strict=True):
         quiet &= (r.t <= r.t[i] + 1e-9) | (r.t > r.t[k] + SETTLED)
     z = r.innovation / np.sqrt(r.innovation_variance)
+    for k, n in enumerate(r.y.names):
+        if s := filt.considered(n):  # that offset is no news
+            usual = 3 * s / math.sqrt(float(np.median(r.innovation_variance[k])))
+            z[k] -= np.clip(np.nanmean(np.where(quiet, z[k], np.nan)), -usual, usual)
     each = {n: np.where(quiet, row, np.nan) for n, row in zip(r.y.names, z, strict=True)}
     for f in least(findings(each, margin=MARGIN), LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
@@ -362,18 +366,20 @@ def _hidden(side: ElectricalSide) -> Iterator[Doubt]:
 def _prior_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     """Gain errors, inertia and efficiency against what was stated of them."""
     r = tracked.result
-    names = [n for n in r.x.names if n.startswith("gain_")]
+    names = [n for n in r.x.names if n.startswith(("gain_", "bias_"))]
+    names = [n for n in names if n not in filt.model.consider]
     limit = float(-ndtri(LEVEL / 2 / max(len(names), 1)))
     jumped = "jump_PW" in filt.model.u.names
     for n in names:
-        x, s = float(r[n][0][-1]), filt.sigma[n]
+        x, walk = float(r[n][0][-1]), filt.model.walk[filt.model.x.index(n)]
+        s = math.hypot(filt.sigma[n], walk * math.sqrt(r.t[-1] - r.t[0]))
         if abs(x) > limit * s and not (n == "gain_PW" and jumped and tracked.alarms):
             what = {"gain_PW": "the generators' efficiency", "gain_J": "the inertia"}
             of = what.get(n, f"the sensor {n[5:]}")
+            size = f"{x:+.3g} {r.x[n].unit}" if n.startswith("bias_") else f"{100 * x:+.1f} %"
             yield Doubt(
                 "power" if n == "gain_PW" else "prior",
-                f"{n[5:]}: an error of {100 * x:+.1f} % is {abs(x) / s:.1f} times what was stated "
-                f"of {of}",
+                f"{n[5:]}: an error of {size} is {abs(x) / s:.1f} times what was stated of {of}",
             )
 
 
