@@ -14,6 +14,7 @@ from estimators.apu import believable
 from estimators.apu.believable import KINDS, LEVEL, Doubt, standing_still
 from estimators.apu.electrical import residuals
 from estimators.apu.electrical.causes import PRIOR, probabilities
+from estimators.apu.electrical.hypotheses import Hypotheses
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.wild import wild_samples
@@ -158,7 +159,10 @@ def test_a_new_beginning_without_cause_is_told(waves):
 def side(h, s=1e-4, **more):
     h = np.repeat(np.array(h, float)[:, None], 3, axis=1)
     t, phase = 0.02 * np.arange(3), np.zeros(3, int)
-    return SimpleNamespace(severities=np.array([h, s + 0 * h]), t=t, phase=phase, **more)
+    beliefs = np.append(h, np.full((1, 3), 2e5), axis=0).T, np.diag([s, s, s, 1e3]) ** 2
+    misfit = Hypotheses.of(beliefs[0], np.repeat(beliefs[1][None], 3, axis=0)).misfit
+    told = {"severities": np.array([h, s + 0 * h]), "misfit": misfit}
+    return SimpleNamespace(**told, t=t, phase=phase, **more)
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,6 @@ from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import engine_function
-from estimators.apu.joint import H_GAIN
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.information.innovationtests import Finding, findings, least
 
@@ -75,6 +74,7 @@ MARGIN = (
     1.1  # on the variance of the gas path's innovations, for maps and gas data of another engine
 )
 STEEP = 0.1  # change of a factor beyond which no filter was tried
+SEVERAL = 25.0  # chi-squared of two degrees of freedom that one faulty phase may leave
 STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
@@ -224,22 +224,16 @@ def _slip(samples: Mapping[str, np.ndarray]) -> float:
 
 def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
     """At most one phase is faulty, and no severity is negative."""
-    h, s = side.severities
-    if not s[:, -1].all():
-        return
-    z = h[:, -1] / s[:, -1]
-    limit = float(-ndtri(LEVEL / 6))
-    best = int(z.argmax()) if z.max() > 0 else -1
-    odd = [k for k in range(3) if k != best and abs(z[k]) > limit]
-    if odd:
-        k = max(odd, key=lambda k: abs(z[k]))
-        why = "negative" if z[k] < 0 else "not that of the one faulty phase"
+    h = side.severities[0]
+    best = int(h[:, -1].argmax())
+    if side.misfit[-1] > SEVERAL:
         yield Doubt(
             "machine",
-            f"h_{PHASES[k]} = {h[k, -1]:+.1e} is {z[k]:+.1f} of its sigmas and {why}: no short "
-            "circuit of one phase explains that; another machine, or sensors that err alike",
+            f"the severities are {math.sqrt(side.misfit[-1]):.0f} sigmas from what one faulty "
+            "phase explains: no short circuit of one phase; another machine, or like errors of "
+            "several sensors",
         )
-    if best >= 0 and h[best, -1] > STEEP_H:
+    if h[best, -1] > STEEP_H:
         yield Doubt(
             "linearisation",
             f"h_{PHASES[best]} = {h[best, -1]:.2e} is larger than any that the filter was tried on",
@@ -354,7 +348,7 @@ def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, 
 def _hidden(side: ElectricalSide) -> Iterator[Doubt]:
     """A short circuit too small to report, of which a change of health may be the loss."""
     h, s = side.severities[:, :, -1]
-    i = int((h / np.hypot(s, H_GAIN)).argmax())
+    i = int((h / s).argmax())
     if not side.phase[-1] and h[i] > 2 * s[i]:
         yield Doubt(
             "power",

@@ -382,7 +382,7 @@ class _Waves:
             a = self._tame(a, notes)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
-            side = electrical_side(self.apu, self.sensors, a, t, backend=self.backend)
+            side = electrical_side(self.apu, self.sensors, a, t, judged=True, backend=self.backend)
         except (DataError, EstimationError) as e:
             lacking[what] = str(e)
             return None

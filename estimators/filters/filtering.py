@@ -172,6 +172,7 @@ class FilterResult:
         cross: covariance of the filtered state at k and the predicted one at k+1, (K, nx, nx).
         innovation_cov: covariances of the innovations, (K, ny, ny), 1 on the diagonal where nothing
             was measured; None unless kept.
+        some_cov: filtered covariances of the samples asked for, (n, nx, nx); None unless kept.
         roots: roots of the predicted covariance before each sample, and Y, Z and the root of the
             filtered covariance, each (K, nx, nx); see :mod:`estimators.filters.rootfilter`.
         again: runs the same filter in square-root form and keeps the roots; None where it cannot.
@@ -193,6 +194,7 @@ class FilterResult:
     cov_pred: np.ndarray | None = None
     cross: np.ndarray | None = None
     innovation_cov: np.ndarray | None = None
+    some_cov: np.ndarray | None = None
     roots: tuple[np.ndarray, ...] | None = field(default=None, repr=False)
     again: Callable[[], FilterResult] | None = field(default=None, repr=False)
 
@@ -330,6 +332,7 @@ def run(
     data: Recording,
     *,
     full: bool = False,
+    cov_at: np.ndarray | None = None,
     backend: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FilterResult:
@@ -340,6 +343,7 @@ def run(
         prior: belief at the first instant, before its sample.
         data: the recording.
         full: keep the covariances and what smoothers need; 3 nx^2 numbers for each instant.
+        cov_at: samples, ascending, whose filtered covariances are kept in ``some_cov``.
         backend: see :func:`apu_casadi.core.backend.compiled`.
         progress: called with (done, total) instants after every block.
 
@@ -349,7 +353,8 @@ def run(
         EstimationError: the model could not be evaluated, or the belief is no longer finite; names
             the instant and the state.
     """
-    return alone(course(step, prior, data, full=full, backend=backend, progress=progress))
+    how: dict[str, Any] = {"full": full, "cov_at": cov_at, "backend": backend}
+    return alone(course(step, prior, data, progress=progress, **how))
 
 
 def course(
@@ -358,6 +363,7 @@ def course(
     data: Recording,
     *,
     full: bool = False,
+    cov_at: np.ndarray | None = None,
     backend: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Course[FilterResult]:
@@ -383,6 +389,8 @@ def course(
     nu, S = np.empty((ny, K)), np.empty((ny, K))
     stats = np.empty((len(STATS), K))
     kept = _Kept.of(K, nx, ny, roots=step.gives_roots) if full else None
+    wanted = np.zeros(0, dtype=int) if cov_at is None else np.asarray(cov_at, dtype=int)
+    some = np.empty((wanted.size, nx, nx))
     for b in range(n_blocks):
         s = slice(b * BLOCK, (b + 1) * BLOCK)
         n = min(BLOCK, K - b * BLOCK)
@@ -397,6 +405,8 @@ def course(
         ):
             target[:, r] = source[:, :n]
         _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
+        here = (wanted >= r.start) & (wanted < r.stop)
+        some[here] = out[3].T[wanted[here] - r.start].reshape(-1, nx, nx)
         if kept is not None:
             kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=passes.rooted)
         if progress is not None:
@@ -410,6 +420,7 @@ def course(
     final = Belief(model.x, mean[:, -1].copy(), last, root)
     told = stats[1], stats[3], float(stats[2].sum()), final
     more: dict[str, Any] = {} if kept is None else kept.fields()
+    more["some_cov"] = None if cov_at is None else some
     if full and step.wide is not None:
         more["again"] = partial(_rooted, step, prior, data, backend)
     return FilterResult(model.x, model.y, data.t, mean, var, nu, S, *told, **more)
