@@ -1,7 +1,7 @@
 """Noise by maximum likelihood: Q and R from a recording, with how well they are known.
 
 The likelihood of a recording is the filter's own, sum of log N(nu; 0, S) over its innovations
-(Schweppe 1965; Särkkä 2013, section 12.3.1).  It is maximised over the logarithms of standard
+(Schweppe 1965; Särkkä 2013, chapter 12).  It is maximised over the logarithms of standard
 deviations: of random walks (Q), of measured outputs (R) and of the noises w.  Derivatives are
 exact: the filter's step is differentiated, forwards along the recording.  So is the Fisher
 information,
