@@ -14,6 +14,7 @@ from estimators.apu import believable
 from estimators.apu.believable import KINDS, LEVEL, Doubt, standing_still
 from estimators.apu.electrical import residuals
 from estimators.apu.electrical.causes import PRIOR, probabilities
+from estimators.apu.electrical.hypotheses import Hypotheses
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.wild import wild_samples
@@ -158,7 +159,10 @@ def test_a_new_beginning_without_cause_is_told(waves):
 def side(h, s=1e-4, **more):
     h = np.repeat(np.array(h, float)[:, None], 3, axis=1)
     t, phase = 0.02 * np.arange(3), np.zeros(3, int)
-    return SimpleNamespace(severities=np.array([h, s + 0 * h]), t=t, phase=phase, **more)
+    beliefs = np.append(h, np.full((1, 3), 2e5), axis=0).T, np.diag([s, s, s, 1e3]) ** 2
+    misfit = Hypotheses.of(beliefs[0], np.repeat(beliefs[1][None], 3, axis=0)).misfit
+    told = {"severities": np.array([h, s + 0 * h]), "misfit": misfit}
+    return SimpleNamespace(**told, t=t, phase=phase, **more)
 
 
 @pytest.mark.parametrize(
@@ -174,6 +178,23 @@ def side(h, s=1e-4, **more):
 def test_severities_are_of_one_phase_and_not_negative(h, kinds):
     doubts = list(believable._severity_doubts(side(h)))
     assert [d.kind for d in doubts] == kinds and set(kinds) <= set(KINDS)
+
+
+def test_voltages_and_speed_of_two_rates():
+    """1 % of another rate is 50 rad in 2 s; a load angle that changes by 1 rad is none."""
+    t, w = 1e-4 * np.arange(20_000), 2513.0
+    turn = {n: -k * 2 * np.pi / 3 for k, n in enumerate(("v_a", "v_b", "v_c"))}
+
+    def slip(rate, change=0.0):
+        angle = rate * w * t + change * (t > 1.0)
+        v = {n: 325 * np.cos(angle + k) for n, k in turn.items()}
+        v["v_a"][100:120] = np.nan
+        return believable._slip(v | {"t": t, "w_r": w + 0 * t})
+
+    assert_allclose(slip(1.0), 0.0, atol=1e-3)
+    assert_allclose(slip(1.0, 1.0), 1.0, atol=1e-3)
+    assert_allclose(slip(1.01), 0.95 * 0.01 * w * 2, rtol=0.01)
+    assert_allclose(slip(0.99), -0.95 * 0.01 * w * 2, rtol=0.01)
 
 
 # ------------------------------------------------------------------------------ causes

@@ -1,6 +1,7 @@
 """Loads and faults that change in time, propagated with interpolated tables, against CVODES."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from apu_casadi.core.means import Term, wanted
 from apu_casadi.core.profiles.points import Points
 from apu_casadi.core.profiles.profile import at, varying
 from apu_casadi.core.profiles.shapes import Growth, Ramp
-from apu_casadi.machine.course import Course
+from apu_casadi.machine import transition
+from apu_casadi.machine.course import Course, Piece
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -149,3 +151,33 @@ def test_numbers_of_many_steps_are_those_of_each():
         for a, b in zip(one, many, strict=True):
             assert_allclose(a[:, 0], b[:, k], rtol=1e-13)
     assert math.isclose(many.u[2, 0], KW100.R[0], rel_tol=1e-9)
+
+
+def test_tables_are_made_once_for_all_runs(monkeypatch):
+    """A second course of the same numbers, as of a second run, computes none."""
+    made = []
+    table = transition.transition_table
+
+    def counted(*args, **more):
+        made.append(args)
+        return table(*args, **more)
+
+    monkeypatch.setattr(transition, "transition_table", counted)
+    load = varying(SeriesLoad.from_power, Ramp(100e3, 140e3, over=77.0))
+    for least in (1, 0):
+        before = len(made)
+        course_of(load, None).numbers(np.array([20.0]))
+        assert (len(made) > before) == bool(least)
+
+
+def test_pieces_of_unequal_harmonics_go_on_by_single_steps(monkeypatch):
+    """Two pieces of one layout whose tables have more or fewer harmonics: no block of both."""
+    fast = SimpleNamespace(layout=("same",), smooth=1.0)
+    pieces = {
+        k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), np.zeros(2), np.zeros(2)) for k in (0, 1)
+    }
+    course = object.__new__(Course)
+    course._only, course.ss = None, SimpleNamespace(name="model")
+    monkeypatch.setattr(course, "_piece", lambda s: pieces[int(s)], raising=False)
+    with pytest.raises(NotApplicable, match="model: the structure changes on the way"):
+        course.numbers(np.array([0.9, 1.1]))

@@ -19,7 +19,6 @@ from apu_casadi.core.errors import DataError, ParameterError, ScenarioError, Sig
 from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
 from estimators.apu.electrical.tuning import FAULT_LEVEL
-from estimators.apu.joint import GAIN_SHARE
 from scenarios import cli
 from scenarios.commands import estimate as command
 from scenarios.figures.jointestimateplot import NAMES, plot_joint_estimate
@@ -69,9 +68,8 @@ def test_report_holds_what_the_dataset_says():
     assert v["f_eta_c"]["true"] == pytest.approx(0.98)
     assert v["f_eta_c"]["half_width"] == pytest.approx(1.96 * 0.01)
     assert v["f_eta_c"]["inside"] and not v["f_W_c"]["inside"]
-    # power: gain errors of the sensors on top of the windows' noise
-    wide = 1.96 * np.hypot(100.0, GAIN_SHARE * 200050.0)
-    assert v["P_total"]["half_width"] == pytest.approx(wide)
+    # the standard deviation of the power holds the gain errors of the sensors
+    assert v["P_total"]["half_width"] == pytest.approx(1.96 * 100.0)
     assert [p["faulty_phase"] for p in r["phases"]] == [None, None, "b"]
     s = r["short_circuit"]
     assert (s["true_phase"], s["false_reports"], s["wrong_phase_samples"]) == ("b", 0, 0)

@@ -8,20 +8,27 @@ import json
 import numpy as np
 import pytest
 
-from apu_casadi.core.errors import DataError
+from apu_casadi.core.errors import DataError, EstimationError
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.electrical import tracking
+from estimators.apu.electrical.electricalfilter import electrical_filter
+from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.joint import (
+    GAIN_SHARE,
     electrical_samples,
+    electrical_side,
     estimate_joint,
     joint_case,
     speed_from_generators,
 )
-from estimators.apu.monolithic_filter import compare_monolithic
+from estimators.apu.monolithic_filter import compare_monolithic, monolithic_filter
+from estimators.apu.sensors import ELECTRICAL
+from estimators.apu.unknowns import Knowledge
 
 APU = Apu()
 FAULT = Ttsc(mu=0.05, k_rf=20.0, phase="a")
@@ -53,10 +60,12 @@ def test_a_short_circuit_is_found_and_its_power_accounted_for(estimates):
     assert list(e["faulty_phase"].values[[3, -1]]) == [0, 1]
     assert abs(e["h_a"].values[-1] - H) < 4 * e["h_a_sigma"].values[-1]
     np.testing.assert_allclose(e["h_a_true"].values[[3, -1]], [0, H])
-    # power of each window but those of the reset, in claimed sigmas; 0.1 % of 285 kW
-    z = ((e["P_total"] - e["P_total_true"]) / e["P_total_sigma"]).values[1:]
-    assert np.abs(np.delete(z, [4, 5, 6])).max() < 4
-    assert e["P_total_sigma"].values[-1] < 300
+    # power of each window but those of the reset, 0.1 % of 285 kW: there are no gain errors here
+    error = (e["P_total"] - e["P_total_true"]).values[1:]
+    assert np.abs(np.delete(error, [4, 5, 6])).max() < 4 * 300
+    # what is claimed holds those that there might be
+    share = e["P_total_sigma"].values[-1] / e["P_total"].values[-1]
+    assert share == pytest.approx(GAIN_SHARE, rel=0.1)
 
 
 def test_no_health_fault_is_seen_in_a_short_circuit(estimates):
@@ -139,3 +148,115 @@ def test_cases_of_a_seed_are_reproducible():
     a, b, c = joint_case(1), joint_case(1), joint_case(2)
     assert a == b != c
     assert set(a.gas_gains) == {"P3", "T3", "T5", "Wf", "PW"}
+
+
+@pytest.mark.long
+def test_a_hot_field_is_no_short_circuit():
+    """The field's resistance is 20 % more than the filters know, 50 K."""
+    hot = APU.change({"machine.r_fd": 1.2 * APU.generator.machine.r_fd})
+    ds = simulate_joint(
+        hot, duration=0.1, load=SeriesLoad.from_power(100e3), dt=0.005, exchange="corrected",
+        waveform_dt=1e-4,
+    )  # fmt: skip
+    gains = joint_case(1).electrical_gains
+    measured = electrical_samples(ds, APU, np.random.default_rng(1), gains=gains)
+    t = np.arange(0, 0.1 + 1e-9, 0.02)
+    side = electrical_side(APU, ELECTRICAL, measured, t, backend="vm")
+    assert not side.phase.any() and side.resets == () and side.probability[-1] < 0.1
+    assert side.misfit[-1] < 25
+    taken = {n: Knowledge("known") for n in ("machine.r_s", "machine.r_fd")}
+    blind = electrical_side(APU, ELECTRICAL, measured, t, unknowns=taken, backend="vm")
+    assert blind.misfit[-1] > 25 or blind.resets
+
+
+@pytest.mark.long
+def test_which_machine_is_found():
+    """A short circuit in phase b of the second; each has gain errors of its own."""
+    ds = simulate_joint(
+        APU, duration=0.1, load=SeriesLoad.from_power(100e3),
+        events=[FaultChange(0.04, Ttsc(mu=0.05, k_rf=20.0, phase="b"), generator=2)], dt=0.005,
+        exchange="corrected", waveform_dt=1e-4,
+    )  # fmt: skip
+    case = joint_case(1, machines=2)
+    gains = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
+    e = estimate_joint(ds, 1, apu=APU, **gains, backend="vm")
+    assert list(e["faulty_phase_1"].values) == [0] * 6
+    assert list(e["faulty_phase_2"].values) == [0, 0, 0, 2, 2, 2]
+    assert e["ttsc_probability_1"].values[-1] < 0.1 < 0.99 < e["ttsc_probability_2"].values[-1]
+    assert e.attrs["alarms"] == "[]"
+    for n, true in (("h_b_2", H), ("h_b_1", 0.0), ("P_total", e["P_total_true"].values[-1])):
+        assert abs(e[n].values[-1] - true) < 4 * e[f"{n}_sigma"].values[-1]
+    np.testing.assert_allclose(e["h_b_2_true"].values, [0, 0, 0, H, H, H])
+
+
+def test_a_recording_in_pieces_is_filtered_as_a_whole(run, monkeypatch):
+    """Resets and beliefs do not hang on how much is filtered before it is judged."""
+    filt = electrical_filter(power=True)
+    measured = electrical_samples(run, APU, np.random.default_rng(1))
+    data = filt.recording(measured).part(0, 1500)
+    at = np.array([0, 399, 400, 1103])
+    found = []
+    for pieces in (8, 1000):
+        monkeypatch.setattr(tracking, "CHUNK", pieces * tracking.RESET_WINDOW)
+        found.append(tracking.track(filt, filt.prior(measured), data, backend="vm", cov_at=at))
+    (a, resets), (b, same) = found
+    assert resets == same == [pytest.approx(0.1, abs=0.01)]
+    np.testing.assert_allclose(a.mean, b.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(a.some_cov, b.some_cov, rtol=1e-6, atol=1e-18)
+    variance = a.some_cov.diagonal(axis1=1, axis2=2).T
+    np.testing.assert_allclose(variance, a.variance[:, at], rtol=1e-12)
+    assert a.loglik == pytest.approx(b.loglik, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_two_different_machines_in_one_filter():
+    """Own parameters, gear and load of each: as the coupled filters, and surer of the speed."""
+    unit = APU.change({"generator2.machine.r_s": 0.006, "generator2.coupling.gear": 3.05})
+    ds = simulate_joint(
+        unit,
+        duration=0.14,
+        load=[SeriesLoad.from_power(225e3), SeriesLoad.from_power(150e3)],
+        events=[LoadChange(0.06, SeriesLoad.from_power(180e3), generator=1)],
+        dt=0.005,
+        exchange="corrected",
+        waveform_dt=1e-4,
+    )
+    c = compare_monolithic(ds, 1, apu=unit)
+    for n in (*HEALTH, *(f"generator{k}.h_{p}" for k in (1, 2) for p in "abc")):
+        assert c[n]["difference_max"] < 1.0, n
+        assert 0.8 < c[n]["sigma_ratio"] < 1.01, n
+    assert c["N"]["sigma_ratio"] < 0.5
+
+
+def test_wrong_groups_of_the_filter_of_the_unit_are_told():
+    electrical = electrical_filter(APU.generator.machine, power=True)
+    gas = gas_path_filter(APU.gas_generator, gains=False, inertia=None)
+    other = APU.change({"generator2.machine.r_s": 0.006})
+    with pytest.raises(EstimationError, match="generators 1 and 2 differ"):
+        monolithic_filter(other, electrical, gas)
+    with pytest.raises(EstimationError, match="one for each group is needed"):
+        monolithic_filter(APU, (electrical,) * 3, gas)
+    two = monolithic_filter(other, (electrical, electrical), gas)
+    assert two.of == ((1,), (2,)) and "generator2.h_a" in two.model.x
+    one = monolithic_filter(APU, electrical, gas)
+    assert "h_a" in one.model.x and len(two.model.x) == 2 * len(electrical.model.x) + 6
+    n, dt = len(two.model.x), 1e-4
+    # the same state in both parts: the rotor goes on as that of the one
+    x1 = electrical.model.x.nominals * 0.3
+    N = np.array([APU.N_ref, 1.0, 1.0, 1.0, 1.0, 0.0])
+    u = electrical.model.u.pack({k: 0.0 for k in electrical.model.u.names})
+    more = gas.model.u.unpack(np.zeros(len(gas.model.u))) | {
+        "Wf": 0.04,
+        "sigma_Wf": 0.0,
+        "since": 0.0,
+    }
+    more |= {"altitude": 0.0, "Mach": 0.0, "dT_isa": 5.0, "war": 0.0, "fresh": 0.0}
+    ends = []
+    for filt, parts in ((one, 1), (two, 2)):
+        m = filt.model
+        rest = np.array([more[k] for k in m.u.names[parts * len(u) :]])
+        x, w = np.concatenate([*[x1] * parts, N]), np.zeros(len(m.w))
+        made, check = m.transition(x, np.concatenate([*[u] * parts, rest]), [], w, dt)
+        assert float(check) < 1e-6
+        ends.append(made.full().ravel()[m.x.index("N")])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-12) and n > 20

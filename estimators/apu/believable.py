@@ -32,17 +32,18 @@ import numpy as np
 from scipy.special import ndtri
 
 from apu_casadi.gaspath.health import HEALTH
-from apu_casadi.machine.park import PHASES
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
+from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import engine_function
-from estimators.apu.joint import H_GAIN
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
     from apu_casadi.machine.machinedata import MachineParameters
+    from estimators.apu.fitting import EngineFit
     from estimators.apu.gaspath import GasPathFilter
     from estimators.apu.healthjumps import Tracked
     from estimators.apu.joint import ElectricalSide
@@ -54,6 +55,7 @@ __all__ = [
     "LEVEL",
     "Doubt",
     "channel_doubts",
+    "fit_doubts",
     "gas_causes",
     "gas_doubts",
     "machine_causes",
@@ -72,10 +74,14 @@ MARGIN = (
     1.1  # on the variance of the gas path's innovations, for maps and gas data of another engine
 )
 STEEP = 0.1  # change of a factor beyond which no filter was tried
+SEVERAL = 25.0  # chi-squared of two degrees of freedom that one faulty phase may leave
+STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
 SETTLED = 0.1  # s after a report, in which its innovations are explained
+SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
+FEWEST_SAMPLES = 100
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
 SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
@@ -194,26 +200,40 @@ def machine_doubts(
             "a step of load or a fault: no model of one step fits, and reports around are doubtful",
         )
     yield from _severity_doubts(side)
+    slip = _slip(samples)
+    if abs(slip) > SLIP:
+        yield Doubt(
+            "time",
+            f"the voltages turn by {slip:+.1f} rad against the speed, where no load turns them by "
+            f"{SLIP:g}: a wrong rate of samples, or the speed of another machine",
+        )
+
+
+def _slip(samples: Mapping[str, np.ndarray]) -> float:
+    """Angle that the voltage's space vector gains on the rotor from beginning to end, rad."""
+    a = np.array([samples[n] for n in (*PHASES_V, "w_r", "t")])
+    *v, w, t = a[:, np.isfinite(a).all(0)]
+    if t.size < FEWEST_SAMPLES:
+        return 0.0
+    turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+    rotor = np.concatenate([[0.0], np.cumsum(w[:-1] * np.diff(t))])
+    angle = np.unwrap(np.angle((turn @ np.array(v)) * np.exp(-1j * rotor)))
+    ends = max(t.size // 20, 1)
+    return float(angle[-ends:].mean() - angle[:ends].mean())
 
 
 def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
     """At most one phase is faulty, and no severity is negative."""
-    h, s = side.severities
-    if not s[:, -1].all():
-        return
-    z = h[:, -1] / s[:, -1]
-    limit = float(-ndtri(LEVEL / 6))
-    best = int(z.argmax()) if z.max() > 0 else -1
-    odd = [k for k in range(3) if k != best and abs(z[k]) > limit]
-    if odd:
-        k = max(odd, key=lambda k: abs(z[k]))
-        why = "negative" if z[k] < 0 else "not that of the one faulty phase"
+    h = side.severities[0]
+    best = int(h[:, -1].argmax())
+    if side.misfit[-1] > SEVERAL:
         yield Doubt(
             "machine",
-            f"h_{PHASES[k]} = {h[k, -1]:+.1e} is {z[k]:+.1f} of its sigmas and {why}: no short "
-            "circuit of one phase explains that; another machine, or sensors that err alike",
+            f"the severities are {math.sqrt(side.misfit[-1]):.0f} sigmas from what one faulty "
+            "phase explains: no short circuit of one phase; another machine, or like errors of "
+            "several sensors",
         )
-    if best >= 0 and h[best, -1] > STEEP_H:
+    if h[best, -1] > STEEP_H:
         yield Doubt(
             "linearisation",
             f"h_{PHASES[best]} = {h[best, -1]:.2e} is larger than any that the filter was tried on",
@@ -328,7 +348,7 @@ def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, 
 def _hidden(side: ElectricalSide) -> Iterator[Doubt]:
     """A short circuit too small to report, of which a change of health may be the loss."""
     h, s = side.severities[:, :, -1]
-    i = int((h / np.hypot(s, H_GAIN)).argmax())
+    i = int((h / s).argmax())
     if not side.phase[-1] and h[i] > 2 * s[i]:
         yield Doubt(
             "power",
@@ -368,3 +388,34 @@ def _map_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     for n, v in zip(("compressor", "turbine"), y, strict=True):
         if not v <= 0:
             yield Doubt("maps", f"at the end the {n} runs off its map (by {v:.2g})")
+
+
+# ------------------------------------------------------------------------------ fits
+
+
+def fit_doubts(fit: EngineFit) -> Iterator[Doubt]:
+    """Say why the parameters of a fit are not to be believed, by residuals and bounds.
+
+    The residuals of a fit are smaller than those of the truth, so that the level is kept.
+
+    Args:
+        fit: of :func:`estimators.apu.fitting.fit_engine`.
+    """
+    r = fit.result
+    if r.freedom > 0 and r.p_value < LEVEL:
+        yield Doubt(
+            "innovations",
+            f"chi2 = {r.chi2:.4g} with {r.freedom} degrees of freedom: more than noise gives",
+        )
+    for k, name in enumerate(fit.names):
+        rest = {n: e for n, (_, _, e) in fit.series(k).items() if n in fit.lifted.model.y.names}
+        t = r.recordings[k].t
+        for f in least(findings(rest), LEVEL):
+            text = _GAS[f.test].format(v=f.value, t=float(t[f.at]))
+            text = text.replace("innovations", "residuals")
+            yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{name}: {f.sensor}: {text}")
+    for n in r.at_bound:
+        yield Doubt("linearisation", f"{n} is at its bound, where no interval holds")
+    for n, v in r.values.items():
+        if n.partition("[")[0] in HEALTH and abs(v - 1) > STEEP_FIT:
+            yield Doubt("linearisation", f"{n} = {v:.3f} is farther from 1 than any that was tried")

@@ -74,6 +74,7 @@ HEALTH_WALK = 2e-4  # 1/sqrt(s); 0.1 % in 25 s: slow against a flight, so wear i
 N_SIGMA = 20.0  # rad/s; prior of speed, 0.5 %
 N_WALK = 1.0  # rad/s/sqrt(s); what discretisation and sampling leave after a load drop
 PW_PRIOR = (3e5, 2e5)  # W; mean and standard deviation of an unknown shaft power
+LOSS_WALK = 500.0  # W/sqrt(s); a severity of 2e-5 in a second
 PW_WALK = 1e6  # W/sqrt(s); a load may drop by 280 kW at once, and no less freedom helps the health
 MODEL_ERROR = 0.003  # relative; other maps and gas data shift P3 and P5 by 0.1 % from load to load
 J_SIGMA = 0.1  # relative; the paper gives no inertia
@@ -145,6 +146,8 @@ class GasPathFilter(Parametric):
         means |= {n: v for n, v in self.gg.held.items() if n in self.model.x}
         if not self.known_power:
             means["PW"] = PW_PRIOR[0]
+        if "loss_PW" in self.model.x:
+            means["loss_PW"] = 0.0
         return Belief.of(self.model.x, means | mean, {**self.sigma, **(spread or {})})
 
     def recording(
@@ -297,12 +300,14 @@ def gas_path_filter(
     gains: Sequence[str] | bool = True,
     model_error: float = MODEL_ERROR,
     inertia: float | None = J_SIGMA,
+    consider_inertia: bool = False,
     eta: float | None = None,
     consider_eta: bool = True,
     health_sigma: float = HEALTH_SIGMA,
     walk: Mapping[str, float] | None = None,
     governed: Governor | None = GOVERNOR,
     power_jumps: bool = False,
+    loss: bool = False,
     free: Mapping[str, Unknown] | None = None,
 ) -> GasPathFilter:
     """Make a gas-path filter.
@@ -317,6 +322,7 @@ def gas_path_filter(
             gain errors, of which it cannot be told.
         inertia: relative standard deviation of the inertia, estimated from transients; None: known.
             Without measured power there is nothing to estimate it from.
+        consider_inertia: it is considered, not estimated.
         eta: relative standard deviation of the generators' efficiency, as the state ``gain_PW``: PW
             as measured is 1 + gain_PW times PW; None: the efficiency is known.
         consider_eta: the efficiency is considered, not estimated.
@@ -325,6 +331,9 @@ def gas_path_filter(
         governed: law of the fuel within a step; None: it is held from one reading to the next.
         power_jumps: the error of the shaft power may jump where a recording says so; ``eta`` must
             be estimated then.
+        loss: the shaft power may lack the loss of a short circuit: the state ``loss_PW``, W, whose
+            standard deviation at the start is 0, and which changes where a recording says so by
+            ``jump_loss``.
         free: parameters of the gas generator that are states, by name (``gas_generator.eta_c``,
             ``compressor_map.a_W``); their prior means are those of ``gg``, their standard
             deviations ``FREE_SIGMA`` of the magnitude.
@@ -345,10 +354,15 @@ def gas_path_filter(
     if power == "unknown":
         sigma["PW"] = PW_PRIOR[1]
         walks["PW"] = PW_WALK
+    if loss:
+        sigma["loss_PW"] = 0.0
+        walks["loss_PW"] = LOSS_WALK
     sigma |= {f"gain_{n}": math.hypot(sensors[n].unsure("gain"), model_error) for n in named}
     biased, consider = _offsets(sensors, named, (*sensors.outputs, *held))
     sigma |= {f"bias_{s.name}": s.bias for s in biased}
     walks |= {f"bias_{s.name}": s.drift for s in biased if s.drift}
+    if consider_inertia and inertia is not None and power == "measured":
+        consider += ("gain_J",)
     if inertia is not None and power == "measured":
         named = (*named, "J")
         sigma["gain_J"] = inertia
@@ -365,6 +379,7 @@ def gas_path_filter(
         walks=tuple((walks | dict(walk or {})).items()),
         governed=governed,
         power_jumps=power_jumps,
+        loss=loss,
         sensors=model_sensors(gg, sensors.only(sensors.outputs).sensors),
         free=tuple((free or {}).items()),
     )

@@ -88,6 +88,7 @@ _GAIN_DOCS = {
     "PW": "relative error of the shaft power that the generators' efficiency gives",
     "J": "relative error of the rotor's inertia",
 }
+_LOSS = "shaft power beyond the measured one, the loss of a short circuit that is not known"
 
 
 def model_sensors(gg: GasGenerator, sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
@@ -115,7 +116,11 @@ def _relative(name: str, doc: str, default: float | None = 0.0) -> Signal:
 
 
 def _states(
-    known: bool, gains: Sequence[str], biases: Sequence[str], sensors: Sequence[Sensor]
+    known: bool,
+    gains: Sequence[str],
+    biases: Sequence[str],
+    sensors: Sequence[Sensor],
+    loss: bool,
 ) -> Signals:
     power = () if known else (dataclasses.replace(U["PW"], default=None),)
     docs = {n: _GAIN_DOCS.get(n, f"relative gain error of the sensor of {n}") for n in gains}
@@ -126,10 +131,11 @@ def _states(
         for n, s in ((n, signals[n]) for n in biases)
     ]
     lags = [dataclasses.replace(s.signal, default=None) for s in sensors if s.tau]
-    return Signals([*X, *THETA, *power, *errors, *lags])
+    losses = [Signal("loss_PW", "W", _LOSS, default=0.0, nominal=1e4)] if loss else []
+    return Signals([*X, *THETA, *power, *errors, *lags, *losses])
 
 
-def _inputs(known: bool, power_jumps: bool) -> tuple[Signals, Signals]:
+def _inputs(known: bool, power_jumps: bool, loss: bool) -> tuple[Signals, Signals]:
     """Inputs and noises."""
     measured = ("Wf", "PW") if known else ("Wf",)
     spread = [
@@ -148,15 +154,26 @@ def _inputs(known: bool, power_jumps: bool) -> tuple[Signals, Signals]:
     if power_jumps:
         given += [_relative("jump_PW", "the same of gain_PW")]
         W += [Signal("w_gain_PW", "1", "sudden change of gain_PW over jump_PW")]
+    if loss:
+        text = "standard deviation of a sudden change of loss_PW in this step"
+        given += [Signal("jump_loss", "W", text, default=0.0, nominal=1e4)]
+        W += [Signal("w_loss_PW", "1", "sudden change of loss_PW over jump_loss")]
     W += [Signal(f"w_{n}", "1", f"sudden change of {n} over jump") for n in HEALTH]
     return Signals(given), Signals(W)
 
 
 def _check_gains(
-    power: str, gains: Sequence[str], consider: Sequence[str], power_jumps: bool, names: set[str]
+    power: str,
+    gains: Sequence[str],
+    consider: Sequence[str],
+    power_jumps: bool,
+    loss: bool,
+    names: set[str],
 ) -> None:
     if power not in POWER:
         raise ParameterError(f"power {power!r} {nearest(power, POWER)}")
+    if loss and power != "measured":
+        raise ParameterError("loss: the shaft power must be measured")
     if power_jumps and ("PW" not in gains or "gain_PW" in consider):
         raise ParameterError("power_jumps: gain_PW must be among the estimated states")
     measured = (*GAINED, *sorted(names - {*OUTPUTS, *GAINED}))
@@ -185,6 +202,7 @@ def gas_path_model(
     walks: tuple[tuple[str, float], ...] = (),
     governed: Governor | None = None,
     power_jumps: bool = False,
+    loss: bool = False,
     sensors: tuple[Sensor, ...] | None = None,
     free: tuple[tuple[str, Unknown], ...] = (),
 ) -> FilterModel:
@@ -205,6 +223,8 @@ def gas_path_model(
         governed: law that the fuel follows within a step (limits left out); None: it is held.
         power_jumps: add the input ``jump_PW``: standard deviation of a sudden change of
             ``gain_PW``.
+        loss: whether the shaft power may lack the loss of a short circuit, as the state ``loss_PW``
+            with the input ``jump_loss``.
         sensors: of the outputs, as :func:`model_sensors` gives them; those of the table by default.
         free: pairs of a parameter's name, as ``"gas_generator.eta_c"``, and how it is estimated:
             states behind all others.
@@ -216,10 +236,11 @@ def gas_path_model(
     """
     if sensors is None:
         sensors = model_sensors(gg, GAS_PATH.only(OUTPUTS).sensors)
-    _check_gains(power, gains, consider, power_jumps, {s.name for s in sensors})
+    _check_gains(power, gains, consider, power_jumps, loss, {s.name for s in sensors})
     engines = gg.by_parameters if free else gg.family
     how: dict[str, Any] = {"power": power, "gains": gains, "consider": consider, "walks": walks}
     how |= {"biases": biases, "governed": governed, "power_jumps": power_jumps, "sensors": sensors}
+    how["loss"] = loss
     made = _family(engines, **how).member(gg.held)
     return augment(made, dict(free)) if free else made
 
@@ -235,14 +256,13 @@ def _family(
     walks: tuple[tuple[str, float], ...],
     governed: Governor | None,
     power_jumps: bool,
+    loss: bool,
     sensors: tuple[Sensor, ...],
 ) -> FilterModel:
     """The model of all engines of a structure, with their numbers as known parameters."""
     known, numbers = power == "measured", Signals(engines.theta[len(THETA) :])
-    states, (inputs_of, noises) = (
-        _states(known, gains, biases, sensors),
-        _inputs(known, power_jumps),
-    )
+    states = _states(known, gains, biases, sensors, loss)
+    inputs_of, noises = _inputs(known, power_jumps, loss)
     signals = states, inputs_of, numbers, noises, Signals([s.signal for s in sensors])
     x, u, p, w = (ca.MX.sym(n, len(s)) for n, s in zip("xupw", signals, strict=False))
     dt = ca.MX.sym("dt")
@@ -278,6 +298,9 @@ def _family(
     if power_jumps:
         at["gain_PW"] += given["jump_PW"] * noise["w_gain_PW"]
     inputs["PW"] = true("PW") if known else at["PW"]
+    if loss:
+        at["loss_PW"] += given["jump_loss"] * noise["w_loss_PW"]
+        inputs["PW"] += at["loss_PW"]
     k1, _, check, _ = engine(N, inputs)
     k1 = k1 / (1 + at.get("gain_J", 0.0))
     if governed is not None:

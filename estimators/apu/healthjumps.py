@@ -21,7 +21,9 @@ from estimators.filters.filtering import FilterResult, StepMaker
 from estimators.information.consistency import exceeded
 from estimators.models.recording import Recording
 
-__all__ = ["JumpTest", "Tracked", "track_jumps", "whitened"]
+__all__ = ["JumpTest", "Tracked", "spliced", "track_jumps", "whitened"]
+
+SAME_JUMP = 25  # samples between onsets of one jump, as two courses of the power show it
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,21 @@ def track_jumps(
         result = _spliced(result, filt.run(data, prior=prior, step=step, backend=backend), k)
         start = k + test.hold
     return Tracked(result, tuple(alarms), tuple(onsets), data, prior)
+
+
+def spliced(before: Tracked, after: Tracked, k: int) -> Tracked:
+    """Take ``before`` up to sample k, ``after`` from there on: what is known anew at k.
+
+    Alarms that were raised before k stay; of ``after`` count those of jumps that no alarm has
+    reported, at k at the earliest.
+    """
+    result = _spliced(before.result, after.result, k)
+    pairs = [(a, o) for a, o in zip(before.alarms, before.onsets, strict=True) if a < k]
+    for a, o in zip(after.alarms, after.onsets, strict=True):
+        if a >= k or not any(abs(o - old) <= SAME_JUMP for _, old in pairs):
+            pairs.append((max(a, k), o))
+    alarms, onsets = (tuple(p[i] for p in pairs) for i in (0, 1))
+    return dataclasses.replace(after, result=result, alarms=alarms, onsets=onsets)
 
 
 def _spliced(before: FilterResult, after: FilterResult, k: int) -> FilterResult:

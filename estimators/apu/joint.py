@@ -32,29 +32,33 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import GENERATOR, dataset
+from apu_casadi.core.results import GENERATOR, dataset, generators_of, of_generator
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
-from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
+from estimators.apu.electrical.electricalside import (
+    GAIN_SHARE,
+    ElectricalSide,
+    View,
+    electrical_side,
+    loosened,
+)
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
-from estimators.apu.electrical.tracking import track, window_power
-from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.apu.gaspath import (
     GasPathFilter,
     gas_path_filter,
-    jumps_at,
     samples,
     true_readings,
     window_means,
 )
 from estimators.apu.gaspathmodel import DT
-from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
+from estimators.apu.healthjumps import JumpTest, Tracked, spliced, track_jumps
 from estimators.apu.priorfile import Prior
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
+from estimators.apu.unknowns import Knowledge, of_parameter, usual
 from estimators.filters.ekf import ekf_step
-from estimators.filters.filtering import FilterResult, StepMaker, run
+from estimators.filters.filtering import StepMaker
 from estimators.models.recording import Recording
 
 if TYPE_CHECKING:
@@ -62,8 +66,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ETA_SIGMA",
+    "GAIN_SHARE",
     "ElectricalSide",
     "JointCase",
+    "View",
     "beside_truth",
     "better_speed",
     "cross_talk",
@@ -72,17 +78,14 @@ __all__ = [
     "estimate_joint",
     "fused",
     "joint_case",
+    "loosened",
+    "machines_of",
     "speed_from_generators",
     "unit_of",
 ]
 
 ETA_SIGMA = 0.02  # relative; efficiency of the generators
-# gain errors of 0.5 % of three voltages and three currents in the power of three phases
-GAIN_SHARE = 0.005 * math.sqrt(2 / 3)
-# what gain errors of 0.5 % and an unbalanced load look like at most
-H_FLOOR = 3e-4
-# and as a rule; added to the standard deviation of h
-H_GAIN = 1e-4
+SETTLED = 5  # windows after which the electrical filters have settled
 TEST = JumpTest()
 
 
@@ -109,7 +112,7 @@ def electrical_samples(
         DataError: the run has no waveforms, or its generators differ.
     """
     if GENERATOR in ds.dims:
-        raise DataError("the joint filter takes generators that are alike; those of the run differ")
+        raise DataError("samples are those of one generator; those of the run differ: machines_of")
     if "time_w" not in ds:
         raise DataError("the run has no waveforms; simulate with waveform_dt=1e-4")
     t = np.asarray(ds["time_w"].values, float)
@@ -130,21 +133,6 @@ def unit_of(apu: Apu, number: int) -> Apu:
         return apu
     generator, coupling = apu.machines[number - 1]
     return dataclasses.replace(apu, generator=generator, coupling=coupling, others=None)
-
-
-def loosened(sensors: SensorSet) -> SensorSet:
-    """Return the sensors with their gain errors at rated load taken for noise.
-
-    A filter that estimates the gains from 10 kHz samples learns them within a second to better than
-    its model is; one that takes them for noise learns nothing false.
-    """
-    rated = {"v": 325.0, "i": 461.0, "V_fd": 40.0, "i_fd": 590.0}  # peak values, V and A
-    noise = {}
-    for s in sensors.sensors:
-        size = rated.get(s.name, rated.get(s.name[0])) if s.name != "w_r" else 0.0
-        gain = s.unsure("gain") * float(size or 0.0) / math.sqrt(2)
-        noise[s.name] = math.hypot(s.noise, gain, s.unsure("bias"))
-    return sensors.change(**noise)
 
 
 def speed_from_generators(
@@ -188,125 +176,40 @@ def better_speed(filt: GasPathFilter, data: Recording, N: np.ndarray, s: np.ndar
     return Recording(data.t, data.u, y, variance, data.p)
 
 
-@dataclass(frozen=True, eq=False)
-class ElectricalSide:
-    """What the electrical filters of one machine say at K instants, 20 ms apart.
+def machines_of(ds: xr.Dataset, apu: Apu) -> list[tuple[str, Apu, xr.Dataset]]:
+    """Return the run as each generator has it: ending of its names, unit with it in place of all.
 
-    Args:
-        t: the instants, s.
-        P, variance: mechanical power of both generators over the K - 1 windows, and its variance.
-        severities: h and its standard deviation by phase, (2, 3, K).
-        phase: found faulty, 0 for none, (K,).
-        found_at: windows from which on the power is that of a filter with a fault.
-        resets: instants, s, at which the machine changed.
-        result: of the filter with the three h, at every sample; without them, of the healthy
-            machine's.
-    """
-
-    t: np.ndarray
-    P: np.ndarray
-    variance: np.ndarray
-    severities: np.ndarray
-    phase: np.ndarray
-    found_at: tuple[int, ...]
-    resets: tuple[float, ...]
-    result: FilterResult
-
-
-def electrical_side(
-    apu: Apu,
-    sensors: SensorSet,
-    measured: Mapping[str, np.ndarray],
-    t: np.ndarray,
-    *,
-    ttsc: bool = True,
-    gain_errors: bool = True,
-    step: StepMaker = ekf_step,
-    backend: str | None = None,
-) -> ElectricalSide:
-    """Run the electrical filters and put together what is known causally.
-
-    Args:
-        apu: the unit as the filters know it.
-        sensors: 1-sigma table.
-        measured: samples as :meth:`ElectricalFilter.recording` takes them.
-        t: ends of the windows of the mean power, among the instants of the samples.
-        ttsc, gain_errors, step, backend: as for :func:`estimate_joint`.
+    One without an ending where all are alike: it stands for all of them.
 
     Raises:
-        DataError, EstimationError: as the filter; windows that the waveforms do not cover.
+        DataError: the run and the unit have different numbers of generators.
     """
-    known = loosened(sensors) if gain_errors else sensors
-
-    def filt(phases: tuple[str, ...]) -> ElectricalFilter:
-        return electrical_filter(apu.generator.machine, sensors=known, power=True, phases=phases)
-
-    def windows(
-        phases: tuple[str, ...], begin: float
-    ) -> tuple[FilterResult, np.ndarray, np.ndarray, list[float]]:
-        of = filt(phases)
-        own = {n: v[measured["t"] >= begin - 1e-9] for n, v in measured.items()}
-        part = base.part(int(np.searchsorted(base.t, begin - 1e-9)), base.size)
-        u = part.u.copy()
-        u[of.model.u.index("dt_last"), 0] = 0.0
-        data = dataclasses.replace(part, u=u, p=of.model.p.pack({}))
-        prior = of.prior(own)
-        resets: list[float] = []
-        if phases:
-            level = gain_errors or None
-            r, resets = track(of, prior, data, step=step, backend=backend, own_level=level)
-        else:  # a healthy machine's filter has no step to look for
-            r = run(step(of.model), prior, data, backend=backend)
-        ends, P, var = window_power(of, r, data)
-        if not np.allclose(ends, t[t > begin + 1e-9][: ends.size]) or ends[-1] < t[-1] - 1e-6:
-            raise DataError(
-                f"{t.size - 1} windows of shaft power expected, the waveforms give {ends.size}"
-            )
-        return r, P, var, resets
-
-    K = t.size
-    # the inputs are the same for all: made once
-    base = filt(()).recording(measured, window=DT, start=float(t[0]))
-    healthy, P, var, _ = windows((), float(t[0]))
-    severities, phase = np.zeros((2, 3, K)), np.zeros(K, dtype=int)
-    if not ttsc:
-        return ElectricalSide(t, P, var, severities, phase, (), (), healthy)
-    r, _, _, resets = windows(PHASES, float(t[0]))
-    at = np.minimum(np.searchsorted(r.t, t - 1e-9), r.t.size - 1)
-    for i, n in enumerate(PHASES):
-        mean, sigma = r[f"h_{n}"]
-        severities[:, i] = mean[at], np.hypot(sigma[at], H_GAIN if gain_errors else 0.0)
-    phase = _found(severities, H_FLOOR if gain_errors else 0.0)
-    # the window in which a fault is found is the first with the power of a faulty machine
-    changes = [k for k in range(1, K) if phase[k] and phase[k] != phase[k - 1]]
-    for k in changes:
-        begin = max([v for v in resets if v <= t[k] + 1e-9] + [float(t[0])])
-        # whole windows: from the beginning of the one in which the machine changed
-        first = min(int(np.floor((begin - t[0]) / DT + 1e-6)), k - 1)
-        _, P_k, var_k, _ = windows((PHASES[phase[k] - 1],), float(t[first]))
-        last = k
-        while last + 1 < K and phase[last + 1] == phase[k]:
-            last += 1
-        P[k - 1 : last], var[k - 1 : last] = (v[k - 1 - first : last - first] for v in (P_k, var_k))
-    found_at = tuple(k - 1 for k in changes)
-    return ElectricalSide(t, P, var, severities, phase, found_at, tuple(resets), r)
+    numbers = generators_of(ds)
+    if GENERATOR not in ds.dims:
+        return [("", apu, ds)]
+    if len(numbers) != len(apu.machines):
+        raise DataError(f"the run has {len(numbers)} generators, the unit {len(apu.machines)}")
+    return [(f"_{k}", unit_of(apu, k), of_generator(ds, k)) for k in numbers]
 
 
-def _found(severities: np.ndarray, floor: float) -> np.ndarray:
-    """The phase found faulty at each instant, 1 to 3; 0 for none."""
-    h, s = severities
-    sure = (h - floor > 0) & (((h - floor) / s) ** 2 > FAULT_LEVEL)
-    sure[:, 0] = False  # nothing is known yet
-    return np.where(sure.any(0), 1 + np.where(sure, h, 0).argmax(0), 0)
+def own_gains(gains: Mapping[str, float] | None, ending: str) -> dict[str, float]:
+    """Return the gain errors of one machine, ``v_a_2`` for the ending ``_2``, or ``v_a`` of all."""
+    given = gains or {}
+    own = {n: given.get(n + ending, given.get(n)) for n in GAIN_SENSORS}
+    return {n: v for n, v in own.items() if v is not None}
 
 
-def _phase_of(ds: xr.Dataset) -> str:
-    """Faulty phase of the run's scenario; "a" where it does not say."""
-    if "scenario" in ds.attrs:
-        for p in json.loads(ds.attrs["scenario"]).get("phase", []):
-            if isinstance(p.get("fault"), dict):
-                return str(p["fault"].get("phase", "a"))
-    return "a"
+def _true_phases(ds: xr.Dataset, ending: str, t: np.ndarray) -> np.ndarray:
+    """Number of the phase that has a fault in the run, 1 to 3, at each instant; 0 for none."""
+    out = np.zeros(t.size, dtype=int)
+    for fault in json.loads(ds.attrs.get("faults", "[]")):
+        if ending and str(fault.get("generator", ending[1:])) != ending[1:]:
+            continue
+        phase = fault.get("phase")
+        number = 1 + PHASES.index(phase) if phase in PHASES else 0
+        # a change at an instant shows in the sample after it
+        out[t > fault["t"] + (1e-9 if fault["t"] > t[0] else -1e-9)] = number
+    return out
 
 
 def estimate_joint(
@@ -323,6 +226,7 @@ def estimate_joint(
     electrical_gains: Mapping[str, float] | None = None,
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
+    unknowns: Mapping[str, Knowledge] | None = None,
     step: StepMaker | None = None,
     electrical_step: StepMaker = ekf_step,
     backend: str | None = None,
@@ -340,11 +244,13 @@ def estimate_joint(
         speed: whether it gets the generators' speed.
         gas_sensors, electrical_sensors: 1-sigma tables.
         gas_gains, electrical_gains: actual relative gain errors by sensor; ``PW`` of the former is
-            the relative error of efficiency.
+            the relative error of efficiency.  Of generators that differ, ``v_a_2``.
         eta: relative standard deviation of the efficiency; gain errors of the electrical sensors
             are added to it.
         gain_errors: whether the filters take gain errors into account; False only where there are
             none.
+        unknowns: parameters of the unit that are estimated or considered, by name, see
+            :mod:`estimators.apu.unknowns`.
         step: makes the step of the gas-path filter for its model; its own by default.
         electrical_step: the same of the electrical filters.
         backend: see :func:`apu_casadi.core.backend.compiled`.
@@ -353,8 +259,9 @@ def estimate_joint(
         xarray.Dataset on ``time`` (20 ms): for N, the four factors, h_a, h_b, h_c and P_total the
         estimate under its name, ``<name>_sigma`` and ``<name>_true``; ``faulty_phase`` (0: none, 1
         to 3: a to c), ``nis`` of the gas-path filter.  P_total is the mean of the window that ends
-        at the instant.  Attributes: ``resets`` of the electrical filter, ``alarms`` and ``onsets``
-        of health jumps, s, as JSON.
+        at the instant.  ``ttsc_probability`` is that of a short circuit, found or not.  Of
+        generators that differ, names have endings, ``h_a_2``.  Attributes: ``resets`` of the
+        electrical filters, ``alarms`` and ``onsets`` of health jumps, s, as JSON.
 
     Raises:
         DataError, EstimationError: as the two filters.
@@ -362,10 +269,14 @@ def estimate_joint(
     apu = Apu() if apu is None else apu
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
     t, _ = samples(ds)
-    measured = electrical_samples(ds, apu, rng, sensors=electrical_sensors, gains=electrical_gains)
-    how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend}
+    how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend, "unknowns": unknowns}
     also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
-    side = electrical_side(apu, electrical_sensors, measured, t, **also, **how)
+    sides, pickups = {}, []
+    for number, (ending, one, view) in enumerate(machines_of(ds, apu), 1):
+        own = own_gains(electrical_gains, ending)
+        measured = electrical_samples(view, one, rng, sensors=electrical_sensors, gains=own)
+        sides[number] = electrical_side(one, electrical_sensors, measured, t, **also, **how)
+        pickups.append((measured["t"], measured["w_r"]))
     for n in gas_gains or {}:
         gas_sensors[n]
     truth = true_readings(gas_sensors, ds)[1]
@@ -373,15 +284,15 @@ def estimate_joint(
     how |= {"power": power, "eta": eta, "step": step}
     gas, tracked = fused(
         apu,
-        [side],
+        [*sides.values()],
         {n: (t, v) for n, v in read.items()},
         gas_sensors,
-        speed=(measured["t"], measured["w_r"]) if speed else None,
-        speed_sigma=electrical_sensors.sigma("w_r", float(np.median(measured["w_r"]))),
+        speed=pickups[0] if speed else None,
+        speed_sigma=electrical_sensors.sigma("w_r", float(np.median(pickups[0][1]))),
         efficiency_error=(gas_gains or {}).get("PW", 0.0),
         **how,
     )
-    return beside_truth(ds, side, gas, tracked)
+    return beside_truth(ds, sides, gas, tracked)
 
 
 def fused(
@@ -399,6 +310,7 @@ def fused(
     inputs: Mapping[str, Any] | None = None,
     eta: float = ETA_SIGMA,
     gain_errors: bool = True,
+    unknowns: Mapping[str, Knowledge] | None = None,
     step: StepMaker | None = None,
     test: JumpTest = TEST,
     backend: str | None = None,
@@ -419,36 +331,79 @@ def fused(
         spread: of which the standard deviations are taken.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
         test: of jumps of the health.
-        eta, gain_errors, step, backend: as for :func:`estimate_joint`.
+        eta, gain_errors, unknowns, step, backend: as for :func:`estimate_joint`.
     """
-    gas = _gas_filter(apu, sensors, power, gain_errors, eta)
-    t, n = sides[0].t, len(sides)
-    # one measurement of shaft power for each window, eq. (1)
-    mean = apu.PW(sum(s.P for s in sides) / n) * (1 + efficiency_error)
-    sigma = np.sqrt(sum(s.variance for s in sides)) / n / apu.coupling.eta_gtSg
-    # the loss that belongs to the error of h, of both machines; the fault is a shunt r_s/h
-    machine = apu.generator.machine
-    ghost = 2 * machine.V_rated_rms**2 / machine.r_s / machine.eta_sg * H_GAIN
-    found_at = {k for s in sides for k in s.found_at}
-    new = {float(t[k]): float(np.hypot(sigma[k], ghost) / mean[k]) for k in found_at}
-    inputs = dict(inputs or {})
-    if "jump_PW" in gas.model.u.names and new:
-        inputs["jump_PW"] = (t, jumps_at(t, new))
-    mean, sigma = (np.append(v, v[-1]) for v in (mean, sigma))
-    data = gas.of_readings(readings, power=(t, mean, sigma), inputs=inputs, max_dt=max_dt)
-    if speed is not None:
-        rows = np.isfinite(data.y).any(axis=0)
-        N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
-        N[rows], N_sigma[rows] = speed_from_generators(*speed, speed_sigma, data.t[rows], apu)
-        data = better_speed(gas, data, N, N_sigma)
+    J = of_parameter(usual(unknowns, gain_errors), "J")
+    gas = _gas_filter(apu, sensors, power, gain_errors, eta, J)
+    t = sides[0].t
+    courses = _courses(apu, sides)
+    streams: dict[str, Any] = {"readings": readings, "max_dt": max_dt}
+    tracked: Tracked | None = None
     if spread is not None:
         spread.check(gas.model.x)
     start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
-    return gas, track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
+    for first, mean, white, loss in courses:
+        given = dict(inputs or {})
+        if "jump_loss" in gas.model.u.names:
+            given["jump_loss"] = (t, _opening(loss))
+        else:
+            white = np.hypot(white, loss)
+        told = mean * (1 + efficiency_error)
+        known = t, np.append(told, told[-1]), np.append(white, white[-1])
+        data = gas.of_readings(**streams, power=known, inputs=given)
+        if speed is not None:
+            data = _with_speed(gas, data, speed, speed_sigma, apu)
+        # from the window on in which more is known
+        k = int(np.searchsorted(data.t, t[first] - 1e-9)) + 1 if first else 0
+        now = track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
+        tracked = now if tracked is None else spliced(tracked, now, k)
+    assert tracked is not None
+    return gas, tracked
+
+
+def _courses(
+    apu: Apu, sides: Sequence[ElectricalSide]
+) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
+    """Shaft power as the gas path is told: from which window on, mean, noise, coherent error, W."""
+    n, eta = len(sides), apu.coupling.eta_gtSg
+    out = []
+    for first in sorted({v.start for s in sides for v in s.views}):
+        views = [[v for v in s.views if v.start <= first][-1] for s in sides]
+        common = [_common(v.loss) for v in views]
+        pairs = zip(views, common, strict=True)
+        noise = sum(v.noise + np.maximum(v.loss - c, 0.0) for v, c in pairs)
+        mean = apu.PW(sum(v.P for v in views) / n)
+        out.append((first, mean, np.sqrt(noise) / n / eta, np.sqrt(sum(common)) / n / eta))
+    return out
+
+
+def _common(loss: np.ndarray) -> np.ndarray:
+    """What of the variance is the same error in all windows: what it is once it has settled."""
+    k = min(SETTLED, loss.size - 1)
+    later: np.ndarray = np.maximum.accumulate(loss[k:])
+    return np.append(np.full(k, later[0]), later)
+
+
+def _opening(loss: np.ndarray) -> np.ndarray:
+    """Standard deviations of changes that make a state of variance loss^2, which never falls."""
+    return np.append(np.sqrt(np.diff(loss**2, prepend=0.0).clip(0.0)), 0.0)
+
+
+def _with_speed(
+    gas: GasPathFilter,
+    data: Recording,
+    speed: tuple[np.ndarray, np.ndarray],
+    sigma: float,
+    apu: Apu,
+) -> Recording:
+    rows = np.isfinite(data.y).any(axis=0)
+    N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
+    N[rows], N_sigma[rows] = speed_from_generators(*speed, sigma, data.t[rows], apu)
+    return better_speed(gas, data, N, N_sigma)
 
 
 def _gas_filter(
-    apu: Apu, sensors: SensorSet, power: bool, gain_errors: bool, eta: float
+    apu: Apu, sensors: SensorSet, power: bool, gain_errors: bool, eta: float, J: Knowledge
 ) -> GasPathFilter:
     common = math.hypot(eta, GAIN_SHARE if gain_errors else 0.0)
     return gas_path_filter(
@@ -456,26 +411,30 @@ def _gas_filter(
         sensors,
         power="measured" if power else "unknown",
         gains=gain_errors,
+        inertia=J.sigma or None,
+        consider_inertia=J.how == "considered",
         eta=common if power and common else None,
         consider_eta=False,
-        power_jumps=bool(power and common),
+        loss=bool(power and common),
     )
 
 
 def beside_truth(
-    ds: xr.Dataset, side: ElectricalSide, gas: GasPathFilter, tracked: Tracked
+    ds: xr.Dataset, sides: Mapping[int, ElectricalSide], gas: GasPathFilter, tracked: Tracked
 ) -> xr.Dataset:
     """Put estimates beside the truth of a run, as :func:`estimate_joint` returns them.
 
     Args:
         ds: the run.
-        side: of one machine; its instants are those of the result.
+        sides: of its machines by number; where the run has one for all, the first stands for them.
         gas, tracked: filter and result of the gas path.
     """
-    r, t = tracked.result, side.t
-    rows, k = (np.searchsorted(v, t + 1e-7) - 1 for v in (ds["time"].values, r.t))
-    values: dict[str, Any] = {}
-    signals: list[Signal] = []
+    differ = GENERATOR in ds.dims
+    known = sides if differ else {1: sides[min(sides)]}
+    r, t = tracked.result, known[min(known)].t
+    rows, at = (np.searchsorted(v, t + 1e-7) - 1 for v in (ds["time"].values, r.t))
+    values: dict[str, Any] = {"nis": r.nis[at]}
+    signals = [Signal("nis", "1", "normalised innovation squared of the gas-path filter")]
 
     def put(n: str, unit: str, doc: str, estimate: Any, s: Any, true: Any) -> None:
         of = {n: doc, f"{n}_sigma": f"standard deviation of {n}", f"{n}_true": f"true: {doc}"}
@@ -485,28 +444,36 @@ def beside_truth(
     for name in ("N", *HEALTH):
         x = gas.model.x[name]
         mean, sigma = r[name]
-        put(name, x.unit, x.doc, mean[k], sigma[k], ds[name].values[rows])
-    true_phase = _phase_of(ds)
-    h, h_sigma = side.severities
-    for i, phase in enumerate(PHASES):
-        m, k_rf = ds["mu"].values[rows], ds["k_rf"].values[rows]
-        true = np.where(m > 0, m / (np.nan_to_num(k_rf) + 1 - m), 0.0) * (phase == true_phase)
-        doc = f"severity mu/(k_rf + 1 - mu) of a short circuit in phase {phase}"
-        put(f"h_{phase}", "1", doc, h[i], h_sigma[i], true)
+        put(name, x.unit, x.doc, mean[at], sigma[at], ds[name].values[rows])
+    for number, side in known.items():
+        end, view = (f"_{number}" if differ else ""), of_generator(ds, number)
+        m, k_rf = view["mu"].values[rows], view["k_rf"].values[rows]
+        h_true = np.where(m > 0, m / (np.nan_to_num(k_rf) + 1 - m), 0.0)
+        true_phase, of = _true_phases(ds, end, t), f" of generator {number}" if differ else ""
+        for i, phase in enumerate(PHASES):
+            doc = f"severity mu/(k_rf + 1 - mu) of a short circuit in phase {phase}{of}"
+            true = h_true * (true_phase == i + 1)
+            h, h_sigma = side.severities[:, i]
+            put(f"h_{phase}{end}", "1", doc, h, h_sigma, true)
+        text = f"phase found faulty{of}: 0 none, 1 to 3: a to c"
+        signals += [
+            Signal(f"faulty_phase{end}", "1", text),
+            Signal(f"ttsc_probability{end}", "1", f"probability of a short circuit{of}"),
+        ]
+        values |= {f"faulty_phase{end}": side.phase, f"ttsc_probability{end}": side.probability}
     P_true = window_means(ds["time"].values, ds["P_total"].values, t)[:-1]
-    P = (np.append(np.nan, v) for v in (side.P, np.sqrt(side.variance), P_true))
-    put("P_total", "W", "mean mechanical power of both generators over the window before", *P)
-    signals += [
-        Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c"),
-        Signal("nis", "1", "normalised innovation squared of the gas-path filter"),
-    ]
-    values |= {"faulty_phase": side.phase, "nis": r.nis[k]}
-    at = {
-        "resets": side.resets,
+    share = int(ds.attrs.get("generators", 2)) / 2 / len(known)
+    P = share * np.sum([s.P for s in known.values()], axis=0)
+    sigma = share * np.sqrt(np.sum([s.variance for s in known.values()], axis=0))
+    doc = "mean mechanical power of both generators over the window before"
+    P, sigma, P_true = (np.append(np.nan, v) for v in (P, sigma, P_true))
+    put("P_total", "W", doc, P, sigma, P_true)
+    found = {
+        "resets": sorted({v for s in known.values() for v in s.resets}),
         "alarms": [float(r.t[i]) for i in tracked.alarms],
         "onsets": [float(r.t[i]) for i in tracked.onsets],
     }
-    attrs = {n: json.dumps(v) for n, v in at.items()}
+    attrs = {n: json.dumps(v) for n, v in found.items()}
     return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)
 
 
@@ -521,12 +488,18 @@ class JointCase:
     electrical_gains: dict[str, float]
 
 
-def joint_case(seed: int, *, electrical: bool = True) -> JointCase:
-    """Draw the gain errors of a seed from the sensor sets, and the error of efficiency."""
+def joint_case(seed: int, *, electrical: bool = True, machines: int = 1) -> JointCase:
+    """Draw the gain errors of a seed from the sensor sets, and the error of efficiency.
+
+    With more than one of ``machines`` that differ, their names have endings, ``v_a_2``.
+    """
     rng = np.random.default_rng([seed, 0])
     gas = GAS_PATH.draw_gains(rng, GAS_PATH.uncertain)
     gas["PW"] = ETA_SIGMA * float(rng.standard_normal())
     gains = ELECTRICAL.draw_gains(rng, GAIN_SENSORS)
+    if machines > 1:
+        more = [gains, *(ELECTRICAL.draw_gains(rng, GAIN_SENSORS) for _ in range(1, machines))]
+        gains = {f"{n}_{k}": v for k, own in enumerate(more, 1) for n, v in own.items()}
     return JointCase(gas, gains if electrical else {})
 
 

@@ -15,7 +15,7 @@ from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
-from estimators.apu.joint import GAIN_SHARE, ElectricalSide
+from estimators.apu.joint import ElectricalSide
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -57,12 +57,14 @@ def gas_dataset(filt: GasPathFilter, tracked: Tracked) -> xr.Dataset:
 
 def side_dataset(side: ElectricalSide) -> xr.Dataset:
     """Return severities and power of a machine over time; resets as an attribute."""
-    values: dict[str, Any] = {"faulty_phase": side.phase}
-    signals = [Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c")]
+    values: dict[str, Any] = {"faulty_phase": side.phase, "ttsc_probability": side.probability}
+    signals = [
+        Signal("faulty_phase", "1", "phase found faulty: 0 none, 1 to 3: a to c"),
+        Signal("ttsc_probability", "1", "probability that the machine has a short circuit"),
+    ]
     rows = {f"h_{p}": side.severities[:, i] for i, p in enumerate(PHASES)}
-    # the gain errors of the sensors are common to all windows
-    sigma = np.hypot(np.sqrt(side.variance), GAIN_SHARE * side.P)
-    rows["P_total"] = np.array([np.append(np.nan, v) for v in (side.P, sigma)])
+    power = side.P, np.sqrt(side.variance)
+    rows["P_total"] = np.array([np.append(np.nan, v) for v in power])
     for n, pair in rows.items():
         unit = "W" if n == "P_total" else "1"
         doc = f"severity of a short circuit in phase {n[2:]}"

@@ -25,7 +25,7 @@ from apu_casadi.machine.machinedata import require_linear
 from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.faults import ridge
 from estimators.apu.gaspathmodel import DT
-from estimators.apu.joint import GAIN_SHARE, beside_truth
+from estimators.apu.joint import beside_truth
 from estimators.apu.measuring import drawn_gains, measure_run, write_recording
 from estimators.apu.recorded_estimate import estimate as recorded_estimate
 from estimators.apu.recordings.measured import read_recording
@@ -204,7 +204,7 @@ def estimate(
     e = recorded_estimate(read_recording(*recorded), unit, sensors=of, efficiency_error=error)
     if e.path is None or not e.sides:
         raise EstimationError("; ".join(f"{n}: {why}" for n, why in e.lacking.items()))
-    found = beside_truth(ds, e.sides[min(e.sides)], *e.path)
+    found = beside_truth(ds, e.sides, *e.path)
     told = {"doubts": list(e.doubts), "lacking": dict(e.lacking), "notes": list(e.notes)}
     found.attrs |= {n: json.dumps(v) for n, v in told.items()} | {"seed": seed}
     found.attrs |= {n: ds.attrs[n] for n in ("scenario", "phases")}
@@ -233,16 +233,6 @@ def joint_seconds(scenario: str = "joint", repeat: int = 3, seed: int = 1) -> di
 # ------------------------------------------------------------------------------ what it says
 
 
-def _sigma(e: xr.Dataset, name: str) -> np.ndarray:
-    """Standard deviation of all that may be wrong.
-
-    The electrical filter's power comes with the variance of its windows; the gain errors of its
-    sensors, common to all windows, are added here.
-    """
-    s = np.asarray(e[f"{name}_sigma"].values, float)
-    return np.hypot(s, GAIN_SHARE * e[name].values) if name == "P_total" else s
-
-
 def _at(t: np.ndarray, when: float) -> int:
     """Last sample at or before an instant."""
     return int(np.searchsorted(t, when + 1e-9)) - 1
@@ -266,7 +256,7 @@ def report(e: xr.Dataset) -> dict[str, Any]:
         values = {}
         for n in SHOWN:
             x, true = (float(e[f"{n}{end}"].values[k]) for end in ("", "_true"))
-            s = float(_sigma(e, n)[k])
+            s = float(e[f"{n}_sigma"].values[k])
             inside = bool(abs(x - true) <= Z95 * s)
             values[n] = {"true": true, "estimate": x, "half_width": Z95 * s, "inside": inside}
         found = int(e["faulty_phase"].values[k])
@@ -450,7 +440,7 @@ def saved(e: xr.Dataset, every: int = 2) -> dict[str, Any]:
     """Return an estimate for JSON: the report, and every second sample for the figure."""
     keep, curves = slice(None, None, every), {}
     for n in SHOWN:
-        curves[n], curves[f"{n}_sigma"] = e[n].values[keep], _sigma(e, n)[keep]
+        curves[n], curves[f"{n}_sigma"] = e[n].values[keep], e[f"{n}_sigma"].values[keep]
         curves[f"{n}_true"] = e[f"{n}_true"].values[keep]
     t, alarms = e["time"].values[keep], json.loads(e.attrs["alarms"])
     return {"report": report(e), "t": t, "curves": curves, "alarms": alarms}

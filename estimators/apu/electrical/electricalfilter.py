@@ -40,6 +40,7 @@ from estimators.apu.electrical.tuning import (
     ANGLE_WALK_CONSIDERED,
     FLUX_WALK,
     FREE_SIGMA,
+    H_BALANCED,
     H_SIGMA,
     H_WALK,
     H_WALK_GAINS,
@@ -225,6 +226,10 @@ class ElectricalFilter(Parametric):
             self.model.x.index(n)
             spread[n] = value
         prior = Belief.of(self.model.x, means, spread)
+        if set(SHUNTS.names) <= set(means) and not set(SHUNTS.names) & set(sigma or {}):
+            # that all three are faulty looks like another rotor angle
+            rows = np.ix_(*[self.model.x.indices(SHUNTS.names)] * 2)
+            prior.cov[rows] -= (H_SIGMA**2 - H_BALANCED**2) / 3
         e = 1e-6
         # of a parameter the same share of it
         size = dict.fromkeys(means, 1.0) | {n: abs(v) for n, v in own.items() if n in means}

@@ -14,10 +14,12 @@ from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import RESET_LEVEL, RESET_SIGMA, RESET_WINDOW
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
-from estimators.filters.filtering import FilterResult, StepMaker, run
+from estimators.filters.filtering import FilterResult, FilterStep, StepMaker, run
 from estimators.models.recording import Recording
 
 __all__ = ["track", "window_power"]
+
+CHUNK = 80 * RESET_WINDOW  # samples that are filtered before they are judged
 
 
 def track(
@@ -29,6 +31,7 @@ def track(
     backend: str | None = None,
     max_resets: int = 20,
     own_level: bool | None = None,
+    cov_at: np.ndarray | None = None,
 ) -> tuple[FilterResult, list[float]]:
     """Filter a recording in which faults come and go: h follows steps at once.
 
@@ -45,6 +48,7 @@ def track(
         own_level: whether a window is compared with those before it (the first four are not judged)
             instead of with what white innovations give: where gain errors are considered (the
             default there), or taken as noise, each unit has a level of its own.
+        cov_at: samples whose covariances are kept, see :func:`estimators.filters.filtering.run`.
 
     Returns:
         result: as from one filter. resets : instants, s.
@@ -53,55 +57,78 @@ def track(
         EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
     """
     own_level = filt.gains == "consider" if own_level is None else own_level
-    begin, made = 0, step(filt.model)
+    made, model = step(filt.model), filt.model
     pieces: list[FilterResult] = []
     resets: list[float] = []
-    rest = data
-    mean_of = np.ones(RESET_WINDOW) / RESET_WINDOW
-    while True:
-        r = run(made, prior, rest, backend=backend)
-        # judged window by window; the first two after a start are not
-        full = r.nis.size // RESET_WINDOW
-        share = r.nis[: full * RESET_WINDOW].reshape(full, RESET_WINDOW) @ mean_of
-        usual = _usual(share) if own_level else np.full(full, float(len(MEASURED)))
-        share[:2] = 0.0
-        bad = np.flatnonzero(share > usual + RESET_LEVEL - len(MEASURED))
+    share = np.zeros(0)  # mean NIS of the windows since the last reset
+    at = 0
+    while at < data.size:
+        stop = min(at + CHUNK, data.size)
+        r, ahead = _filtered(made, prior, data, at, stop, cov_at, backend)
+        judged, share = share.size, np.append(share, _window_means(r.nis))
+        white = np.full(share.size - judged, float(len(MEASURED)))
+        usual = _usual(share, judged) if own_level else white
+        over = share[judged:] > usual + RESET_LEVEL - len(MEASURED)
+        over[: max(2 - judged, 0)] = False  # a start needs them to settle
+        bad = judged + np.flatnonzero(over)
         if not bad.size:
-            pieces.append(_piece(r, r.nis.size))
-            return _joined(pieces), resets
+            pieces.append(r)
+            prior, at = ahead, stop
+            continue
         if len(resets) == max_resets:
             raise EstimationError(
-                f"{filt.model.name}: {max_resets} resets up to t = {resets[-1]:.6g} s and still "
+                f"{model.name}: {max_resets} resets up to t = {resets[-1]:.6g} s and still "
                 f"the innovations are {share[bad[0]]:.3g} times what they should be: the model "
                 "does not fit these data: a fault branch with leakage of its own, which "
                 "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults"
             )
-        cut = int(bad[0]) * RESET_WINDOW
-        # once more up to the cut, whose sample is left to the next piece: a belief of s(cut)
-        upto = rest.part(0, cut + 1)
-        y = upto.y.copy()
+        cut = at + (int(bad[0]) - judged) * RESET_WINDOW
+        if cut > at:
+            r, prior = _filtered(made, prior, data, at, cut, cov_at, backend)
+            pieces.append(r)
+        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in model.x.names]
+        prior = Belief(model.x, prior.mean, prior.cov + np.diag(wide))
+        resets.append(float(data.t[cut]))
+        share, at = np.zeros(0), cut
+    return _joined(pieces), resets
+
+
+def _filtered(
+    made: FilterStep,
+    prior: Belief,
+    data: Recording,
+    start: int,
+    stop: int,
+    cov_at: np.ndarray | None,
+    backend: str | None,
+) -> tuple[FilterResult, Belief]:
+    """Filter samples from start up to stop, and return the belief at stop before its sample."""
+    more = stop < data.size
+    part = data.part(start, stop + more)
+    y = part.y.copy()
+    if more:
         y[:, -1] = np.nan
-        r = run(made, prior, dataclasses.replace(upto, y=y), backend=backend)
-        pieces.append(_piece(r, cut))
-        wide = np.zeros(len(filt.model.x))
-        for name, s in RESET_SIGMA.items():
-            if name in filt.model.x.names:
-                wide[filt.model.x.index(name)] = s**2
-        prior = Belief(filt.model.x, r.final.mean, r.final.cov + np.diag(wide))
-        begin += cut
-        resets.append(float(data.t[begin]))
-        rest = data.part(begin, data.size)
+    here = None if cov_at is None else cov_at[(cov_at >= start) & (cov_at < stop)] - start
+    r = run(made, prior, dataclasses.replace(part, y=y), cov_at=here, backend=backend)
+    return _piece(r, stop - start), r.final
 
 
-def _usual(share: np.ndarray) -> np.ndarray:
-    """Return what each window's mean NIS is compared with where gains are considered.
+def _window_means(nis: np.ndarray) -> np.ndarray:
+    """Mean NIS of whole windows."""
+    full = nis.size // RESET_WINDOW
+    of_windows: np.ndarray = nis[: full * RESET_WINDOW].reshape(full, RESET_WINDOW).mean(1)
+    return of_windows
+
+
+def _usual(share: np.ndarray, first: int) -> np.ndarray:
+    """Return what the NIS of windows from ``first`` on is compared with where gains are considered.
 
     Their offsets stay in the innovations, so a unit has its own level: the median of up to 20
     windows before, four at least.
     """
-    out = np.full(share.size, math.inf)
-    for k in range(4, share.size):
-        out[k] = max(float(len(MEASURED)), float(np.median(share[max(k - 20, 1) : k])))
+    out = np.full(share.size - first, math.inf)
+    for k in range(max(first, 4), share.size):
+        out[k - first] = max(float(len(MEASURED)), float(np.median(share[max(k - 20, 1) : k])))
     return out
 
 
@@ -118,6 +145,8 @@ def _joined(pieces: list[FilterResult]) -> FilterResult:
         n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES
     }
     joined["loglik"] = sum(p.loglik for p in pieces)
+    if pieces[-1].some_cov is not None:
+        joined["some_cov"] = np.concatenate([p.some_cov for p in pieces])
     return dataclasses.replace(pieces[-1], **joined)
 
 

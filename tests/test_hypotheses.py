@@ -1,0 +1,95 @@
+"""A short circuit that may be there: odds, severity and power, against quadrature."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal
+
+from apu_casadi.core.errors import ParameterError
+from estimators.apu.electrical.hypotheses import FAULTY, H_SCALE, Hypotheses
+from estimators.apu.unknowns import COPPER, Knowledge, filter_unknowns
+
+TRUE_P, SLOPE = 200e3, 2e7
+
+
+def belief(h, seed=0):
+    """A filter's means and covariance of three severities and power, errors drawn."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((4, 4)) + 2 * np.eye(4)
+    A[:3] *= 2e-5
+    A[3] = 300 * A[3] + SLOPE * A[:3].sum(0)
+    C = A @ A.T
+    return np.array([*h, TRUE_P]) + A @ rng.standard_normal(4), C
+
+
+@pytest.mark.parametrize("h", [(0, 0, 0), (8e-5, 0, 0), (0, 0, 5e-4)])
+def test_odds_severity_and_power_are_those_of_quadrature(h):
+    mean, C = belief(h)
+    found = Hypotheses.of(mean[None], C[None])
+    none = multivariate_normal.pdf(mean[:3], np.zeros(3), C[:3, :3])
+    for k in range(3):
+
+        def weight(x, k=k):
+            at = np.zeros(3)
+            at[k] = x
+            prior = 2 * np.exp(-((x / H_SCALE) ** 2) / 2) / (H_SCALE * np.sqrt(2 * np.pi))
+            return prior * multivariate_normal.pdf(mean[:3], at, C[:3, :3])
+
+        # the power goes with the errors of the severities
+        gain = np.linalg.solve(C[:3, :3], C[:3, 3])
+        best, s = float(found.h[k, 0]), float(np.sqrt(found.variance[k, 0]))
+        end = max(best, 0) + 12 * s
+        total = quad(weight, 0, end, points=[max(best, 0)], epsrel=1e-10)[0]
+        odds = total / none * FAULTY / 3 / (1 - FAULTY)
+        assert_allclose(found.odds[k, 0], np.log(odds), atol=1e-6)
+        # of a severity far from zero, the prior's bound at zero is not felt
+        if best > 6 * s:
+            m = quad(lambda x: x * weight(x), 0, end, points=[best], epsrel=1e-10)[0] / total
+            assert_allclose(best, m, rtol=1e-6)
+            error = mean[:3] - np.eye(3)[k] * best
+            assert_allclose(found.P[k, 0], mean[3] - gain @ error, rtol=1e-9)
+
+
+def test_the_mean_over_the_hypotheses_holds_what_they_differ_by():
+    """The mixture's mean and variance, by its samples."""
+    mean, C = belief((9e-5, 0, 0))
+    found = Hypotheses.of(mean[None], C[None])
+    P, variance = (np.array([v]) for v in (195e3, 400.0**2))
+    got, spread = found.power(P, variance)
+    rng = np.random.default_rng(1)
+    of = np.append(P, found.P[:, 0]), np.sqrt(np.append(variance, found.P_variance[:, 0]))
+    which = rng.choice(4, 200_000, p=found.probability[:, 0])
+    drawn = of[0][which] + of[1][which] * rng.standard_normal(which.size)
+    assert_allclose(got[0], drawn.mean(), atol=5 * drawn.std() / np.sqrt(which.size))
+    assert_allclose(spread[0], drawn.var(), rtol=0.02)
+
+
+def test_one_faulty_phase_leaves_no_misfit_and_two_do():
+    """Chi-squared with two degrees of freedom, mean 2; far more for three phases."""
+    draws = [belief((3e-4, 0, 0), seed) for seed in range(300)]
+    means, covs = (np.array(x) for x in zip(*draws, strict=True))
+    assert Hypotheses.of(means, covs).misfit.mean() == pytest.approx(2.0, abs=0.6)
+    two = means + np.array([0, 1e-3, 1e-3, 0])
+    assert np.median(Hypotheses.of(two, covs).misfit) > 20
+
+
+def test_what_is_known_of_parameters():
+    assert Knowledge.temperature(20.0).sigma == pytest.approx(20 * COPPER)
+    of = filter_unknowns({"machine.L_md": Knowledge("considered", 0.05), "J": Knowledge("known")})
+    assert of["machine.L_md"][0].consider and of["machine.L_md"][1] == 0.05 and len(of) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Knowledge("guessed", 0.1), "guessed"),
+        (lambda: Knowledge("known", 0.1), "0 for what is known"),
+        (lambda: Knowledge("considered"), "a share of the value > 0"),
+        (lambda: filter_unknowns({"machine.L_nd": Knowledge("considered", 0.1)}), "L_md"),
+        (lambda: filter_unknowns({"machine.r_s": Knowledge("estimated", 0.1)}), "consider it"),
+    ],
+)
+def test_wrong_knowledge_is_refused(make, words):
+    with pytest.raises(ParameterError, match=words):
+        make()
