@@ -9,7 +9,7 @@ between call and mover need know of ensembles, if it changes nothing before the 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
@@ -100,11 +100,17 @@ class Together:
     Args:
         fun: as compiled for one call.
         of: what it was compiled from, with dense inputs and outputs.
+        one: evaluates one call; a ``Caller`` of ``fun`` if not given.
     """
 
-    def __init__(self, fun: ca.Function, of: ca.Function) -> None:
+    def __init__(
+        self,
+        fun: ca.Function,
+        of: ca.Function,
+        one: Callable[..., tuple[np.ndarray, ...]] | None = None,
+    ) -> None:
         self.fun, self.of = fun, of
-        self._one: Caller | None = None
+        self._one = one  # a member's own is never made where all ask
         self._wide: Caller | None = None
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
@@ -125,7 +131,7 @@ class Together:
         return results
 
     def _alone(self, *given: Any) -> tuple[np.ndarray, ...]:
-        if self._one is None:  # a member's is never called where all ask
+        if self._one is None:
             self._one = Caller(self.fun, copy=False)
         return self._one(*given)
 
