@@ -46,6 +46,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(sharing, "_stores", weakref.WeakValueDictionary())
     monkeypatch.setattr(sharing, "_recent", {})
     monkeypatch.setattr(backend, "_find_or_make", note)
+    monkeypatch.setattr(backend, "_library", lambda *given: None)
     monkeypatch.setattr(backend, "_load", lambda name, key: None)
     monkeypatch.setattr(backend, "_toolchain", lambda wanted: (sys.executable,))
     return found

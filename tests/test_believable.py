@@ -176,6 +176,23 @@ def test_severities_are_of_one_phase_and_not_negative(h, kinds):
     assert [d.kind for d in doubts] == kinds and set(kinds) <= set(KINDS)
 
 
+def test_voltages_and_speed_of_two_rates():
+    """1 % of another rate is 50 rad in 2 s; a load angle that changes by 1 rad is none."""
+    t, w = 1e-4 * np.arange(20_000), 2513.0
+    turn = {n: -k * 2 * np.pi / 3 for k, n in enumerate(("v_a", "v_b", "v_c"))}
+
+    def slip(rate, change=0.0):
+        angle = rate * w * t + change * (t > 1.0)
+        v = {n: 325 * np.cos(angle + k) for n, k in turn.items()}
+        v["v_a"][100:120] = np.nan
+        return believable._slip(v | {"t": t, "w_r": w + 0 * t})
+
+    assert_allclose(slip(1.0), 0.0, atol=1e-3)
+    assert_allclose(slip(1.0, 1.0), 1.0, atol=1e-3)
+    assert_allclose(slip(1.01), 0.95 * 0.01 * w * 2, rtol=0.01)
+    assert_allclose(slip(0.99), -0.95 * 0.01 * w * 2, rtol=0.01)
+
+
 # ------------------------------------------------------------------------------ causes
 
 

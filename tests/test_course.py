@@ -13,6 +13,7 @@ from apu_casadi.core.means import Term, wanted
 from apu_casadi.core.profiles.points import Points
 from apu_casadi.core.profiles.profile import at, varying
 from apu_casadi.core.profiles.shapes import Growth, Ramp
+from apu_casadi.machine import transition
 from apu_casadi.machine.course import Course, Piece
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
@@ -163,3 +164,20 @@ def test_pieces_of_unequal_harmonics_go_on_by_single_steps(monkeypatch):
     monkeypatch.setattr(course, "_piece", lambda s: pieces[int(s)], raising=False)
     with pytest.raises(NotApplicable, match="model: the structure changes on the way"):
         course.numbers(np.array([0.9, 1.1]))
+
+
+def test_tables_are_made_once_for_all_runs(monkeypatch):
+    """A second course of the same numbers, as of a second run, computes none."""
+    made = []
+    table = transition.transition_table
+
+    def counted(*args, **more):
+        made.append(args)
+        return table(*args, **more)
+
+    monkeypatch.setattr(transition, "transition_table", counted)
+    load = varying(SeriesLoad.from_power, Ramp(100e3, 140e3, over=77.0))
+    for least in (1, 0):
+        before = len(made)
+        course_of(load, None).numbers(np.array([20.0]))
+        assert (len(made) > before) == bool(least)

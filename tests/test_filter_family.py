@@ -16,10 +16,15 @@ from apu_casadi.machine.terminals import terminal_model
 from apu_casadi.unit.control import GovernorParameters
 from estimators.apu.electrical.electricalfilter import electrical_filter
 from estimators.apu.electrical.machinemodel import electrical_model
+from estimators.apu.fitting import engine_model
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.gaspathmodel import gas_path_model
 from estimators.apu.joint import electrical_samples
 from estimators.apu.sensors import ELECTRICAL
+from estimators.batch.fit import fit
+from estimators.batch.mhe import moving_horizon
+from estimators.detection.signatures import Jump, linearised
+from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step, extended_kalman_filter
 from estimators.filters.filtering import FilterStep
 from estimators.filters.imm import interacting_multiple_models
@@ -34,7 +39,7 @@ from estimators.models.filtermodel import (
     measure,
     noisy_inputs,
 )
-from estimators.models.recording import record
+from estimators.models.recording import Recording, record
 
 # what none of the filter's outputs depends on: surge margins, and a pressure beside the gas path
 IDLE = ["gas_generator.Ps3_P3", "compressor_map.k_SM", "compressor_map.a_SM"]
@@ -334,3 +339,50 @@ def test_interacting_models_of_another_engine_compile_nothing(truth, asked):
             before = set(asked)
     assert before and asked == before
     assert np.abs(probabilities[0] - probabilities[1]).max() > 1e-6
+
+
+@pytest.mark.long
+def test_horizons_fits_and_signatures_of_another_engine_compile_nothing(truth, asked):
+    """Moving horizon, batch fit and the Jacobians of jumps: made of the family, once."""
+    before, found = set(asked), []
+    for eta in (0.85, 0.84):
+        unit = Apu().change({"gas_generator.eta_c": eta}).gas_generator
+        names = ["N", "P3", "T3", "T5"]
+        model = measure(discretise(unit.state_space, walk={"N": 1.0}), names)
+        filt = gas_path_filter(unit, gains=False, inertia=None)
+        few = filt.recording(truth, 1).part(0, 3)
+        u = few.u[filt.model.u.indices(model.u.names)]
+        data = Recording(few.t, u, few.y, few.variance, np.ones(4))
+        prior = Belief.of(model.x, {"N": 3770.0}, {"N": 20.0})
+        near = moving_horizon(model, prior, data, horizon=2)
+        f = fit(model, data, ["f_eta_c"], prior={"f_eta_c": (1.0, 0.02)}, beliefs=[prior])
+        path = extended_kalman_filter(model, prior, data, full=True)
+        jumps = linearised(model, path, data, [Jump("parameter", "f_eta_c", 0.01)])
+        found.append([near.mean[0, -1], f.estimate[0], jumps.output[0, 1, 0]])
+        if not before:
+            before = set(asked)
+    assert before and asked == before
+    assert (np.abs(np.subtract(*found)) > 1e-6).all()
+
+
+def test_a_fit_of_another_engine_compiles_nothing(asked):
+    """The lifted model and the program are the family's; the numbers are among the data."""
+    before, found = set(asked), []
+    t = np.arange(3) * 0.02
+    read = {"N": 3775.0, "P3": 8.1e5, "T3": 552.0, "T5": 748.0}
+    held = {"Wf": 0.0485, "PW": 4.95e5, "altitude": 0.0, "Mach": 0.0, "dT_isa": 5.0, "war": 0.0}
+    for eta in (0.85, 0.84):
+        unit = Apu().change({"gas_generator.eta_c": eta}).gas_generator
+        lifted = engine_model(unit, ("N", "P3", "T3", "T5"))
+        data = record(
+            lifted.model,
+            outputs={n: (t, np.full(3, v)) for n, v in read.items()},
+            sigma={n: 2e-3 * v for n, v in read.items()},
+            inputs=held | {"sigma_Wf": 3e-4, "sigma_PW": 2e3},
+            p=dict.fromkeys(HEALTH, 1.0),
+        )
+        found.append(fit(lifted, data, ["f_eta_c"], prior={"f_eta_c": (1.0, 0.02)}).estimate[0])
+        if not before:
+            before = set(asked)
+    assert before and asked == before
+    assert abs(found[1] / found[0] - 0.85 / 0.84) < 3e-3

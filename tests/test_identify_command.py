@@ -4,6 +4,7 @@ FACTS known of the machine: with kappa = mu only h = mu/(k_rf + 1 - mu) shows at
 from there the faulty machine is the healthy one with a shunt R = r_s/h, L = (kappa - mu) L_ls/mu.
 """
 
+import dataclasses
 import json
 import math
 
@@ -274,3 +275,52 @@ def test_the_figure_refuses_what_it_cannot_draw():
         plot_gain_of_a_sensor(prior[:1], {"a": curve}, **options)
     with pytest.raises(SignalError, match="aims of unknown curves: b"):
         plot_gain_of_a_sensor(prior, {"a": curve}, aims={"b": (0.02, 0.5)}, note="")
+
+
+def test_generators_whose_efficiencies_err_on_their_own(capsys, tmp_path):
+    """Two equal loads: 0.71 of one's error; one of two with another r_s: its own severity."""
+    assert study.independent_bias(0.02, [3.0, 3.0]) == pytest.approx(0.02 / math.sqrt(2))
+    assert study.independent_bias(0.02, [1.0]) == 0.02
+    # as two considered gains with half of the reading each
+    one = study.gas_path(eta_bias=study.independent_bias(0.02, [0.5, 0.5]))
+    g = study.gas_path(eta_bias=0.0, power_noise=math.hypot(0.01, 0.02 * math.hypot(0.5, 0.5)))
+    pairs = [x.only([*study.BASE, "PW"]).covariance() for x in (one, g)]
+    assert_allclose(*pairs, rtol=1e-9)
+    engine = tmp_path / "two.toml"
+    engine.write_text(
+        'name = "two"\n[[generator]]\n[[generator]]\n[generator.machine]\n'
+        'r_s = { value = 0.0088, unit = "ohm", source = "twice Table 1" }\n'
+    )
+    told = []
+    for k in ("1", "2"):
+        how = ("--json", "--engine", str(engine), "--generator", k, "--shares", "100,100")
+        status, text, err = out(capsys, *how)
+        assert status == 0, err
+        told.append(json.loads(text))
+    a, b = (t["severity"] for t in told)
+    assert told[1]["generator"] == 2 and "generator" not in told[0]
+    assert told[0]["eta_bias_of_all"] == pytest.approx(0.02 / math.sqrt(2))
+    bias = [t["shaft_power"]["efficiency bias"]["eta_bias"] for t in told]
+    assert bias == [pytest.approx(0.02 / math.sqrt(2))] * 2
+    gen = Generator()
+    other = dataclasses.replace(gen, machine=gen.machine.change(r_s=0.0088))
+    for rows, machine in ((a, gen), (b, other)):
+        wanted = severity.severity_study(generator=machine)
+        assert_allclose([r["sigma_log_h"] for r in rows], [s.sigma_h for s in wanted], rtol=1e-12)
+    # a shunt of twice the resistance carries half of the current
+    assert b[-3]["sigma_log_h"] == pytest.approx(2 * a[-3]["sigma_log_h"], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (("--generator", "3"), "--generator 3: the unit has generators 1 to 2"),
+        (("--generator", "0"), "the unit has generators 1 to 2"),
+        (("--shares", "1,2,3"), "--shares 1,2,3: the unit has 2 generators"),
+        (("--shares", "1,-2"), "numbers > 0 expected"),
+        (("--shares", "1,x"), "is no number"),
+    ],
+)
+def test_wrong_generators_and_shares_are_told(capsys, argv, words):
+    status, _, err = out(capsys, *argv)
+    assert status == 2 and words in err

@@ -8,20 +8,22 @@ import json
 import numpy as np
 import pytest
 
-from apu_casadi.core.errors import DataError
+from apu_casadi.core.errors import DataError, EstimationError
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.electrical.electricalfilter import electrical_filter
+from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.joint import (
     electrical_samples,
     estimate_joint,
     joint_case,
     speed_from_generators,
 )
-from estimators.apu.monolithic_filter import compare_monolithic
+from estimators.apu.monolithic_filter import compare_monolithic, monolithic_filter
 
 APU = Apu()
 FAULT = Ttsc(mu=0.05, k_rf=20.0, phase="a")
@@ -139,3 +141,57 @@ def test_cases_of_a_seed_are_reproducible():
     a, b, c = joint_case(1), joint_case(1), joint_case(2)
     assert a == b != c
     assert set(a.gas_gains) == {"P3", "T3", "T5", "Wf", "PW"}
+
+
+@pytest.mark.slow
+def test_two_different_machines_in_one_filter():
+    """Own parameters, gear and load of each: as the coupled filters, and surer of the speed."""
+    unit = APU.change({"generator2.machine.r_s": 0.006, "generator2.coupling.gear": 3.05})
+    ds = simulate_joint(
+        unit,
+        duration=0.14,
+        load=[SeriesLoad.from_power(225e3), SeriesLoad.from_power(150e3)],
+        events=[LoadChange(0.06, SeriesLoad.from_power(180e3), generator=1)],
+        dt=0.005,
+        exchange="corrected",
+        waveform_dt=1e-4,
+    )
+    c = compare_monolithic(ds, 1, apu=unit)
+    for n in (*HEALTH, *(f"generator{k}.h_{p}" for k in (1, 2) for p in "abc")):
+        assert c[n]["difference_max"] < 1.0, n
+        assert 0.8 < c[n]["sigma_ratio"] < 1.01, n
+    assert c["N"]["sigma_ratio"] < 0.5
+
+
+def test_wrong_groups_of_the_filter_of_the_unit_are_told():
+    electrical = electrical_filter(APU.generator.machine, power=True)
+    gas = gas_path_filter(APU.gas_generator, gains=False, inertia=None)
+    other = APU.change({"generator2.machine.r_s": 0.006})
+    with pytest.raises(EstimationError, match="generators 1 and 2 differ"):
+        monolithic_filter(other, electrical, gas)
+    with pytest.raises(EstimationError, match="one for each group is needed"):
+        monolithic_filter(APU, (electrical,) * 3, gas)
+    two = monolithic_filter(other, (electrical, electrical), gas)
+    assert two.of == ((1,), (2,)) and "generator2.h_a" in two.model.x
+    one = monolithic_filter(APU, electrical, gas)
+    assert "h_a" in one.model.x and len(two.model.x) == 2 * len(electrical.model.x) + 6
+    n, dt = len(two.model.x), 1e-4
+    # the same state in both parts: the rotor goes on as that of the one
+    x1 = electrical.model.x.nominals * 0.3
+    N = np.array([APU.N_ref, 1.0, 1.0, 1.0, 1.0, 0.0])
+    u = electrical.model.u.pack({k: 0.0 for k in electrical.model.u.names})
+    more = gas.model.u.unpack(np.zeros(len(gas.model.u))) | {
+        "Wf": 0.04,
+        "sigma_Wf": 0.0,
+        "since": 0.0,
+    }
+    more |= {"altitude": 0.0, "Mach": 0.0, "dT_isa": 5.0, "war": 0.0, "fresh": 0.0}
+    ends = []
+    for filt, parts in ((one, 1), (two, 2)):
+        m = filt.model
+        rest = np.array([more[k] for k in m.u.names[parts * len(u) :]])
+        x, w = np.concatenate([*[x1] * parts, N]), np.zeros(len(m.w))
+        made, check = m.transition(x, np.concatenate([*[u] * parts, rest]), [], w, dt)
+        assert float(check) < 1e-6
+        ends.append(made.full().ravel()[m.x.index("N")])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-12) and n > 20

@@ -65,8 +65,9 @@ BELOW: dict[str, tuple[str, ...]] = {
     "scenarios.studies": STUDIES,
     "scenarios.bench": STUDIES,
     "scenarios.pages": STUDIES,
+    "scenarios.datasets": SCENARIO,
     "scenarios.export": (*ESTIMATORS, *SHELL),
-    "scenarios.commands": (*PAGES, "apu_casadi", "scenarios.export"),
+    "scenarios.commands": (*PAGES, "apu_casadi", "scenarios.export", "scenarios.datasets"),
     "scenarios.cli": (*SHELL, "scenarios.commands"),
 }
 # who may import a package of others' code; all others may not

@@ -3,15 +3,17 @@
 import itertools
 import json
 import math
+import re
 import warnings
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from apu_casadi.core import simulation
 from apu_casadi.core.errors import ApuWarning, SignalError
-from apu_casadi.core.means import PARTS, RMS, Term, as_dict, settled, wanted, window
+from apu_casadi.core.means import PARTS, RMS, Term, as_dict, harmonic, settled, wanted, window
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
@@ -22,6 +24,7 @@ from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.stepmeans import MEANS
 
 APU, GEN = Apu(), Generator()
 W = GEN.machine.w_rated
@@ -240,3 +243,26 @@ def test_a_new_speed_of_an_open_generator():
     for end in (means, fine):
         V = ss.g(end.ravel(), u, []).full().ravel()[row]
         assert pytest.approx(exact.y[row, -1], rel=1e-5) == V
+
+
+def test_harmonics_cost_one_cosine_and_one_sine():
+    """All means of an unbalanced step take those of one angle."""
+    ss = GEN.variant(KW100, Ttsc(0.05, 20.0)).shared
+    x, y, share = ca.SX.sym("x", len(ss.x)), ca.SX.sym("y", len(ss.y)), ca.SX.sym("share")
+    terms = [Term.of(q).expression(ss, x, y, share) for q in QUAD]
+    f = ca.Function("f", [x, y, share], [ca.cse(ca.vertcat(*terms))])
+    ids = [f.instruction_id(k) for k in range(f.n_instructions())]
+    assert ids.count(ca.OP_COS) == ids.count(ca.OP_SIN) == 1
+    for k in (1, 2, 3, 4):
+        got = [float(v) for v in harmonic(k, ca.SX(0.7))]
+        assert_allclose(got, [math.cos(0.7 * k), math.sin(0.7 * k)], rtol=1e-14)
+
+
+def test_means_of_a_balanced_step_take_no_harmonics():
+    """Phasors and components are means of what stands still on the rotor's axes."""
+    quad = (*MEANS, *wanted(phasors=True, short=False, symmetric=True), "T_e")
+    u = GEN.inputs(KW100)
+    fast = MeanStep(GEN, GEN.variant(KW100, None), u, np.empty(0), dt=0.02, quad=quad)
+    code = ca.CodeGenerator("step.c")
+    code.add(fast.advance)
+    assert fast.constant and not re.search(r"\b(cos|sin)\(", code.dump())

@@ -2,6 +2,7 @@
 
 import math
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -14,7 +15,7 @@ from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.series import SeriesLoad
-from apu_casadi.machine.propagation import Propagator, strides
+from apu_casadi.machine.propagation import Propagator, hoisted, strides
 from apu_casadi.machine.weights import gregory
 
 GEN = Generator()
@@ -156,8 +157,37 @@ def test_a_series_that_does_not_converge_is_refused(monkeypatch):
     with pytest.raises(SimulationError, match=r"over \d+ harmonics"):
         transition.transition_table(ss, u, theta, W, h=50e-6)
     monkeypatch.setattr(transition, "STAGES", 1)
+    monkeypatch.setattr(transition, "FEW", 1)
     with pytest.raises(SimulationError, match="do not converge"):
         transition.transition_table(ss, u, theta, W, h=50e-6)
+
+
+@pytest.mark.parametrize("k_rf", [500.0, 5000.0])
+def test_fewer_stages_are_as_good_where_a_branch_settles_at_once(monkeypatch, k_rf):
+    """A light fault asks for four steps and more: entries as of eight stages to 1e-9 nominal."""
+    load, fault = SeriesLoad.from_power(100e3, 0.85), Ttsc(0.05, k_rf)
+    ss = GEN.variant(load, fault)
+    u, theta = GEN.inputs(load), GEN.fault_vector(load, fault)
+    few = transition.transition_table(ss, u, theta, W, angle=2 * math.pi / 28)
+    monkeypatch.setattr(transition, "FEW", transition.STAGES)
+    all_ = transition.transition_table(ss, u, theta, W, angle=2 * math.pi / 28)
+    units = transition.nominal_entries(ss, 1)
+    for part, scale in zip(("even", "odd"), units, strict=True):
+        a, b = (getattr(t, part) * scale for t in (few, all_))
+        n = min(a.shape[1], b.shape[1])
+        assert np.abs(a[:, :n] - b[:, :n]).max() < 1e-9
+
+
+def test_what_is_fixed_is_taken_out_of_a_loop_and_divides_nothing_in_it():
+    """Inside there is no division by it and no cosine of it; the values are the same."""
+    x, p = ca.SX.sym("x", 2), ca.SX.sym("p", 2)
+    values = [ca.vertcat(x[0] / p[0] + ca.cos(p[1]) * x[1], p[0] / x[1], x[1] / (p[0] + p[1]))]
+    inner, before = hoisted("f", [x], p, values)
+    ids = [inner.instruction_id(k) for k in range(inner.n_instructions())]
+    assert ids.count(ca.OP_DIV) == 1 and ca.OP_COS not in ids
+    given = np.array([0.3, 0.7]), np.array([1.7, 0.4])
+    expected = ca.Function("e", [x, p], values)(*given).full()
+    assert_allclose(inner(given[0], before(given[1])).full(), expected, rtol=1e-15)
 
 
 def test_noise_that_half_a_turn_does_not_reverse_is_refused():

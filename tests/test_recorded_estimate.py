@@ -5,6 +5,7 @@ The truth is the joint simulation of 0.2 s with a short circuit at 0.1 s.
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -27,7 +28,10 @@ from estimators.apu.joint import ETA_SIGMA, GAIN_SHARE, estimate_joint, joint_ca
 from estimators.apu.measuring import measure_run, read_sensors, write_recording
 from estimators.apu.recorded_estimate import estimate
 from estimators.apu.recordings.measured import read_recording
+from estimators.apu.sensors import ELECTRICAL
 from scenarios import cli
+from scenarios.schema import Scenario
+from scenarios.studies import jointrun
 
 APU = Apu()
 SEED = 3
@@ -127,7 +131,54 @@ def test_two_machines_and_their_mean_power(readings):
     )
 
 
+@pytest.mark.ci  # two joint estimates
+def test_the_joint_command_writes_its_recording_and_estimates_from_it(run, tmp_path):
+    """With the error of the efficiency, which is no sensor's; the file says the same again."""
+    load = {"kind": "R", "power_kW": 100.0}
+    fault = {"mu": 0.05, "k_rf": 20.0, "phase": "a"}
+    phases = [
+        {"name": "a", "start": 0.0, "load": load},
+        {"name": "b", "start": 0.1, "fault": fault},
+    ]
+    s = Scenario.from_dict({"name": "x", "duration": 0.2, "phase": phases})
+    ds = run.assign_attrs(scenario=s.to_json(), phases=json.dumps(s.phase_table()))
+    e = jointrun.estimate(ds, SEED, folder=tmp_path)
+    case = joint_case(SEED)
+    gains = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
+    own = estimate_joint(run, SEED, apu=APU, **gains)
+    for n in ("N", *HEALTH, "h_a", "h_a_sigma", "h_a_true", "P_total", "P_total_true", "nis"):
+        assert_allclose(e[n], own[n], rtol=1e-9, atol=1e-12, err_msg=n)
+    assert json.loads(e.attrs["doubts"]) == []
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"recording_gaspath.nc", "recording_electrical.nc"}
+
+
 # ------------------------------------------------------------------------------ fewer channels
+
+
+@pytest.mark.ci  # an estimate each
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (ELECTRICAL.names, "jitter = 5e-6"),
+        (("i_a", "i_b", "i_c"), "lag = 20e-6\ndelay = 5e-5"),
+        (("i_a", "i_b", "i_c"), "quantum = 4.0\nrange = [-200, 200]"),
+    ],
+)
+def test_declared_imperfections_of_the_generators_sensors(run, tmp_path, names, text):
+    """No false alarm before the fault, found at the next sample, h within its band, believed."""
+    path = tmp_path / "s.toml"
+    path.write_text("".join(f"[{n}]\n{text}\n" for n in names))
+    w = measure_run(run, APU, SEED, read_sensors(path))["electrical"]
+    m = read_recording({"t": w["time"].values, **{n: w[n].values for n in w}})
+    e = estimate(m, sensors=path, only="electrical")
+    (machine,) = e.machines.values()
+    phase = machine["faulty_phase"].sel(time=[0.1, 0.14, 0.2], method="nearest").values
+    assert phase.tolist() == [0, 1, 1]
+    for n, true in (("h_a", 0.05 / 20.95), ("h_b", 0.0), ("h_c", 0.0)):
+        off = machine[n].values[-1] - true
+        assert abs(off) < 3 * machine[f"{n}_sigma"].values[-1], n
+    assert e.believable, e.doubts
 
 
 def test_a_subset_of_the_gas_path(readings):
@@ -343,11 +394,15 @@ def test_commands(run, tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "note: with exchange 'paper' every 20 ms speed and voltage have kinks" in said
     assert len(pd.read_csv("r_gaspath.csv")) == 11
+    Path("p.toml").write_text("[f_eta_c]\nsigma = 1e-4\n")
+    Path("s.toml").write_text("[T5]\nlag = 0.1\n")
     command = ["estimate", "data", "r_gaspath.csv", "--altitude", "100", "--out", "o", "--json"]
+    command += ["--prior", "p.toml", "--sensors", "s.toml"]
     assert cli.main(command) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["believable"] and set(found["gaspath"]["values"]) >= {"N", *HEALTH}
     assert not any("assumed" in n for n in found["notes"])
+    assert found["gaspath"]["values"]["f_eta_c"]["half_width"] < 4e-4
     names = {p.name for p in (tmp_path / "o").iterdir()}
     assert names == {"estimate_gaspath.nc", "estimate.json", "estimate.png"}
     assert (tmp_path / "o" / "estimate.png").stat().st_size > 10_000

@@ -1,19 +1,26 @@
 """Sensors: tables, readings, a lag against its step response, and the filter that carries it."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
 import pytest
 
 from apu_casadi import Apu, LoadChange, SeriesLoad, simulate_joint
-from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.measuring import measure
 from apu_casadi.gaspath.gasgenerator import GasGenerator
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from estimators.apu.fitting import EngineData, fit_engine
 from estimators.apu.gaspath import gas_path_filter, samples
+from estimators.apu.measuring import measure_run
+from estimators.apu.priorfile import Prior
+from estimators.apu.recorded_estimate import estimate
+from estimators.apu.recordings.measured import read_recording
 from estimators.apu.recordings.plausible import PLAUSIBLE
+from estimators.apu.sensorfile import read_sensors
 from estimators.apu.sensors import (
     ELECTRICAL,
     GAS_PATH,
@@ -24,6 +31,7 @@ from estimators.apu.sensors import (
     gas_path_table,
     register,
     respond,
+    unregister,
 )
 from estimators.information.consistency import band
 
@@ -204,3 +212,92 @@ def test_one_table_feeds_all():
     for s in KNOWN.values():
         assert PLAUSIBLE[s.name] == s.plausible
     assert gas_path_table().names[:6] == GAS_PATH.names
+
+
+MANY = """
+[T3]
+lag = 1.0
+[T5]
+lag = 1.0
+bias = 3.0
+[T41]
+bias = 5.0
+bias_as = "considered"
+[EGT]
+quantity = "T5"
+unit = "degC"
+noise = 2.0
+lag = 0.5
+delay = 0.1
+quantum = 1.0
+[f_gen]
+quantity = "N"
+unit = "Hz"
+factor = 0.1061
+noise = 0.1
+jitter = 1e-3
+"""
+
+
+@pytest.fixture
+def many(tmp_path):
+    path = tmp_path / "many.toml"
+    path.write_text(MANY)
+    yield read_sensors(path)
+    for name in ("EGT", "f_gen"):
+        unregister(name)
+
+
+def recorded(run, sensors, seed):
+    made = measure_run(run, Apu(), seed, sensors)["gaspath"]
+    return read_recording({"t": made["time"].values, **{n: made[n].values for n in made}})
+
+
+def of_health(e):
+    """NEES of the health factors at the end, over their number."""
+    r, at = e.result, e.result.x.indices(HEALTH)
+    off = r.mean[at, -1] - 1.0
+    return off @ np.linalg.solve(r.cov[-1][np.ix_(at, at)], off) / 4
+
+
+def test_offsets_are_states_estimated_or_considered(many):
+    """With the declared prior; a considered one keeps it, and all that is declared is a state."""
+    filt = gas_path_filter(GG, many.gas_path)
+    assert {"bias_T5", "bias_T41", "T5", "T3", "EGT", "gain_EGT"} <= {*filt.model.x.names}
+    assert "bias_P3" not in filt.model.x and "gain_f_gen" not in filt.model.x
+    assert filt.model.consider == ("bias_T41",)
+    assert (filt.sigma["bias_T5"], filt.sigma["bias_T41"]) == (3.0, 5.0)
+    x = dict.fromkeys(filt.model.x.names, 0.0)
+    x |= dict.fromkeys(HEALTH, 1.0) | {"N": GG.parameters.N, "T5": 900.0, "bias_T5": 7.0}
+    at = trim_gas_generator(GG, {"N": GG.parameters.N, "PW": 400e3})
+    u = filt.model.u.pack({"Wf": at["Wf"], "PW": at["PW"], "sigma_Wf": 0.0, "sigma_PW": 0.0})
+    y, check = filt.model.output(filt.model.x.pack(x), u, [], np.zeros(len(filt.model.w)))
+    y = dict(zip(filt.model.y.names, y.full().ravel(), strict=True))
+    assert float(check) < 1e-9 and y["T5"] == 907.0
+    assert y["f_gen"] == pytest.approx(0.1061 * GG.parameters.N)
+    assert y["T41"] == pytest.approx(at["T41"], rel=1e-8)
+
+
+@pytest.mark.ci  # sixteen estimates
+def test_declared_sensors_are_believed_and_right_and_undeclared_lags_are_not(drop, many):
+    """NEES near 1 with lags, delay, offsets, digits and jitter declared; a lag left out shows."""
+    found = [estimate(recorded(drop, many, s), sensors=many, backend="vm") for s in range(12)]
+    assert 0.5 < np.mean([of_health(e) for e in found]) < 1.6
+    assert sum(e.believable for e in found) >= 11
+    assert not any(json.loads(e.gaspath.attrs["alarms"]) for e in found)
+    instant = [dataclasses.replace(s, tau=0.0) for s in many.gas_path.sensors]
+    fast = dataclasses.replace(many, gas_path=SensorSet(tuple(instant)))
+    for seed in range(4):
+        e = estimate(recorded(drop, many, seed), sensors=fast, backend="vm")
+        assert not e.believable
+
+
+def test_a_prior_is_taken_and_a_wrong_state_named(drop, many):
+    m = recorded(drop, many, 1)
+    known = Prior({"f_eta_c": 1.0}, {"f_eta_c": 1e-4})
+    e, free = (estimate(m, sensors=many, prior=p, backend="vm") for p in (known, None))
+    first, own = (x.gaspath["f_eta_c_sigma"].values for x in (e, free))
+    assert first[0] < 1.01e-4 and own[0] > 0.015
+    for name, words in (("f_eta", "did you mean 'f_eta_"), ("h_a", "h_a is a severity")):
+        with pytest.raises(DataError, match=words):
+            estimate(m, sensors=many, prior=Prior({name: 1.0}), backend="vm")

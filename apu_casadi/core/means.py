@@ -128,9 +128,16 @@ class Term(NamedTuple):
         """What the mean is of; ``tau`` is the share of the step that has passed."""
         value = self.value(ss, x, y)
         if self.trig:
-            angle = self.k * x[ss.x.index("theta_e")]
-            value = value * (ca.cos(angle) if self.trig == "cos" else ca.sin(angle))
+            value = value * harmonic(self.k, x[ss.x.index("theta_e")])[self.trig == "sin"]
         return value * window(tau) if self.weighted else value
+
+
+def harmonic(k: int, angle: Any) -> tuple[Any, Any]:
+    """Return cos and sin of k times an angle, by the addition theorems from those of the angle."""
+    if k == 1:
+        return ca.cos(angle), ca.sin(angle)
+    (c, s), (d, t) = harmonic(k // 2, angle), harmonic(k - k // 2, angle)
+    return c * d - s * t, s * d + c * t
 
 
 def window(tau: Any) -> Any:

@@ -168,7 +168,8 @@ class Stepper(Rebuilt):
         if self.quad:
             y, asked = ss.g(x, u, theta), [Term.of(name) for name in self.quad]
             terms = [q.expression(ss, x, y, share) / q.nominal(ss) for q in asked]
-            dae |= {"t": time, "quad": ca.vertcat(*terms)}
+            # harmonics are those of one angle, which each term would take anew
+            dae |= {"t": time, "quad": ca.cse(ca.vertcat(*terms))}
         name = f"{ss.name}_{self.solver}"
         F = ca.integrator(name, self.solver, dae, 0.0, list(self.grid), options)
         return _Buffered(F, ("x0", "p", "z0"), ("xf", "qf"))

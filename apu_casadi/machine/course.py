@@ -34,6 +34,8 @@ from apu_casadi.machine.propagation import Propagator
 DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
 TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
 DEEPEST = 16  # times that an interval may be halved
+#: Products of numbers up to which BLAS does not start threads; with them, waiting takes longer.
+_ONE_THREAD = 250_000
 _INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 
 F = TypeVar("F", MeanStep, Propagator)
@@ -84,7 +86,11 @@ class Piece(Generic[F]):
         basis = np.cos(np.arccos(x)[:, None] * np.arange(self.powers.shape[0]))
         if s.size not in self.buffers:
             self.buffers[s.size] = np.empty((s.size, self.powers.shape[1]))
-        return np.matmul(basis, self.powers, out=self.buffers[s.size]).T
+        made = self.buffers[s.size]
+        size = max(1, _ONE_THREAD // basis.size)
+        for k in range(0, made.shape[1], size):
+            np.matmul(basis, self.powers[:, k : k + size], out=made[:, k : k + size])
+        return made.T
 
 
 class Course(Generic[F]):
@@ -214,7 +220,7 @@ class Course(Generic[F]):
         for degree in DEGREES:
             nodes: np.ndarray = _lobatto(degree)
             between: np.ndarray = _lobatto(2 * degree)[1::2]
-            if degree == DEGREES[-1]:  # two of them tell enough
+            if degree >= 8:  # two of them tell enough: one has the largest error of its kind
                 between = between[[0, degree // 2]]
             wanted = [float(x) for x in (*nodes, *between)]
             tables = [self._table(middle + reach * x, made, x) for x in wanted]

@@ -25,7 +25,7 @@ import numpy as np
 from apu_casadi.core.backend import backend_in_use, compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.means import Term, window
+from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
@@ -432,7 +432,7 @@ class _Sampled:
         for q in self._asked:
             row = sums[self._own.index((q.base, q.power, q.weighted)), :]
             if q.trig:
-                row = row * (ca.cos if q.trig == "cos" else ca.sin)(q.k * angles)
+                row = row * harmonic(q.k, angles)[q.trig == "sin"]
             found.append(ca.sum2(row))
         return ca.Function("means", [sums, angles], [ca.vertcat(*found)], {"cse": True})
 

@@ -33,7 +33,7 @@ import numpy as np
 from apu_casadi.core.backend import backend_in_use, compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.means import Term
+from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.core.simulation import StepResult
 from apu_casadi.machine.generator import Generator
@@ -329,25 +329,51 @@ def _advance(
         S, X = fold(S, *(p if constant else p[:, plan.head :] for p in PP))
         parts.append(X)
     X_all, miss = ca.horzcat(*parts), S[nx + 2]
-    # outputs and means
-    xo, uo, to = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
-    y, share = ss.g(xo, uo, to), ca.SX.sym("share")
-    terms = [Term.of(q).expression(ss, xo, y, share) for q in quad]
-    wanted = ca.vertcat(*(y[ss.y.index(k)] for k in outputs), *terms)
-    out, before = hoisted("out", [xo, share], ca.vertcat(uo, to), [wanted])
-    D = before(ca.vertcat(U, TH))
-    w, shares = gregory(n_out), ca.DM(np.arange(1, n_out + 1) / n_out).T
-    y0 = out(X0, 0.0, D)
-    Y = out.map("outs", "serial", n_out, [2], [])(X_all, shares, D)
-    k = len(outputs)
-    means = y0[k:] * w[0] + ca.mtimes(Y[k:, :], ca.DM(w[1:]))
+    Y, means = _observed(ss, outputs, quad, X0, X_all, ca.vertcat(U, TH))
     return ca.Function(
         f"advance_{ss.name}_{n_out}" + ("" if plan.many else "_fine"),
         [X0, *PP, U, TH, H],
-        [X_all[:, n_out - 1], Y[:k, :], means, miss],
+        [X_all[:, n_out - 1], Y, means, miss],
         ["x0", *(p.name() for p in PP), "u", "theta", "h"],
         ["x", "y", "mean", "miss"],
     )
+
+
+_TOGETHER = 20  # samples that are summed at once
+
+
+def _observed(
+    ss: GeneratorModel,
+    outputs: Sequence[str],
+    quad: Sequence[str],
+    start: Any,
+    samples: Any,
+    fixed: Any,
+) -> tuple[Any, Any]:
+    """Return outputs at the samples, and means over the step by :func:`gregory`."""
+    x, u, th = (ca.SX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True))
+    y, weight = ss.g(x, u, th), ca.SX.sym("weight", 2)  # of plain means, and of weighted ones
+    terms = [
+        q._replace(weighted=False).expression(ss, x, y, None) * weight[int(q.weighted)]
+        for q in map(Term.of, quad)
+    ]
+    waves = ca.vertcat(ca.SX(0, 1), *(y[ss.y.index(k)] for k in outputs))
+    each = [waves, ca.vertcat(ca.SX(0, 1), *terms)]
+    out, before = hoisted("out", [x, weight], ca.vertcat(u, th), each)
+    n, d = samples.shape[1], before(fixed)
+    w, light = gregory(n), window(np.arange(n + 1) / n)
+    weights = ca.DM(np.array([w, w * light]))
+    means, Y = out(start, weights[:, 0], d)[1], []
+    sums = dict[int, Any]()
+    for k in range(0, n, _TOGETHER):
+        size = min(_TOGETHER, n - k)
+        at = weights[:, k + 1 : k + 1 + size]
+        of_some, some = out.map("outs", "serial", size, [2], [])(samples[:, k : k + size], at, d)
+        sums[size] = sums[size] + some if size in sums else some
+        Y.append(of_some)
+    for some in sums.values():
+        means = means + ca.sum2(some)
+    return ca.horzcat(*Y), means
 
 
 @kept

@@ -31,11 +31,17 @@ from apu_casadi.machine.generatormodel import GeneratorModel
 
 TAIL = 1e-9  # Fourier coefficients below this share of the largest are left out
 STAGES = 8  # of the Radau method that P is made by; even where stiff its error falls as steps^-8
+FEW = (
+    4  # stages where more than two steps are needed, for a stiff branch's sake: as good, and cheap
+)
 STEP_TOL = 5e-7  # largest change of P, nominal units, when its steps are halved; then used: 2e-9
 HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goes on is refused
 EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
 NODES = 4  # Chebyshev nodes in speed
+TABLES = (
+    256  # kept for a model; a load or a fault that changes in time takes some ten in an interval
+)
 
 
 @dataclass(frozen=True)
@@ -88,25 +94,31 @@ def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _transition(
-    M_of: Any, theta0: np.ndarray, w: np.ndarray, h: np.ndarray, steps: int, leaps: int = 1
+    M_of: Any,
+    theta0: np.ndarray,
+    w: np.ndarray,
+    h: np.ndarray,
+    steps: int,
+    leaps: int = 1,
+    stages: int = STAGES,
 ) -> list[np.ndarray]:
     """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Radau collocation.
 
-    All three arrays have the shape (angles,).  There are ``steps`` of the method in h, of order 15
-    (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch that settles
-    within nanoseconds, or an open generator, needs no smaller steps.
+    All three arrays have the shape (angles,).  There are ``steps`` of the method in h, of order
+    2 stages - 1 (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch
+    that settles within nanoseconds, or an open generator, needs no smaller steps.
 
     Returns:
         One array for each leap, shape (angles, n, n + EXTRA): the rows of the windings.
     """
-    c, _ = _radau(STAGES)
+    c, _ = _radau(stages)
     hs, out = h / steps, []
     X = np.empty(0)
     for k in range(leaps * steps):
         t = hs[:, None] * (k + c)
         angles = theta0[:, None] + w[:, None] * t
-        M = M_of(angles.ravel(), np.repeat(w, STAGES))
-        M = M.reshape(theta0.size, STAGES, *M.shape[1:])
+        M = M_of(angles.ravel(), np.repeat(w, stages))
+        M = M.reshape(theta0.size, stages, *M.shape[1:])
         X = _radau_step(M, t, hs, X if k else None)
         if (k + 1) % steps == 0:
             out.append(X)
@@ -119,12 +131,12 @@ def _radau_step(
     """Advance transition matrices by one step of the Radau method.
 
     Args:
-        M: coefficients at the nodes, shape (angles, STAGES, n + EXTRA, n + EXTRA).
-        t, hs: instants of the nodes, (angles, STAGES), and length of the step, (angles,), s.
+        M: coefficients at the nodes, shape (angles, stages, n + EXTRA, n + EXTRA).
+        t, hs: instants of the nodes, (angles, stages), and length of the step, (angles,), s.
         X: matrices before it, (angles, n, n + EXTRA); None at the start.
     """
-    _, a = _radau(STAGES)
-    N, n = hs.size, M.shape[2] - EXTRA
+    N, stages, n = hs.size, M.shape[1], M.shape[2] - EXTRA
+    _, a = _radau(stages)
     M = M[:, :, :n]
     drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
     drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
@@ -133,11 +145,11 @@ def _radau_step(
         X = np.broadcast_to(np.eye(n, n + EXTRA), (N, n, n + EXTRA))
     by_h = hs[:, None, None]
     G = -a[None, :, None, :, None] * M[:, None, :, :, :n].transpose(0, 1, 3, 2, 4)
-    G = by_h * G.reshape(N, STAGES * n, STAGES * n) + np.eye(STAGES * n)
-    rhs = np.repeat(X[:, None], STAGES, axis=1)
-    forced = by_h * (a @ (M[..., n:] @ drive).reshape(N, STAGES, -1))
+    G = by_h * G.reshape(N, stages * n, stages * n) + np.eye(stages * n)
+    rhs = np.repeat(X[:, None], stages, axis=1)
+    forced = by_h * (a @ (M[..., n:] @ drive).reshape(N, stages, -1))
     rhs[..., n:] += forced.reshape(*t.shape, n, EXTRA)
-    return np.linalg.solve(G, rhs.reshape(N, STAGES * n, n + EXTRA))[:, -n:]
+    return np.linalg.solve(G, rhs.reshape(N, stages * n, n + EXTRA))[:, -n:]
 
 
 def _constant_transition(M: np.ndarray, h: np.ndarray, steps: int, leaps: int = 1) -> np.ndarray:
@@ -326,15 +338,15 @@ def transition_table(
     if constant:
         M = M_of(np.zeros(NODES), nodes)
 
-    def trial(steps: int) -> np.ndarray:
+    def trial(steps: int, stages: int) -> np.ndarray:
         """Transition matrices that tell whether the steps suffice."""
         if constant:
             slow = [int(nodes.argmin())]
             return np.asarray(_constant_transition(M[slow], length(nodes)[slow], steps)[0])
         slowest = np.full(_PROBE.size, nodes.min())
-        return _transition(M_of, _PROBE, slowest, length(slowest), steps)[0]
+        return _transition(M_of, _PROBE, slowest, length(slowest), steps, stages=stages)[0]
 
-    steps, error = _enough(
+    steps, stages, error = _enough(
         trial, f"{ss.name}: transition matrices over {length(nodes).max():.3g} s"
     )
 
@@ -344,7 +356,7 @@ def transition_table(
         if constant:
             P = _constant_transition(M, length(nodes), steps, leaps).swapaxes(0, 1)
         else:
-            P = np.stack(_transition(M_of, a, w, length(w), steps, leaps), axis=1)
+            P = np.stack(_transition(M_of, a, w, length(w), steps, leaps, stages), axis=1)
         return P.transpose(0, 1, 3, 2).reshape(NODES, angles.size, -1)
 
     units = np.tile((1 / _scale(ss)[:n]).T.ravel(), leaps)
@@ -372,16 +384,22 @@ def transition_table(
     return Table(centre, half, even, odd, highest, error)
 
 
-def _enough(trial: Callable[[int], np.ndarray], what: str) -> tuple[int, float]:
-    """Return how many steps suffice, doubled until trials agree, and the last change."""
-    steps, error, last = 1, math.inf, trial(1)
+def _enough(trial: Callable[[int, int], np.ndarray], what: str) -> tuple[int, int, float]:
+    """Return how many steps of how many stages suffice, doubled until trials agree, and the change.
+
+    ``trial`` takes them; two steps of all stages at most, else of few.
+    """
+    steps, stages, error, last = 1, STAGES, math.inf, trial(1, STAGES)
     while error > STEP_TOL:
         if steps >= 64:
             raise NotApplicable(f"{what} do not converge (error {error:.1e} with {steps} steps)")
-        new = trial(2 * steps)
-        error = float(np.abs(new - last).max())
-        steps, last = 2 * steps, new
-    return steps, error
+        if steps == 2:
+            steps, stages = 4, FEW
+            last = trial(steps, stages)
+        steps *= 2
+        new = trial(steps, stages)
+        error, last = float(np.abs(new - last).max()), new
+    return steps, stages, error
 
 
 def _fourier(
@@ -426,4 +444,4 @@ def cached_table(
     def make() -> Table:
         return transition_table(ss, key_u, theta, w_rated, h=h, angle=angle, leaps=leaps)
 
-    return keep(ss, Table, key, make, locked=False)
+    return keep(ss, Table, key, make, limit=TABLES, locked=False)

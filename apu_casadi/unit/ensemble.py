@@ -13,28 +13,20 @@ where there are thousands.
 from __future__ import annotations
 
 import inspect
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from apu_casadi.core.calling import available_threads
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
-from apu_casadi.core.lanes.together import Member, Question, answer
+from apu_casadi.core.lanes.together import CHUNK, ensemble
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.multirate import joint_course, simulate_joint
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["CHUNK", "ensemble", "simulate_ensemble"]
+__all__ = ["simulate_ensemble"]
 
-CHUNK = 64  # members that are under way at once
 _DEFAULTS = {n: p.default for n, p in inspect.signature(simulate_joint).parameters.items()}
-
-T = TypeVar("T")
-Course = Generator[Question, None, T]
 
 
 def simulate_ensemble(
@@ -96,48 +88,3 @@ def _asked(k: int, given: Mapping[str, Any]) -> dict[str, Any]:
     if missing:
         raise ScenarioError(f"member {k}: {' and '.join(missing)} must be given")
     return how
-
-
-def ensemble(
-    courses: Iterator[Course[T]], *, chunk: int = CHUNK, n_threads: int | None = 1
-) -> Iterator[tuple[int, T | Exception]]:
-    """Move courses, which pause at questions, and answer these together.
-
-    Args:
-        courses: what :func:`~apu_casadi.unit.multirate.joint_course` makes; taken when there is
-            room.
-        chunk, n_threads: as of :func:`simulate_ensemble`.
-
-    Yields:
-        Number of a member and what it returned or raised, in the order in which they end.
-    """
-    if chunk < 1:
-        raise ScenarioError(f"chunk = {chunk!r}: at least one member must be under way")
-    n = available_threads() if n_threads is None else n_threads
-    waiting = enumerate(courses)
-    with ThreadPoolExecutor(n) if n > 1 else nullcontext() as pool:
-        under_way = deque[tuple[int, Course[T], Member]]()
-        while True:
-            while len(under_way) < chunk and (one := next(waiting, None)) is not None:
-                under_way.append((*one, Member()))
-            if not under_way:
-                return
-            yield from _moved(under_way, pool)
-
-
-def _moved(
-    under_way: deque[tuple[int, Course[T], Member]], pool: Executor | None
-) -> Iterator[tuple[int, T | Exception]]:
-    """Move each member to its next question, and answer; yields those that end."""
-    for _ in range(len(under_way)):
-        k, course, member = under_way.popleft()
-        try:
-            with member:
-                next(course)
-        except StopIteration as end:
-            yield k, end.value
-        except Exception as error:
-            yield k, error
-        else:
-            under_way.append((k, course, member))
-    answer([m for _, _, m in under_way], pool)

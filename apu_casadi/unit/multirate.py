@@ -31,14 +31,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ApuWarning, ScenarioError, ValidityWarning, nearest
-from apu_casadi.core.lanes.together import Question, by_itself
+from apu_casadi.core.lanes.together import Course, alone
 from apu_casadi.core.means import RMS
 from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, steps
@@ -175,7 +175,7 @@ def simulate_joint(
     return alone(joint_course(**locals()))
 
 
-def joint_course(apu: Apu, **how: Any) -> Generator[Question, None, xr.Dataset]:
+def joint_course(apu: Apu, **how: Any) -> Course[xr.Dataset]:
     """Do what :func:`simulate_joint` does, whose arguments these are, and pause at questions.
 
     An ensemble answers them (:mod:`apu_casadi.unit.ensemble`); a single run asks none.
@@ -196,16 +196,6 @@ def joint_course(apu: Apu, **how: Any) -> Generator[Question, None, xr.Dataset]:
     record = yield from _moved(system, events, stops, how["storage"], judged, how["progress"])
     told = {"warn_exchange": how["warn_exchange"], "strict": strict, "limits": limits}
     return _concluded(system, record, how["exchange"], events, **told, attrs=how["attrs"] or {})
-
-
-def alone(course: Generator[Question, None, xr.Dataset]) -> xr.Dataset:
-    """Run a course that asks nobody, though it may be inside of a member of an ensemble."""
-    try:
-        with by_itself():
-            raise next(course)
-    except StopIteration as end:
-        made: xr.Dataset = end.value
-        return made
 
 
 def start_of(
@@ -229,7 +219,7 @@ def _moved(
     storage: str | os.PathLike[str],
     strict: Limits | None,
     progress: Callable[[float, float], None] | None,
-) -> Generator[Question, None, Recorder]:
+) -> Course[Recorder]:
     """Run the unit over its grid, strictly within limits if given; return what was recorded."""
     apu, asked, grid = system.apu, system.asked, system.asked.grid
     means = {k: means_of(apu, k, asked.phasors) for k in kinds(apu, system.now, events)}

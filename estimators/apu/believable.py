@@ -32,9 +32,10 @@ import numpy as np
 from scipy.special import ndtri
 
 from apu_casadi.gaspath.health import HEALTH
-from apu_casadi.machine.park import PHASES
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
+from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import engine_function
 from estimators.apu.joint import H_GAIN
@@ -43,6 +44,7 @@ from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
     from apu_casadi.machine.machinedata import MachineParameters
+    from estimators.apu.fitting import EngineFit
     from estimators.apu.gaspath import GasPathFilter
     from estimators.apu.healthjumps import Tracked
     from estimators.apu.joint import ElectricalSide
@@ -54,6 +56,7 @@ __all__ = [
     "LEVEL",
     "Doubt",
     "channel_doubts",
+    "fit_doubts",
     "gas_causes",
     "gas_doubts",
     "machine_causes",
@@ -72,10 +75,13 @@ MARGIN = (
     1.1  # on the variance of the gas path's innovations, for maps and gas data of another engine
 )
 STEEP = 0.1  # change of a factor beyond which no filter was tried
+STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
 SETTLED = 0.1  # s after a report, in which its innovations are explained
+SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
+FEWEST_SAMPLES = 100
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
 SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
@@ -194,6 +200,26 @@ def machine_doubts(
             "a step of load or a fault: no model of one step fits, and reports around are doubtful",
         )
     yield from _severity_doubts(side)
+    slip = _slip(samples)
+    if abs(slip) > SLIP:
+        yield Doubt(
+            "time",
+            f"the voltages turn by {slip:+.1f} rad against the speed, where no load turns them by "
+            f"{SLIP:g}: a wrong rate of samples, or the speed of another machine",
+        )
+
+
+def _slip(samples: Mapping[str, np.ndarray]) -> float:
+    """Angle that the voltage's space vector gains on the rotor from beginning to end, rad."""
+    a = np.array([samples[n] for n in (*PHASES_V, "w_r", "t")])
+    *v, w, t = a[:, np.isfinite(a).all(0)]
+    if t.size < FEWEST_SAMPLES:
+        return 0.0
+    turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+    rotor = np.concatenate([[0.0], np.cumsum(w[:-1] * np.diff(t))])
+    angle = np.unwrap(np.angle((turn @ np.array(v)) * np.exp(-1j * rotor)))
+    ends = max(t.size // 20, 1)
+    return float(angle[-ends:].mean() - angle[:ends].mean())
 
 
 def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
@@ -283,6 +309,10 @@ def gas_doubts(
     for i, k in zip(tracked.onsets, tracked.alarms, strict=True):
         quiet &= (r.t <= r.t[i] + 1e-9) | (r.t > r.t[k] + SETTLED)
     z = r.innovation / np.sqrt(r.innovation_variance)
+    for k, n in enumerate(r.y.names):
+        if s := filt.considered(n):  # that offset is no news
+            usual = 3 * s / math.sqrt(float(np.median(r.innovation_variance[k])))
+            z[k] -= np.clip(np.nanmean(np.where(quiet, z[k], np.nan)), -usual, usual)
     each = {n: np.where(quiet, row, np.nan) for n, row in zip(r.y.names, z, strict=True)}
     for f in least(findings(each, margin=MARGIN), LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
@@ -336,18 +366,20 @@ def _hidden(side: ElectricalSide) -> Iterator[Doubt]:
 def _prior_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     """Gain errors, inertia and efficiency against what was stated of them."""
     r = tracked.result
-    names = [n for n in r.x.names if n.startswith("gain_")]
+    names = [n for n in r.x.names if n.startswith(("gain_", "bias_"))]
+    names = [n for n in names if n not in filt.model.consider]
     limit = float(-ndtri(LEVEL / 2 / max(len(names), 1)))
     jumped = "jump_PW" in filt.model.u.names
     for n in names:
-        x, s = float(r[n][0][-1]), filt.sigma[n]
+        x, walk = float(r[n][0][-1]), filt.model.walk[filt.model.x.index(n)]
+        s = math.hypot(filt.sigma[n], walk * math.sqrt(r.t[-1] - r.t[0]))
         if abs(x) > limit * s and not (n == "gain_PW" and jumped and tracked.alarms):
             what = {"gain_PW": "the generators' efficiency", "gain_J": "the inertia"}
             of = what.get(n, f"the sensor {n[5:]}")
+            size = f"{x:+.3g} {r.x[n].unit}" if n.startswith("bias_") else f"{100 * x:+.1f} %"
             yield Doubt(
                 "power" if n == "gain_PW" else "prior",
-                f"{n[5:]}: an error of {100 * x:+.1f} % is {abs(x) / s:.1f} times what was stated "
-                f"of {of}",
+                f"{n[5:]}: an error of {size} is {abs(x) / s:.1f} times what was stated of {of}",
             )
 
 
@@ -362,3 +394,34 @@ def _map_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     for n, v in zip(("compressor", "turbine"), y, strict=True):
         if not v <= 0:
             yield Doubt("maps", f"at the end the {n} runs off its map (by {v:.2g})")
+
+
+# ------------------------------------------------------------------------------ fits
+
+
+def fit_doubts(fit: EngineFit) -> Iterator[Doubt]:
+    """Say why the parameters of a fit are not to be believed, by residuals and bounds.
+
+    The residuals of a fit are smaller than those of the truth, so that the level is kept.
+
+    Args:
+        fit: of :func:`estimators.apu.fitting.fit_engine`.
+    """
+    r = fit.result
+    if r.freedom > 0 and r.p_value < LEVEL:
+        yield Doubt(
+            "innovations",
+            f"chi2 = {r.chi2:.4g} with {r.freedom} degrees of freedom: more than noise gives",
+        )
+    for k, name in enumerate(fit.names):
+        rest = {n: e for n, (_, _, e) in fit.series(k).items() if n in fit.lifted.model.y.names}
+        t = r.recordings[k].t
+        for f in least(findings(rest), LEVEL):
+            text = _GAS[f.test].format(v=f.value, t=float(t[f.at]))
+            text = text.replace("innovations", "residuals")
+            yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{name}: {f.sensor}: {text}")
+    for n in r.at_bound:
+        yield Doubt("linearisation", f"{n} is at its bound, where no interval holds")
+    for n, v in r.values.items():
+        if n.partition("[")[0] in HEALTH and abs(v - 1) > STEEP_FIT:
+            yield Doubt("linearisation", f"{n} = {v:.3f} is farther from 1 than any that was tried")

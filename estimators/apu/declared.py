@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from estimators.apu.electrical.terminalsignals import PHASES_V, VOLTAGES
+from estimators.apu.believable import Doubt
+from estimators.apu.electrical.terminalsignals import VOLTAGES
 from estimators.apu.recordings.measured import Channel, Measurements
 from estimators.apu.recordings.plausible import WAVES, clipped, plain
 from estimators.apu.sensorchain import interpolated, slopes
@@ -49,7 +50,7 @@ class Declared:
     gas_path: SensorSet
     electrical: SensorSet
     notes: tuple[str, ...]
-    doubts: tuple[str, ...]
+    doubts: tuple[Doubt, ...]
     late: float
     coarse: tuple[str, ...]
 
@@ -85,7 +86,7 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     Raises:
         DataError: nothing is left of a channel.
     """
-    notes, doubts = list[str](), list[str]()
+    notes, doubts = list[str](), list[Doubt]()
     channels: dict[str, Channel] = dict(m.channels)
     waves = {n: electrical[plain(n)] for n in m.electrical if plain(n) in electrical}
     slow = {n: gas_path[n] for n in m.gaspath if n in gas_path}
@@ -115,15 +116,14 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     )
 
 
-def _kept(c: Channel, s: Sensor, notes: list[str], doubts: list[str], *, wave: bool) -> Channel:
+def _kept(c: Channel, s: Sensor, notes: list[str], doubts: list[Doubt], *, wave: bool) -> Channel:
     """Return the channel without what is at the end of the range, and without expected errors."""
     limits = s.limits
     if limits is None and wave and np.isfinite(c.values).any() and (count := clipped(c.values)):
         limits = float(np.nanmin(c.values)), float(np.nanmax(c.values))
-        doubts.append(
-            f"{c.source}: {count} samples of {c.name} are clipped; declare its range in a file of "
-            "sensors if that is what it can show"
-        )
+        text = f"{c.source}: {count} samples of {c.name} are clipped"
+        how = "declare its range in a file of sensors if that is what it can show"
+        doubts.append(Doubt("sensor", f"{text}; {how}"))
     v = c.values if limits is None else _inside(c, limits, notes, BESIDE[wave])
     if s.bias_mean or s.gain_mean:
         v = (v - s.bias_mean) / (1.0 + s.gain_mean)
@@ -182,8 +182,8 @@ def _noisier(
     """Return a sensor of the generators with what is done to its readings as noise."""
     by = grown.get(s.name, 1.0)
     s = dataclasses.replace(s, noise=by * s.noise, quantum=by * s.quantum) if by != 1.0 else s
-    if not s.jitter or s.name not in (*PHASES_V, "V_fd", "w_r"):
-        return s  # of outputs each sample has its own noise
+    if not s.jitter:
+        return s
     each = [channels[n] for n in waves if plain(n) == s.name]
     fastest = max((float(slopes(c.t, c.values, wave=True).max()) for c in each), default=0.0)
     # two digits: the model of the filter is made for the number

@@ -22,9 +22,10 @@ import numpy as np
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, EstimationError, ParameterError, nearest
-from apu_casadi.core.sharing import kept, once
+from apu_casadi.core.sharing import keep, kept, once
 from apu_casadi.core.simulation import stepper
 from apu_casadi.gaspath.conditions import AMBIENT, DEFAULT_DAY
+from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
@@ -97,10 +98,25 @@ def engine_model(
         steady: every sample is an operating point, where no lag shows.
         sensors: those of the outputs that are no outputs of the engine themselves.
     """
+    which = outputs, gain, bias, steady, sensors
+    made = keep(gg.family, engine_model, which, lambda: _family_model(gg.family, *which))
+    return made.unit(made.model.unit(gg.state_space))
+
+
+def _family_model(
+    family: CycleFunctions,
+    outputs: tuple[str, ...],
+    gain: tuple[str, ...],
+    bias: tuple[str, ...],
+    steady: bool,
+    sensors: tuple[Sensor, ...],
+) -> Lifted:
+    """The lifted model of all engines of a family, its numbers among the parameters."""
     own = {s.name: s for s in sensors}
+    units = {s.name: s.unit for s in GasGenerator.Y}
 
     def read(m: FilterModel) -> FilterModel:
-        of = [own.get(n) or Sensor(n, 0.0, False, 0.0, gg.Y[n].unit, "") for n in outputs]
+        of = [own.get(n) or Sensor(n, 0.0, False, 0.0, units[n], "") for n in outputs]
         return lagging(m, [(s.signal, s.expression, s.reads, 0.0 if steady else s.tau) for s in of])
 
     def build(m: FilterModel) -> FilterModel:
@@ -108,7 +124,7 @@ def engine_model(
         m = gains(m, gain) if gain else m
         return biases(m, bias) if bias else m
 
-    return lift(gg.state_space, build, equations=gg.equations, steady=steady)
+    return lift(family.state_space, build, equations=family.equations, steady=steady)
 
 
 # ------------------------------------------------------------------------------ data

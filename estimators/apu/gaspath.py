@@ -123,6 +123,15 @@ class GasPathFilter(Parametric):
         """Sensors whose gain error is a state."""
         return tuple(n[5:] for n in self.model.x.names if n.startswith("gain_"))
 
+    def considered(self, name: str) -> float:
+        """Return the standard deviation of what considered errors add to a reading, its unit.
+
+        It stays in the innovations of that sensor, as an offset.
+        """
+        of = {n: self.sigma[n] for n in self.model.consider if n[5:] == name}
+        bias, gain = (of.get(f"{error}_{name}", 0.0) for error in ("bias", "gain"))
+        return math.hypot(bias, gain * self.model.y[name].nominal) if of else 0.0
+
     def prior(self, spread: Mapping[str, float] | None = None, /, **mean: float) -> Belief:
         """Return the belief before the first sample: healthy, at governed speed.
 
@@ -337,13 +346,9 @@ def gas_path_filter(
         sigma["PW"] = PW_PRIOR[1]
         walks["PW"] = PW_WALK
     sigma |= {f"gain_{n}": math.hypot(sensors[n].unsure("gain"), model_error) for n in named}
-    biased = [
-        s for s in sensors.sensors if s.biased and (s.name in sensors.outputs or s.name in held)
-    ]
+    biased, consider = _offsets(sensors, named, (*sensors.outputs, *held))
     sigma |= {f"bias_{s.name}": s.bias for s in biased}
     walks |= {f"bias_{s.name}": s.drift for s in biased if s.drift}
-    consider = tuple(f"gain_{n}" for n in named if sensors[n].gain_as == "considered")
-    consider += tuple(f"bias_{s.name}" for s in biased if s.bias_as == "considered")
     if inertia is not None and power == "measured":
         named = (*named, "J")
         sigma["gain_J"] = inertia
@@ -365,6 +370,16 @@ def gas_path_filter(
     )
     sigma |= {n: FREE_SIGMA * model.x[n].nominal for n in free or {}}
     return GasPathFilter(gg, sensors, model, sigma)
+
+
+def _offsets(
+    sensors: SensorSet, gained: Sequence[str], used: Sequence[str]
+) -> tuple[list[Sensor], tuple[str, ...]]:
+    """Sensors whose offset is a state, and states that are considered: of gains and offsets."""
+    biased = [s for s in sensors.sensors if s.biased and s.name in used]
+    consider = [f"gain_{n}" for n in gained if sensors[n].gain_as == "considered"]
+    consider += [f"bias_{s.name}" for s in biased if s.bias_as == "considered"]
+    return biased, tuple(consider)
 
 
 def samples(ds: xr.Dataset, dt: float = DT) -> tuple[np.ndarray, np.ndarray]:

@@ -1,10 +1,11 @@
 """One filter for the whole unit at 10 kHz: the check of the coupled pair on a short window.
 
 All that the two filters of :mod:`estimators.apu.joint` know apart is here one state: fluxes,
-rotor angle and severities of the generator, rotor speed and health factors of the gas generator,
-coupled by eqs. (1) and (2) at every sample instead of every 20 ms.  Nothing is handed over, so no
-correlation can be lost on the way.  The cycle is solved two hundred times as often; that is why it
-is a check.
+rotor angle and severities of the generators, rotor speed and health factors of the gas generator,
+coupled by eqs. (1) and (2) at every sample instead of every 20 ms.  Equal generators with equal
+loads are one; of others each has its own part, named ``generator2.h_a``.  Nothing is handed over,
+so no correlation can be lost on the way.  The cycle is solved two hundred times as often; that is
+why it is a check.
 
 The error of a fuel reading holds for 20 ms.  It is a state, drawn anew with every reading.
 """
@@ -12,22 +13,26 @@ The error of a fuel reading holds for 20 ms.  It is a state, drawn anew with eve
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from apu_casadi.core.errors import DataError, EstimationError
+from apu_casadi.core.results import GENERATOR, of_generator
 from apu_casadi.core.sharing import Parametric, kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import who
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.tracking import window_power
 from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples
 from estimators.apu.gaspathmodel import DT, GOVERNOR, engine_function
-from estimators.apu.joint import better_speed, electrical_samples, speed_from_generators
+from estimators.apu.joint import better_speed, electrical_samples, speed_from_generators, unit_of
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
@@ -51,82 +56,163 @@ class Monolithic(Parametric):
 
     Args:
         apu: the unit.
-        electrical, gas: the filters that it stands for; gains, inertia and efficiency known.
+        electrical, gas: the filters that it stands for, the first of each group of equal
+            generators; gains, inertia and efficiency known.
         model: their one model.
+        of: numbers of the generators of each group.
     """
 
     apu: Apu
-    electrical: ElectricalFilter
+    electrical: tuple[ElectricalFilter, ...]
     gas: GasPathFilter
     model: FilterModel
+    of: tuple[tuple[int, ...], ...]
 
     def recording(
-        self, fast: Recording, slow: Recording, w_r: np.ndarray, sigma: float
+        self,
+        fast: Sequence[Recording],
+        slow: Recording,
+        w_r: Sequence[np.ndarray],
+        sigma: Sequence[float],
     ) -> Recording:
-        """Merge the recordings of both filters and the pick-ups' speed, (K,) with its sigma.
+        """Merge the recordings of all filters and the pick-ups' speeds, (K,) with their sigmas.
 
-        The gas path's instants must be among the electrical ones.
+        One of each for each group; the gas path's instants must be among the electrical ones.
+
+        Raises:
+            DataError: another number of recordings, or other instants.
         """
-        m, K = self.model, fast.size
-        at = np.searchsorted(fast.t, slow.t - 1e-9)
-        row = np.searchsorted(slow.t, fast.t + 1e-9, side="right") - 1
-        ne = len(self.electrical.model.u)
-        u = np.zeros((len(m.u), K))
-        u[:ne] = fast.u
-        for n in ("Wf", "sigma_Wf", *AMBIENT):
-            u[m.u.index(n)] = slow.u[self.gas.model.u.index(n), row]
-        u[m.u.index("since")] = fast.t - slow.t[row]
+        t = fast[0].t
+        if not len(fast) == len(w_r) == len(sigma) == len(self.of):
+            raise DataError(f"{len(self.of)} recordings with speed expected, got {len(fast)}")
+        if any(not np.array_equal(f.t, t) for f in fast[1:]):
+            raise DataError("the generators were sampled at other instants")
+        m, K = self.model, t.size
+        at = np.searchsorted(t, slow.t - 1e-9)
+        row = np.searchsorted(slow.t, t + 1e-9, side="right") - 1
+        u, y = np.zeros((len(m.u), K)), np.full((len(m.y), K), np.nan)
+        variance = np.ones((len(m.y), K))
+        u[: sum(len(f.u) for f in fast)] = np.concatenate([f.u for f in fast])
+        for name in ("Wf", "sigma_Wf", *AMBIENT):
+            u[m.u.index(name)] = slow.u[self.gas.model.u.index(name), row]
+        u[m.u.index("since")] = t - slow.t[row]
         u[m.u.index("fresh"), at[1:] - 1] = 1.0
-        y, variance = np.full((len(m.y), K), np.nan), np.ones((len(m.y), K))
-        y[:4], variance[:4] = fast.y, fast.variance
-        y[4], variance[4] = w_r, sigma**2
-        y[5:, at], variance[5:, at] = slow.y, slow.variance
-        return Recording(fast.t, u, y, variance, np.zeros(0))
+        k = 0
+        for f, own, deviation in zip(fast, w_r, sigma, strict=True):
+            n = len(f.y)
+            y[k : k + n], variance[k : k + n] = f.y, f.variance
+            y[k + n], variance[k + n] = own, deviation**2
+            k += n + 1
+        y[k:, at], variance[k:, at] = slow.y, slow.variance
+        return Recording(t, u, y, variance, np.zeros(0))
 
-    def prior(self, electrical: Belief, gas: Belief) -> Belief:
-        """Put the beliefs of both filters together, uncorrelated."""
-        P = np.zeros((len(self.model.x), len(self.model.x)))
-        n, k = len(electrical.mean), len(electrical.mean) + len(gas.mean)
-        P[:n, :n], P[n:k, n:k], P[k, k] = electrical.cov, gas.cov, 1.0
-        return Belief(self.model.x, np.concatenate([electrical.mean, gas.mean, [0.0]]), P)
+    def prior(self, electrical: Sequence[Belief], gas: Belief) -> Belief:
+        """Put the beliefs of all filters together, uncorrelated."""
+        P, k = np.zeros((len(self.model.x), len(self.model.x))), 0
+        for belief in (*electrical, gas):
+            n = len(belief.mean)
+            P[k : k + n, k : k + n] = belief.cov
+            k += n
+        P[k, k] = 1.0
+        mean = np.concatenate([*(b.mean for b in electrical), gas.mean, [0.0]])
+        return Belief(self.model.x, mean, P)
 
     def run(self, prior: Belief, data: Recording, *, backend: str | None = None) -> FilterResult:
         """Filter a recording."""
         return extended_kalman_filter(self.model, prior, data, full=True, backend=backend)
 
 
+def _named(numbers: tuple[int, ...], signals: Iterable[Signal], alone: bool) -> list[Signal]:
+    """Return signals of a group under the names that they have in the unit."""
+    prefix, of = f"generator{numbers[0]}.", who(numbers)
+    if alone:
+        return [*signals]
+    return [dataclasses.replace(s, name=prefix + s.name, doc=f"{of}: {s.doc}") for s in signals]
+
+
+def _kept_noises(me: FilterModel) -> list[int]:
+    """Positions of an electrical filter's noises but that of the speed, which is the rotor's."""
+    return [i for i, n in enumerate(me.w.names) if n != "w_w_r"]
+
+
+def _signals(
+    of: Sequence[tuple[int, ...]], models: Sequence[FilterModel], mg: FilterModel
+) -> tuple[Signals, Signals, Signals, Signals]:
+    """Return x, u, w and y of the unit."""
+    x, u, w, y = list[Signal](), list[Signal](), list[Signal](), list[Signal]()
+    for k, me in zip(of, models, strict=True):
+        speed = dataclasses.replace(me.u["w_r"], default=None)
+        parts = ([*me.x], [*me.u], [me.w[i] for i in _kept_noises(me)], [*me.y, speed])
+        for all_of, own in zip((x, u, w, y), parts, strict=True):
+            all_of += _named(k, own, len(of) == 1)
+    fuel = (mg.u[n] for n in ("Wf", "sigma_Wf", *AMBIENT))
+    w.append(Signal("w_Wf", "1", "error of the next fuel reading"))
+    return (
+        Signals([*x, *mg.x, _ERROR]),
+        Signals([*u, *fuel, _SINCE, _FRESH]),
+        Signals(w),
+        Signals([*y, *mg.y]),
+    )
+
+
 @kept
-def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter) -> Monolithic:
-    """Make the filter of the whole unit from its two parts.
+def monolithic_filter(
+    apu: Apu,
+    electrical: ElectricalFilter | tuple[ElectricalFilter, ...],
+    gas: GasPathFilter,
+    of: tuple[tuple[int, ...], ...] | None = None,
+) -> Monolithic:
+    """Make the filter of the whole unit from its parts.
 
     Args:
         apu: the unit.
-        electrical: with ``power=True`` and without gains.
+        electrical: with ``power=True`` and without gains; of all generators, or of each group.
         gas: with measured power, without gains, inertia or efficiency among its states.
+        of: numbers of the generators of each group; default all in one, or each on its own.
+
+    Raises:
+        EstimationError: another number of filters than groups, or a generator in none or in two.
     """
-    me, mg, gg = electrical.model, gas.model, gas.gg
-    kept_w = [i for i, n in enumerate(me.w.names) if n != "w_w_r"]
-    X = me.x + mg.x + Signals([_ERROR])
-    U = me.u + Signals([*(mg.u[n] for n in ("Wf", "sigma_Wf", *AMBIENT)), _SINCE, _FRESH])
-    W = Signals([*(me.w[i] for i in kept_w), Signal("w_Wf", "1", "error of the next fuel reading")])
-    Y = Signals([*me.y, dataclasses.replace(me.u["w_r"], default=None), *mg.y])
+    each = (electrical,) if isinstance(electrical, ElectricalFilter) else tuple(electrical)
+    numbers = tuple(range(1, len(apu.machines) + 1))
+    if of is None:
+        of = (numbers,) if len(each) == 1 else tuple((k,) for k in numbers)
+    if len(of) != len(each) or sorted(k for group in of for k in group) != [*numbers]:
+        raise EstimationError(
+            f"{len(each)} electrical filters for generators {of}: one for each group is needed, "
+            f"and each of the generators 1 to {len(numbers)} in one of them"
+        )
+    for group in of:
+        if len({apu.machines[k - 1] for k in group}) > 1:
+            raise EstimationError(
+                f"{who(group)} differ: one electrical filter cannot stand for them"
+            )
+    mg, gg, models = gas.model, gas.gg, [f.model for f in each]
+    X, U, W, Y = _signals(of, models, mg)
     x, u, w = (ca.MX.sym(n, len(s)) for n, s in (("x", X), ("u", U), ("w", W)))
     p, dt = ca.MX.sym("p", 0), ca.MX.sym("dt")
-    ne = len(me.x)
     at = dict(zip(X.names, ca.vertsplit(x), strict=True))
     given = dict(zip(U.names, ca.vertsplit(u), strict=True))
     N, health = at["N"], ca.vertcat(*(at[n] for n in HEALTH))
-    # the generator at the speed of the rotor, (2)
-    known = dict(zip(me.u.names, ca.vertsplit(u[: len(me.u)]), strict=True))
-    u_e = me.u.stack(known | {"w_r": apu.w_r(N), "keep": ca.MX(0)})
-    w_e = ca.MX.zeros(len(me.w))
-    for j, i in enumerate(kept_w):
-        w_e[i] = w[j]
-    x_e, check_e = me.transition(x[:ne], u_e, p, w_e, dt)
-    y_e, _ = me.output(x[:ne], u_e, p, w_e)
-    # its power of this step loads the rotor, (1)
-    energy = me.x.index("energy")
-    PW = apu.PW(x_e[energy]) / ca.fmax(dt, 1e-12)
+    moved, seen, checks, power = [], [], [], []
+    i = j = n = 0
+    for group, me in zip(of, models, strict=True):
+        link, ne, keep = apu.link_of(group), len(me.x), _kept_noises(me)
+        # the generators at the speed of the rotor, (2)
+        known = dict(zip(me.u.names, ca.vertsplit(u[j : j + len(me.u)]), strict=True))
+        u_e = me.u.stack(known | {"w_r": link.w_r(N), "keep": ca.MX(0)})
+        w_e = ca.MX.zeros(len(me.w))
+        for k, own in enumerate(keep):
+            w_e[own] = w[n + k]
+        x_e, check_e = me.transition(x[i : i + ne], u_e, p, w_e, dt)
+        y_e, _ = me.output(x[i : i + ne], u_e, p, w_e)
+        moved.append(x_e)
+        seen += [y_e, link.w_r(N)]
+        checks.append(check_e)
+        power.append(link.PW(x_e[me.x.index("energy")]) / ca.fmax(dt, 1e-12))
+        i, j, n = i + ne, j + len(me.u), n + len(keep)
+    # their power of this step loads the rotor, (1)
+    PW = sum(power[1:], power[0])
     Wf = given["Wf"] - given["sigma_Wf"] * at["error_Wf"]
     engine = engine_function(gg.cycle)
     inputs: dict[str, Any] = {n: given[n] for n in AMBIENT} | {"PW": PW, "Wf": Wf}
@@ -136,13 +222,47 @@ def monolithic_filter(apu: Apu, electrical: ElectricalFilter, gas: GasPathFilter
     now = inputs | {"Wf": Wf + given["since"] * slope}
     k2, _, check_2, _ = engine(N, gg.U.stack(now), health)
     error = (1 - given["fresh"]) * at["error_Wf"] + given["fresh"] * w[len(W) - 1]
-    x1 = ca.vertcat(x_e, N + dt * k2, health, error)
-    y = ca.vertcat(y_e, apu.w_r(N), N, y_g)
-    step, output = (x1, check_e + check + check_2), (y, check_y)
+    x1 = ca.vertcat(*moved, N + dt * k2, health, error)
+    y = ca.vertcat(*seen, N, y_g)
+    step, output = (x1, sum(checks[1:], checks[0]) + check + check_2), (y, check_y)
     model = FilterModel.of("unit", (X, U, Signals(), W, Y), (x, u, p, w, dt), step, output)
-    walks = zip(X.names, np.concatenate([me.walk, mg.walk, [0.0]]), strict=True)
-    model = model.with_walk(dict(walks))
-    return Monolithic(apu, electrical, gas, model)
+    walk = np.concatenate([*(me.walk for me in models), mg.walk, [0.0]])
+    model = model.with_walk(dict(zip(X.names, walk, strict=True)))
+    return Monolithic(apu, each, gas, model, of)
+
+
+class _Side(NamedTuple):
+    """The electrical filter of a group of generators along a run."""
+
+    prefix: str
+    numbers: tuple[int, ...]
+    filt: ElectricalFilter
+    samples: Mapping[str, np.ndarray]
+    data: Recording
+    prior: Belief
+    found: FilterResult
+    power: tuple[np.ndarray, np.ndarray]
+    sigma: float
+
+
+def _sides(ds: xr.Dataset, seed: int, apu: Apu, start: float) -> list[_Side]:
+    numbers = tuple(range(1, len(apu.machines) + 1))
+    of = [(k,) for k in numbers] if GENERATOR in ds.dims else [numbers]
+    made = []
+    for group in of:
+        k, alone = group[0], len(of) == 1
+        unit = unit_of(apu, k)
+        filt = electrical_filter(unit.generator.machine, power=True)
+        rng = np.random.default_rng([seed, 1] if k == 1 else [seed, 1, k])
+        samples = electrical_samples(of_generator(ds, k), unit, rng)
+        data = filt.recording(samples, window=DT, start=start)
+        first = filt.prior(samples)
+        found = extended_kalman_filter(filt.model, first, data)
+        _, P, var = window_power(filt, found, data)
+        sigma = ELECTRICAL.sigma("w_r", float(np.median(samples["w_r"])))
+        prefix = "" if alone else f"generator{k}."
+        made.append(_Side(prefix, group, filt, samples, data, first, found, (P, var), sigma))
+    return made
 
 
 def compare_monolithic(ds: xr.Dataset, seed: int, *, apu: Apu | None = None) -> dict[str, Any]:
@@ -157,32 +277,32 @@ def compare_monolithic(ds: xr.Dataset, seed: int, *, apu: Apu | None = None) -> 
         apu: the unit.
 
     Returns:
-        For N, the factors and h_a, h_b, h_c: ``difference_max``, largest difference of the means
-        over the coupled sigma, from the fifth window on; ``sigma_ratio``, monolithic over coupled
-        at the end.  ``correlation``: largest correlation of an electrical with a gas-path state at
-        the end, which the coupled pair does not carry.
+        For N, the factors and h_a, h_b, h_c (of each generator where they differ,
+        ``generator2.h_a``): ``difference_max``, largest difference of the means over the coupled
+        sigma, from the fifth window on; ``sigma_ratio``, monolithic over coupled at the end.
+        ``correlation``: largest correlation of an electrical with a gas-path state at the end,
+        which the coupled pair does not carry.
     """
     apu = Apu() if apu is None else apu
-    electrical = electrical_filter(apu.generator.machine, power=True)
     gas = gas_path_filter(apu.gas_generator, gains=False, inertia=None)
-    samples_fast = electrical_samples(ds, apu, np.random.default_rng([seed, 1]))
     t, _ = samples(ds)
-    fast = electrical.recording(samples_fast, window=DT, start=float(t[0]))
-    first = electrical.prior(samples_fast)
-    found = extended_kalman_filter(electrical.model, first, fast)
-    _, P, var = window_power(electrical, found, fast)
-    slow = gas.recording(
-        ds,
-        np.random.default_rng([seed, 2]),
-        power=(apu.PW(P), np.sqrt(var) / apu.coupling.eta_gtSg),
-    )
-    sigma = ELECTRICAL.sigma("w_r", float(np.median(samples_fast["w_r"])))
-    speed = speed_from_generators(samples_fast["t"], samples_fast["w_r"], sigma, t, apu)
+    sides = _sides(ds, seed, apu, float(t[0]))
+    links = [apu.link_of(s.numbers) for s in sides]
+    PW = sum(link.PW(x.power[0]) for link, x in zip(links, sides, strict=True))
+    var = sum(link.PW(1.0) ** 2 * x.power[1] for link, x in zip(links, sides, strict=True))
+    slow = gas.recording(ds, np.random.default_rng([seed, 2]), power=(PW, np.sqrt(var)))
+    better = slow
+    for side in sides:
+        own, unit = side.samples, unit_of(apu, side.numbers[0])
+        speed = speed_from_generators(own["t"], own["w_r"], side.sigma, t, unit)
+        better = better_speed(gas, better, *speed)
     before = gas.prior()
-    pair = gas.run(better_speed(gas, slow, *speed), prior=before)
-    whole = monolithic_filter(apu, electrical, gas)
-    data = whole.recording(fast, slow, samples_fast["w_r"], sigma)
-    one = whole.run(whole.prior(first, before), data)
+    pair = gas.run(better, prior=before)
+    filters, of = tuple(x.filt for x in sides), tuple(x.numbers for x in sides)
+    whole = monolithic_filter(apu, filters, gas, of)
+    speeds, sigmas = [x.samples["w_r"] for x in sides], [x.sigma for x in sides]
+    data = whole.recording([x.data for x in sides], slow, speeds, sigmas)
+    one = whole.run(whole.prior([x.prior for x in sides], before), data)
     assert one.cov is not None
     at = np.searchsorted(one.t, t - 1e-9)
     out: dict[str, Any] = {}
@@ -192,14 +312,15 @@ def compare_monolithic(ds: xr.Dataset, seed: int, *, apu: Apu | None = None) -> 
             "difference_max": float(np.abs((m[at] - m2) / s2)[5:].max()),
             "sigma_ratio": float(s[-1] / s2[-1]),
         }
-    for n in ("h_a", "h_b", "h_c"):
-        (m, s), (m2, s2) = one[n], found[n]
-        out[n] = {
-            "difference_max": float(np.abs((m - m2) / s2)[at[5] :].max()),
-            "sigma_ratio": float(s[-1] / s2[-1]),
-        }
+    for side in sides:
+        for n in ("h_a", "h_b", "h_c"):
+            (m, s), (m2, s2) = one[f"{side.prefix}{n}"], side.found[n]
+            out[f"{side.prefix}{n}"] = {
+                "difference_max": float(np.abs((m - m2) / s2)[at[5] :].max()),
+                "sigma_ratio": float(s[-1] / s2[-1]),
+            }
     C = one.cov[-1]
     size = np.sqrt(np.maximum(np.diag(C), np.finfo(float).tiny))
-    e = len(electrical.model.x)
+    e = sum(len(x.filt.model.x) for x in sides)
     out["correlation"] = float(np.abs(C / np.outer(size, size))[:e, e:].max())
     return out

@@ -69,7 +69,7 @@ from estimators.apu.recorded_report import (
 )
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
-from estimators.apu.sensors import ELECTRICAL, SensorSet, gas_path_table
+from estimators.apu.sensors import ELECTRICAL, SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
@@ -189,7 +189,7 @@ def estimate(
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
     notes = [*m.notes, *ready.notes]
-    doubts = [*ready.doubts, *channel_doubts(m, table, ready.coarse)]
+    doubts = list[str]([*ready.doubts, *channel_doubts(m, table, ready.coarse)])
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     causes: dict[str, tuple[Causes, ...]] = {}
@@ -229,37 +229,40 @@ def estimate(
     return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
 
 
+def gas_path_data(
+    m: Measurements,
+    engine: Apu | str | Path | None = None,
+    *,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
+    ambient: Mapping[str, float] | None = None,
+    prior: Prior | str | Path | None = None,
+) -> tuple[GasPathFilter, Recording, Belief, tuple[str, ...]]:
+    """Return the gas-path filter that a recording suffices for, its data, its prior, and notes.
+
+    Args:
+        m, engine, sensors, ambient, prior: as of :func:`estimate`.
+
+    Raises:
+        ParameterError, DataError: as of :func:`estimate`; the recording has no gas path.
+    """
+    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    ready = as_declared(m, *tables(m, sensors, ELECTRICAL))
+    if reason := _no_gas_path(ready.m, ready.gas_path):
+        raise DataError(f"no gas path: {reason}")
+    notes = [*m.notes, *ready.notes, *ready.doubts]
+    given = ambient or {}, notes, notes, None, start, 0.0
+    path = _GasPath(ready.m, apu, ready.gas_path, *given)
+    filt, data, begin = path.alone()
+    return filt, data, begin, tuple(dict.fromkeys(notes))
+
+
 def _told(
     found: Iterable[tuple[Causes, Doubt | None]],
 ) -> tuple[tuple[Causes, ...], list[Doubt]]:
     """Part causes from the doubts that they raise."""
     both = list(found)
     return tuple(c for c, _ in both), [d for _, d in both if d is not None]
-
-
-def gas_path_data(
-    m: Measurements,
-    engine: Apu | str | Path | None = None,
-    *,
-    sensors: SensorSet | None = None,
-    ambient: Mapping[str, float] | None = None,
-) -> tuple[GasPathFilter, Recording, Belief, tuple[str, ...]]:
-    """Return the gas-path filter that a recording suffices for, its data, its prior, and notes.
-
-    Args:
-        m, engine, sensors, ambient: as of :func:`estimate`.
-
-    Raises:
-        ParameterError, DataError: as of :func:`estimate`; the recording has no gas path.
-    """
-    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    table = gas_path_table().including(*m.gaspath) if sensors is None else sensors
-    if reason := _no_gas_path(m, table):
-        raise DataError(f"no gas path: {reason}")
-    notes = list(m.notes)
-    path = _GasPath(m, apu, table, ambient or {}, notes, [], None, Prior(), ETA_SIGMA)
-    filt, data, prior = path.ready()
-    return filt, data, prior, tuple(dict.fromkeys(notes))
 
 
 def _fusable(
@@ -422,15 +425,10 @@ class _GasPath:
     ) -> tuple[GasPathFilter, Tracked]:
         """Filter, with the power of the electrical side where there is one."""
         sides = list(of.values())
-        power = bool(sides) or ("PW" in self.m and "PW" in self.table)
-        # speed and the measured inputs stay in the table
-        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
-        sensors = self.table.only([n for n in self.table.names if n not in absent])
-        inputs = self._inputs()
+        power = bool(sides) or self._power_measured
+        sensors, inputs = self._there(), self._inputs()
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
-        if not power:
-            self.notes.append("no shaft power was measured: it is a random walk")
         if sides:
             own = self.m.machine(next(iter(of))).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
@@ -455,18 +453,27 @@ class _GasPath:
         how: dict[str, Any] = {"step": ROBUST, "test": JUMPS, "backend": self.backend}
         return filt, track_jumps(filt, data, prior=start, **how)
 
-    def ready(self) -> tuple[GasPathFilter, Recording, Belief]:
-        """The filter without electrical side, its recording, and its prior."""
-        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
-        sensors = self.table.only([n for n in self.table.names if n not in absent])
-        power, inputs = "PW" in self.m, self._inputs()
+    def alone(self) -> tuple[GasPathFilter, Recording, Belief]:
+        """Return the filter without an electrical side, its recording, and its prior."""
+        sensors, power, inputs = self._there(), self._power_measured, self._inputs()
         span = (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power)
         return self._ready(sensors, readings, inputs, power)
 
+    @property
+    def _power_measured(self) -> bool:
+        return "PW" in self.m and "PW" in self.table
+
+    def _there(self) -> SensorSet:
+        """The sensors that were measured; speed and the measured inputs stay in the table."""
+        absent = [n for n in self.table.outputs if n not in self.m and n != "N"]
+        return self.table.only([n for n in self.table.names if n not in absent])
+
     def _ready(
         self, sensors: SensorSet, readings: Streams, inputs: Mapping[str, Any], power: bool
     ) -> tuple[GasPathFilter, Recording, Belief]:
+        if not power:
+            self.notes.append("no shaft power was measured: it is a random walk")
         filt = gas_path_filter(
             self.apu.gas_generator,
             sensors,

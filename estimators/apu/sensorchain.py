@@ -160,5 +160,7 @@ def slopes(t: np.ndarray, v: np.ndarray, *, wave: bool) -> np.ndarray:
 
 def spread(s: Sensor, t: np.ndarray, v: np.ndarray, *, wave: bool = False) -> np.ndarray:
     """Return the standard deviation of all that is white in each reading, jitter included."""
-    sigma = np.broadcast_to(s.sigma(v), v.shape)
-    return np.hypot(sigma, s.jitter * slopes(t, v, wave=wave)) if s.jitter else sigma
+    if not s.jitter:
+        return np.broadcast_to(s.sigma(v), v.shape)
+    constant = np.hypot(s.white(v), s.quantum / math.sqrt(12))
+    return np.asarray(np.hypot(constant, s.jitter * slopes(t, v, wave=wave)))

@@ -93,7 +93,7 @@ class Sensor:
         limits: lowest and highest value that it can show, unit; there it saturates.
         factor: reading over what it reads: ``unit`` over that of the output.
         fails: whether it can fail; hypotheses of failures are about those that can.
-        extra: further white noise in a recording, unit: what jitter makes of its slope.
+        extra: further white noise in a recording, unit: what jitter makes of its fastest change.
 
     Raises:
         ParameterError: a number out of range, several outputs without ``value``.

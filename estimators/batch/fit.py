@@ -32,6 +32,7 @@ from scipy.sparse.linalg import splu
 from apu_casadi.core.errors import EstimationError, ParameterError, nearest
 from apu_casadi.core.sharing import Rebuilt, building
 from estimators.batch.fitresult import FitResult, FittedRecording, Profile
+from estimators.batch.programs import full, program
 from estimators.batch.transcription import Solution, Transcription
 from estimators.batch.undetermined import invert
 from estimators.filters.belief import Belief
@@ -117,7 +118,7 @@ class FitProblem(Rebuilt):
                 "parameters and name them in consider"
             )
         self.estimate, self.own, self.consider = tuple(estimate), tuple(own), tuple(consider)
-        self.program = Transcription(
+        self.program = program(
             self.lifted,
             sizes,
             (*estimate, *consider),
@@ -237,8 +238,9 @@ class FitProblem(Rebuilt):
         each = list(beliefs) if beliefs else [None] * len(recordings)
         x = [self._states(r, b, g) for r, b, g in zip(recordings, each, given, strict=True)]
         z_lower, z_upper = self._limits(lower, upper)
-        data = program.data(recordings, mean=mean, weight=weight, beliefs=beliefs)
-        z0 = program.guess(recordings, theta, x)
+        told = full(self.lifted, recordings)
+        data = program.data(told, mean=mean, weight=weight, beliefs=beliefs)
+        z0 = program.guess(told, theta, x)
         found = program.solve(data, z0, z_lower, z_upper, max_iterations=max_iterations)
         return self._result(found, recordings, weight, sigma_c, z_lower, z_upper, exact)
 

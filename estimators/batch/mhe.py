@@ -25,6 +25,7 @@ from apu_casadi.core.backend import compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError
 from apu_casadi.core.sharing import Rebuilt, building, kept
+from estimators.batch.programs import program
 from estimators.batch.transcription import Solution, Transcription
 from estimators.filters.algebra import root_of
 from estimators.filters.belief import Belief
@@ -125,8 +126,8 @@ class HorizonEstimator(Rebuilt):
                 "estimated by a moving horizon; leave them out, or estimate them with their prior"
             )
         self.model, self.horizon, self.max_iterations = model, horizon, max_iterations
-        self.program = Transcription(lifted, [horizon], prior=True, backend=backend, build=build)
-        step = _along(model)
+        self.program = program(lifted, [horizon], prior=True, backend=backend, build=build)
+        step = _along(self.program.model)
         self._step = Caller(compiled(step, backend=backend, build=build))
         window = step.mapaccum(f"{step.name()}_window", horizon, 2)
         self._window = Caller(compiled(window, backend=backend, build=build))
@@ -155,7 +156,8 @@ class HorizonEstimator(Rebuilt):
         y = np.where(missing, 0.0, data.y)[:, index]
         R = np.where(inside, np.where(missing, -1.0, data.variance)[:, index], -1.0)
         u, dt = data.u[:, index], np.where(inside, data.dt[index], 0.0)
-        p = np.repeat(data.p[:, None], N, axis=1)
+        numbers = data.p if self.program.model is model else model.full(data.p)
+        p = np.repeat(numbers[:, None], N, axis=1)
         mean, var, mean_pred = (np.empty((nx, K)) for _ in range(3))
         innovation, S = np.full((ny, K), np.nan), np.full((ny, K), np.nan)
         stats = np.empty((3, K))
@@ -169,7 +171,7 @@ class HorizonEstimator(Rebuilt):
             i, at = k - s, slice(s, s + N)
             mean_pred[:, k], cov_pred[k] = mp, Lp @ Lp.T
             now = _Along(
-                *self._step(mp, Lp, mp, np.zeros(nw), u[:, k], data.p, y[:, k], R[:, k], dt[k])
+                *self._step(mp, Lp, mp, np.zeros(nw), u[:, k], numbers, y[:, k], R[:, k], dt[k])
             )
             there = ~missing[:, k]
             innovation[there, k] = now.nu[there]

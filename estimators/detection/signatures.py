@@ -206,7 +206,7 @@ def linearised(
     place = [where[j.kind].index(j.name) for j in jumps]
     rates, outs = _jacobians(model, backend)
     missing = np.isnan(data.y)
-    p = data.p[:, None]
+    p = model.full(data.p)[:, None]
     h, Hx, Hw, Hp = _stacks(
         outs(r.mean_pred, data.u, p, np.zeros((nw, 1))), [(ny, 1), (ny, nx), (ny, nw), (ny, np_)], K
     )
@@ -242,22 +242,33 @@ def linearised(
 
 
 def _jacobians(model: FilterModel, backend: str | None) -> tuple[Any, Any]:
-    """Batch forms of the Jacobians of transition and output; kept with the model's functions."""
-    key = model.output, backend, backend_in_use()
-    return keep(model.transition, _jacobians, key, lambda: _build_jacobians(model, backend))
+    """Batch forms of the Jacobians of transition and output; kept with the family's functions."""
+    made, names = model.shared, model.p.names
+    key = made.output, names, backend, backend_in_use()
+    return keep(made.transition, _jacobians, key, lambda: _build_jacobians(made, names, backend))
 
 
-def _build_jacobians(model: FilterModel, backend: str | None) -> tuple[Any, Any]:
+def _build_jacobians(
+    model: FilterModel, names: Sequence[str], backend: str | None
+) -> tuple[Any, Any]:
+    """Derivatives by states, noises and the parameters ``names``, whatever else p has."""
     x, u, p, w, dt = model.symbols()
-    x1, _ = model.transition(x, u, p, w, dt)
-    y, _ = model.output(x, u, p, w)
+    # a move of some of the parameters, by which alone is differentiated
+    d, spread = ca.MX.sym("d", len(names)), ca.DM(len(model.p), len(names))
+    for j, i in enumerate(model.p.indices(names)):
+        spread[i, j] = 1
+    moved = p + ca.mtimes(spread, d)
+    x1, _ = model.transition(x, u, moved, w, dt)
+    y, _ = model.output(x, u, moved, w)
 
     def made(name: str, args: list[Any], of: list[Any]) -> Any:
         columns = [ca.vec(ca.densify(e)) for e in of]
+        still = ca.Function(f"{name}_moved", [*args, d], columns)(*args, ca.DM.zeros(len(names)))
+        columns = [*still] if isinstance(still, tuple | list) else [still]
         return mapped(compiled(ca.Function(name, args, columns), backend=backend), 1)
 
-    rates = made(f"{model.name}_df", [x, u, p, w, dt], [ca.jacobian(x1, v) for v in (x, w, p)])
-    outs = made(f"{model.name}_dg", [x, u, p, w], [y, *(ca.jacobian(y, v) for v in (x, w, p))])
+    rates = made(f"{model.name}_df", [x, u, p, w, dt], [ca.jacobian(x1, v) for v in (x, w, d)])
+    outs = made(f"{model.name}_dg", [x, u, p, w], [y, *(ca.jacobian(y, v) for v in (x, w, d))])
     return rates, outs
 
 

@@ -17,8 +17,8 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.backend import backend_in_use, compiled
-from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, SignalError
+from apu_casadi.core.lanes.together import Course, Question, Together, alone
 from apu_casadi.core.results import dataset
 from apu_casadi.core.sharing import Parametric, derived, kept
 from apu_casadi.core.signals import Signal, Signals
@@ -282,8 +282,10 @@ def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) 
 
 
 @kept
-def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> ca.Function:
-    """``BLOCK`` steps in one function; ``_in_use`` keeps the forms of each backend apart.
+def _block(
+    step: FilterStep, full: bool, backend: str | None, _in_use: str
+) -> tuple[ca.Function, ca.Function]:
+    """``BLOCK`` steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
 
     (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
     before each sample and C, S; matrices as columns.
@@ -305,7 +307,8 @@ def _block(step: FilterStep, full: bool, backend: str | None, _in_use: str) -> c
     name = f"{step.function.name()}{'_full' if full else ''}"
     out = [o["m1"], o["P1"], *(ca.densify(k) for k in kept)]
     one = ca.Function(f"{name}_one", [m, P, u, y, R, dt, p], out)
-    return compiled(block_of(one, name, 2), backend=backend)
+    block = block_of(one, name, 2)
+    return compiled(block, backend=backend), block
 
 
 def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:
@@ -346,6 +349,22 @@ def run(
         EstimationError: the model could not be evaluated, or the belief is no longer finite; names
             the instant and the state.
     """
+    return alone(course(step, prior, data, full=full, backend=backend, progress=progress))
+
+
+def course(
+    step: FilterStep,
+    prior: Belief,
+    data: Recording,
+    *,
+    full: bool = False,
+    backend: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Course[FilterResult]:
+    """Do what :func:`run` does, and pause where many filters are evaluated together.
+
+    See :mod:`estimators.filters.filterensemble`.
+    """
     model = step.model
     data.check(model)
     if prior.x.names != model.x.names:
@@ -368,7 +387,7 @@ def run(
         s = slice(b * BLOCK, (b + 1) * BLOCK)
         n = min(BLOCK, K - b * BLOCK)
         r = slice(b * BLOCK, b * BLOCK + n)
-        out = passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], p)
+        out = yield from passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], p)
         for target, source in (
             (mean, out[2]),
             (var, out[3][:: nx + 1]),
@@ -415,7 +434,7 @@ class _Passes:
         self.m = prior.mean.copy()
         self.P = prior.cov.copy()
         # the buffers are this run's own: runs may be nested, or go on in several threads
-        self.calls: dict[bool, Caller] = {}
+        self.calls: dict[bool, Together] = {}
         self.done = 0
         root = prior.root
         if step.root or (step.wide is not None and (root is not None or narrow(prior.cov))):
@@ -434,26 +453,31 @@ class _Passes:
             assert self.step.wide is not None
             self.now = self.step.wide()
 
-    def _call(self, *args: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _call(self, *args: np.ndarray) -> Course[tuple[np.ndarray, ...]]:
         if self.rooted not in self.calls:
-            block = _block(self.now.shared, self.full, self.backend, backend_in_use())
-            self.calls[self.rooted] = Caller(block, copy=False)
-        return self.calls[self.rooted](self.m, self.P, *args)
+            blocks = _block(self.now.shared, self.full, self.backend, backend_in_use())
+            self.calls[self.rooted] = Together(*blocks)
+        while True:
+            try:
+                return self.calls[self.rooted](self.m, self.P, *args)
+            except Question as question:
+                asked = question
+            yield asked
 
     def block(
         self, u: np.ndarray, y: np.ndarray, R: np.ndarray, dt: np.ndarray, p: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
+    ) -> Course[tuple[np.ndarray, ...]]:
         """Return the outputs of one block, and go on to the next."""
         if self.rooted and not self.step.root and not narrow(self.P, root=True):
             # well enough known in all directions: on with the covariance
             self.P, self.now = self.P @ self.P.T, self.step
-        out = self._call(u, y, R, dt, p)
+        out = yield from self._call(u, y, R, dt, p)
         nx = self.m.size
         self.done += 1
         ends = self.done % 4 == 1
         if self.step.wide is not None and not self.rooted and _lossy(out, R, nx, ends):
             self._root(root_of(self.P))
-            out = self._call(u, y, R, dt, p)
+            out = yield from self._call(u, y, R, dt, p)
         self.m, self.P = out[0].ravel().copy(), out[1].reshape(nx, nx).copy()
         return out
 

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError, SignalError
-from apu_casadi.core.sharing import Parametric, building, remade
+from apu_casadi.core.sharing import Parametric, building, of_family, remade
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
 from estimators.models.filtermodel import FilterModel, discretise
@@ -65,12 +65,40 @@ class Lifted(Parametric):
             )
 
     @property
+    def family(self) -> Lifted | None:
+        """The same of the model's family, of which programs are made; None if it has none."""
+        return self.__dict__.get("_family")
+
+    @property
+    def shared(self) -> Lifted:
+        """The family's, or this one if it has none."""
+        return self if self.family is None else self.family
+
+    def unit(self, like: FilterModel) -> Lifted:
+        """Return the lifted form of a model of this one's family."""
+        x, u, p, w, dt = like.symbols()
+        s, k = ca.MX.sym("s", len(self.s)), ca.MX.sym("k", self.frozen.size1_out(0))
+        full, at = like.full(p), [x, s, u]
+        stage = self.stage.call([*at, full, w, dt, k])
+        made = Lifted(
+            like,
+            self.s,
+            ca.Function(self.stage.name(), [*at, p, w, dt, k], stage, *_STAGE),
+            ca.Function(self.frozen.name(), [*at, p, w, dt], [self.frozen(*at, full, w, dt)]),
+            ca.Function(self.start.name(), [x, u, p], [self.start(x, u, full)]),
+            self.steady,
+        )
+        made.__dict__["_family"] = self
+        return made
+
+    @property
     def n_c(self) -> int:
         """Number of constraints of a stage."""
         return int(self.stage.size1_out(2))
 
 
 @remade
+@of_family
 def plain(model: FilterModel) -> Lifted:
     """Return a filter's model as it is, nothing lifted."""
     model = model.expanded()
@@ -288,20 +316,31 @@ def _split(equations: ca.Function) -> tuple[ca.Function, ca.Function]:
     if (
         smooth != [True] * 4 + [False] * (n - 4)
         or not inner.is_a("SXFunction")
-        or not all(ca.is_equal(call.dep(i), args[i]) for i in range(4))
+        or not all(ca.is_equal(call.dep(i), args[i]) for i in range(3))
+        or not _only(call.dep(3), args[3])
         or not all(o.which_output() == i for i, o in enumerate(out) if o.is_output())
     ):
         return whole
-    more = [call.dep(i) for i in range(4, n)]
-    found = [d for d in more if not d.is_constant()]  # the numbers of a unit are no part of k
+    # numbers of the unit, and theta's parts, are no part of k
+    deps = [call.dep(i) for i in range(3, n)]
+    held = [_only(d, args[3]) for d in deps]
+    found = [d for d, h in zip(deps, held, strict=True) if not h]
     k = ca.SX.sym("k", sum(d.size1() for d in found))
     given = [ca.SX.sym("q", m) for m in sizes]
     pieces = iter(ca.vertsplit(k, [0, *np.cumsum([d.size1() for d in found]).tolist()]))
-    rest = [ca.SX(d.to_DM()) if d.is_constant() else next(pieces) for d in more]
+    of_theta = ca.Function("theta", args[3:], [d for d, h in zip(deps, held, strict=True) if h])
+    known = of_theta.expand().call(given[3:], True, False)
+    parts = iter(known)
+    rest = [next(parts) if h else next(pieces) for h in held]
     return (
-        ca.Function("smooth", [*given, k], inner.call([*given, *rest], True, False)),
+        ca.Function("smooth", [*given, k], inner.call([*given[:3], *rest], True, False)),
         ca.Function("cells", args, [ca.vertcat(*found)]),
     )
+
+
+def _only(expression: ca.MX, symbol: ca.MX) -> bool:
+    """Whether an expression has no other symbol, be it differentiated by it or not."""
+    return all(ca.is_equal(v, symbol) for v in ca.symvar(expression))
 
 
 def _sorted(

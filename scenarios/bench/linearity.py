@@ -1,4 +1,4 @@
-"""Cost against what is asked for: simulated time, number of runs, output rate."""
+"""Cost against what is asked for: simulated time, runs one by one and together, output rate."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from apu_casadi.core import files
+from apu_casadi.unit.ensemble import simulate_ensemble
+from scenarios.bench.laneparts import asked_of
 from scenarios.bench.measuring import Row, Size, timed
 from scenarios.bench.runparts import simulate
 from scenarios.campaigns import random_faults, run_campaign
@@ -19,7 +21,7 @@ Curves = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def linear(size: Size) -> Curves:
-    """Cost against simulated time, number of runs and output rate: x and seconds of each."""
+    """Cost against simulated time, number of runs, members and output rate: x and seconds."""
     s = size.joint
     repeats = min(3, size.repeats)
     made: Curves = {}
@@ -37,6 +39,12 @@ def linear(size: Size) -> Curves:
         runs = random_faults(n, seed=100 + n, base=s)
         seconds.append(timed(partial(run_campaign, runs, workers=1), 1)[0])
     made["runs"] = np.array(size.counts, float), np.array(seconds)
+    seconds = []
+    for n in size.counts:
+        asked = [asked_of(r.change(waveform_dt=None)) for r in random_faults(n, seed=n, base=s)]
+        ends = partial(simulate_ensemble, asked, keep=lambda _, ds: ds.sizes, refused="keep")
+        seconds.append(timed(ends, 1)[0])
+    made["members"] = np.array(size.counts, float), np.array(seconds)
     rates = np.array(size.rates)
     took = []
     for r in rates:
@@ -50,6 +58,7 @@ def linear(size: Size) -> Curves:
 def linear_rows(curves: Curves) -> list[Row]:
     """Return how far from a straight line the costs are."""
     names = {"duration": "simulated time", "runs": "number of runs", "rate": "output rate"}
+    names["members"] = "number of members of an ensemble"
     rows = []
     for key, (x, y) in curves.items():
         *_, off = fit(x, y)
@@ -63,6 +72,7 @@ def write_plot(curves: Curves, size: Size, path: str | os.PathLike[str]) -> Path
     labels = {
         "duration": ("Simulated time", "Simulated time [s]"),
         "runs": ("Number of runs", "Joint runs with random faults"),
+        "members": ("Members of an ensemble", "Joint runs in one loop, in lanes"),
         "rate": ("Output rate", "Waveform samples per ms"),
     }
     panels = [(*labels[k], "Wall time [s]", *curve) for k, curve in curves.items()]

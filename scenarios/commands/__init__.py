@@ -17,8 +17,8 @@ from typing import Any
 from scenarios.shell import usage
 
 _NAMES = """
-bench calibrate campaign linearise compile deck errata estimate export fit identify list maps
-measure multirate run study trim tune validate
+bench calibrate campaign dataset linearise compile deck errata estimate export fit identify list
+maps measure multirate run score study trim tune validate
 """
 MODULES = tuple(f"scenarios.commands.{name}" for name in _NAMES.split())
 """The modules of the subcommands, in the order of the help text; add new ones here."""

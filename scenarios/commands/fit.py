@@ -323,9 +323,10 @@ def report(
     fit: EngineFit, profiles: Sequence[Profile], ignored: Sequence[str], *, steady: bool
 ) -> dict[str, Any]:
     """Return the result as plain numbers; what is unbounded or unknown is None."""
+    from estimators.apu.believable import fit_doubts
     from estimators.apu.fitting import words
 
-    r = fit.result
+    r, doubts = fit.result, list(fit_doubts(fit))
 
     def number(x: float) -> float | None:
         return float(x) if math.isfinite(x) else None
@@ -373,6 +374,8 @@ def report(
         "p_value": number(r.p_value),
         "verdict": verdict(r.chi2, r.freedom, r.p_value),
         "misfit": {n: {"rms": v, "readings": k} for n, (v, k) in fit.misfit().items()},
+        "believable": not doubts,
+        "doubts": doubts,
         "loglik": r.loglik,
         "iterations": r.iterations,
         "ignored_columns": list(ignored),
@@ -450,6 +453,7 @@ def text(found: Mapping[str, Any]) -> str:
     misfit = ", ".join(f"{n} {m['rms']:.2f} ({m['readings']})" for n, m in found["misfit"].items())
     lines.append(f"rms residual in sigmas (readings): {misfit}")
     lines.append("(for Wf and PW below 1: their true values are fitted sample by sample)")
+    lines += [f"doubt: {d}" for d in found["doubts"]]
     open_ = [n for n in INPUTS if n not in found["misfit"]]
     if open_:
         lines.append(f"not measured, and left open: {', '.join(open_)}")

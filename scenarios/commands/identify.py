@@ -46,6 +46,9 @@ OPTIONS = f"""
 --prior float PCT =2.0 | 1 sigma of each health factor before, %% (default 2)
 --samples int N =50  | samples of 20 ms that are averaged (default 50)
 --eta-bias float PCT =2.0 | 1 sigma of the generators' efficiency, %% (default 2)
+--shares A,B         | powers of the generators, in any unit: the efficiency of each then errs
+                     | on its own (default: they err alike)
+--generator int N =1 | generator whose short circuits are looked at (default %(default)s)
 --gain-errors        | consider the sensors' gain errors
 --transient          | also a load ramp of 5 s; takes some seconds
 --trials int N =0    | also estimate from N random snapshots, 12 ms each, to confirm the bounds
@@ -68,9 +71,13 @@ def run(args: argparse.Namespace) -> int:
             f"{args.prior:g}, {args.eta_bias:g}, {args.samples:g}, {args.trials:g}"
         )
     given.parts(args)
+    alone = [given.number(x, "--shares", x) for x in given.names(args.shares or "1")]
+    args.bias = study.independent_bias(args.eta_bias / 100, alone)
+    args.aside = study.independent_bias(1.0, alone)
+    machine = _machine(args)
     table, sensors = _named(args, study.BASE)
     sets, added = _sets(args, table, sensors)
-    f = _found(args)
+    f = _found(args, machine)
     if args.figure is not None:
         figure = _figure(f.point, args.samples, _engine(args), given.program(args))
         files.save_figure(figure, args.figure)
@@ -112,7 +119,7 @@ def _sets(
 
     how: dict[str, Any] = {"prior": args.prior / 100, "samples": args.samples}
     how["sensors"] = table
-    how |= {"eta_bias": args.eta_bias / 100, "gain_errors": args.gain_errors, **_engine(args)}
+    how |= {"eta_bias": args.bias, "gain_errors": args.gain_errors, **_engine(args)}
     g = study.gas_path(args.point, **how)
     more = [s for s in g.sensors if s not in sensors]
     sets = {"these": list(sensors), **{f"+ {s}": [*sensors, s] for s in more}}
@@ -124,7 +131,24 @@ def _engine(args: argparse.Namespace) -> dict[str, GasGenerator]:
 
 
 def _machine(args: argparse.Namespace) -> Generator | None:
-    return None if args.engine is None else given.engine_file(args, _PARTS).unit.generator
+    """Return the generator of ``--generator``; None for the default one.
+
+    Raises:
+        ParameterError: the unit has no such generator, or another number of shares is given.
+    """
+    from apu_casadi.core.errors import ParameterError
+
+    if args.engine is None and args.generator == 1 and args.shares is None:
+        return None
+    shares: str | None = args.shares
+    gens = given.engine_file(args, _PARTS).unit.generators
+    if not 1 <= args.generator <= len(gens):
+        has = f"the unit has generators 1 to {len(gens)}"
+        raise ParameterError(f"--generator {args.generator}: {has}")
+    if shares is not None and len(given.names(shares)) != len(gens):
+        raise ParameterError(f"--shares {shares}: the unit has {len(gens)} generators")
+    found: Generator = gens[args.generator - 1]
+    return found
 
 
 @dataclass(frozen=True)
@@ -153,7 +177,7 @@ class Found:
     ramp: dict[str, Identifiability] | None
 
 
-def _found(args: argparse.Namespace) -> Found:
+def _found(args: argparse.Namespace, machine: Generator | None) -> Found:
     from estimators.apu import identify as study
     from estimators.apu.severity import severity_study
     from estimators.apu.trials import snapshot_trials
@@ -162,7 +186,11 @@ def _found(args: argparse.Namespace) -> Found:
     first, prior = given.names(args.point)[0], args.prior / 100
     engine = _engine(args)
     options: dict[str, Any] = {"prior": prior, "samples": args.samples, **engine}
-    variants, seeds = study.VARIANTS, range(10_000, 10_000 + args.trials)
+    bias, seeds = study.ETA_BIAS * args.aside, range(10_000, 10_000 + args.trials)
+    variants = {
+        n: {k: bias if k == "eta_bias" else x for k, x in v.items()}
+        for n, v in study.VARIANTS.items()
+    }
     snapshot, needed = study.shaft_power_snapshot, study.needed_samples
     power = {n: snapshot(first, **{**options, **v}) for n, v in variants.items()}
     at = {"swept": {"samples": args.samples, **engine}}
@@ -182,10 +210,10 @@ def _found(args: argparse.Namespace) -> Found:
         first,
         power,
         study.snapshot_sweep(first, priors=SWEPT, variants=at),
-        study.limiting_gains(first, eta_bias=study.ETA_BIAS, **options),
+        study.limiting_gains(first, eta_bias=bias, **options),
         study.limiting_noises(first, **how),
         aims,
-        severity_study(generator=_machine(args)),
+        severity_study(generator=machine),
         trials,
         ramp,
     )
@@ -205,6 +233,7 @@ def _report(
         "prior": args.prior / 100,
         "samples": args.samples,
         "eta_bias": args.eta_bias / 100,
+        **_asked(args),
         "gain_errors": args.gain_errors,
         "sensors": list(sensors),
         "points": {n: _condition(args, n) for n in given.names(args.point)},
@@ -229,6 +258,13 @@ def _report(
         "severity": [_severity_row(s) for s in f.electrical],
         "transient": None if f.ramp is None else {k: r.rows() for k, r in f.ramp.items()},
     }
+
+
+def _asked(args: argparse.Namespace) -> dict[str, Any]:
+    """Return which generator, and their shares with what is left of the bias, where given."""
+    told = {} if args.generator == 1 else {"generator": args.generator}
+    shares = {"shares": args.shares, "eta_bias_of_all": args.bias} if args.shares else {}
+    return {**told, **shares}
 
 
 _PAIR = ["first", "second", "angle", "correlation", "size", "confounded"]
@@ -261,12 +297,20 @@ def _heading(args: argparse.Namespace, sensors: Sequence[str]) -> list[str]:
         f"Gas path at {args.point}, from {', '.join(sensors)}",
         f"{args.samples} samples of 20 ms averaged, prior {args.prior:g} % on each health factor; "
         f"gain errors: {gains};",
-        f"true speed and fuel flow unknown; efficiency behind PW known to {args.eta_bias:g} %; "
+        f"true speed and fuel flow unknown; efficiency behind PW known to {_bias(args)}; "
         "noise: estimators.apu.sensors.",
         *(f"{n}: {_condition_words(args, n)}; healthy engine" for n in given.names(args.point)),
         given.program(args)
+        + (f"; short circuits of generator {args.generator}" if args.generator != 1 else "")
         + (f"; trials with seeds from 10000, {args.trials}" if args.trials else ""),
     ]
+
+
+def _bias(args: argparse.Namespace) -> str:
+    if args.shares is None:
+        return f"{args.eta_bias:g} %"
+    of = f"generators with shares {args.shares}, {args.eta_bias:g} % each on its own"
+    return f"{100 * args.bias:.3g} % ({of})"
 
 
 def _condition_words(args: argparse.Namespace, point: str) -> str:
@@ -342,7 +386,7 @@ def _shares(values: Mapping[str, float]) -> str:
 
 
 def _power(f: Found) -> list[str]:
-    from estimators.apu.identify import AIMS, ETA_BIAS, PRIOR
+    from estimators.apu.identify import AIMS, PRIOR
 
     one = next(iter(f.power.values()))
     null = ", ".join(f"{n} {v:+.3f}" for n, v in one["null"].items() if abs(v) > 1e-6)
@@ -363,7 +407,7 @@ def _power(f: Found) -> list[str]:
             f"  {label:<18}{aim:>6}{100 * r['reduction']:7.1f}{cells}"
             f"   {100 * r['null_before']:.2f} -> {100 * r['null_after']:.2f}"
         )
-    lines += _say("bias", eta=ETA_BIAS, null=null)
+    lines += _say("bias", eta=f.power["efficiency bias"]["eta_bias"], null=null)
     for label, n in f.needed.items():
         lines += _say("needed" if n else "never reached", label=label, aim=AIMS[label], n=n)
     for label in AIMS:

@@ -30,7 +30,8 @@ files FILE + | recorded data of the gas path, CSV, Parquet or netCDF
 --inputs A,B = | measured inputs whose noise is found: Wf, PW
 {given.UNIT}
 {readingoptions.OPTIONS.strip()}
---sensors FILE | noise and gain of sensors (TOML, as apu measure); default: apu estimate sensors
+--sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
+--prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep JSON and figure there
 --figures =on  | draw the estimates into it (default)
@@ -43,10 +44,10 @@ def run(args: argparse.Namespace) -> int:
     """Read, fit, print; return 0."""
     from apu_casadi.core.files import save_figure, write_text
     from estimators.apu.gaspath import ITERATED, ITERATIONS
-    from estimators.apu.measuring import read_sensors
     from estimators.apu.recorded_estimate import gas_path_data
     from estimators.apu.recordings.measured import read_recording
     from estimators.apu.recordings.runfiles import recorded_ambient
+    from estimators.apu.sensorfile import read_sensors
     from estimators.batch.noisefit import fit_noise
     from scenarios import registry
     from scenarios.figures.noiseplot import plot_noise
@@ -58,8 +59,9 @@ def run(args: argparse.Namespace) -> int:
     m = read_recording(*args.files, columns=columns, reading=reading)
     said = {n: v for f in args.files for n, v in recorded_ambient(f).items() if n not in m}
     day = said | {n: v for n, v in given.ambient_given(args).items() if v is not None}
-    sensors = read_sensors(args.sensors).gas_path.including(*m.gaspath)
-    filt, data, prior, notes = gas_path_data(m, apu, sensors=sensors, ambient=day)
+    sensors = read_sensors(args.sensors)
+    how: dict[str, Any] = {"sensors": sensors, "ambient": day, "prior": args.prior}
+    filt, data, prior, notes = gas_path_data(m, apu, **how)
     measured = [n for n in filt.model.y.names if n in m]
     progress.tell(f"fitting noise to {', '.join(m)}", quiet=args.quiet or args.json)
     found = fit_noise(

@@ -150,7 +150,7 @@ def page(records: Mapping[str, Mapping[str, Any]]) -> str:
         blocks += _study(name, record, figures[name])
     blocks += [TEXT.raw("sensors"), "Gas path, every 20 ms:", sensor_table(GAS_PATH)]
     blocks += ["Electrical, at 10 kHz:", sensor_table(ELECTRICAL)]
-    blocks += [TEXT.raw("how"), _durations(records), TEXT.raw("limits")]
+    blocks += [TEXT.raw("peers"), TEXT.raw("how"), _durations(records), TEXT.raw("limits")]
     return "\n\n".join(b for b in blocks if b) + "\n"
 
 

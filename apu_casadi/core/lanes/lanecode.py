@@ -92,9 +92,15 @@ IN S s_floor(S a){return floor(a);}
 IN S s_ceil(S a){return ceil(a);}
 IN S s_fmin(S a,S b){return fmin(a,b);}
 IN S s_fmax(S a,S b){return fmax(a,b);}
+#if defined(__clang__)
+/* it has code of its own for these, which tells one zero from the other in its own way */
+IN V v_fmin(V a,V b){V r;for(int l=0;l<L;l++)r[l]=fmin(a[l],b[l]);return r;}
+IN V v_fmax(V a,V b){V r;for(int l=0;l<L;l++)r[l]=fmax(a[l],b[l]);return r;}
+#else
 /* as the C library says of numbers that are missing: the other one */
 IN V v_fmin(V a,V b){return v_sel((a<b)|(b!=b),a,b);}
 IN V v_fmax(V a,V b){return v_sel((a>b)|(b!=b),a,b);}
+#endif
 IN V v_fabs(V a){return (V)((M)a&~(M)v_all(-0.0));}
 #define EACH(f) static V v_##f(V a){V r;for(int l=0;l<L;l++)r[l]=f(a[l]);return r;}
 #if L==8 && defined(__AVX512F__)

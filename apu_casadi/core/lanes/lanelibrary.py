@@ -159,11 +159,20 @@ def single(fun: ca.Function, *, build: bool = True, level: int = 1) -> ca.Functi
         BackendError: as of :func:`in_lanes`.
     """
     n = lanes_in_use()
-    if n > 1 and not unsupported(fun):
+    if n > 1 and _has_maps(fun) and not unsupported(fun):
         made = library(_code(fun, n, (), single=True), build=build, level=level)
         if made is not None:
             return made
     return compiled(fun, build=build, level=level)
+
+
+def _has_maps(fun: ca.Function) -> bool:
+    """Whether a function is a map or calls one, at any depth."""
+    if fun.class_name() != "MXFunction":
+        return bool(fun.class_name() == "Map")
+    calls = [k for k in range(fun.n_instructions()) if fun.instruction_id(k) == ca.OP_CALL]
+    inner = {hash(g): g for g in (fun.instruction_MX(k).which_function() for k in calls)}
+    return any(map(_has_maps, inner.values()))
 
 
 def _by_map(fun: ca.Function, n: int, common: tuple[int, ...]) -> ca.Function:

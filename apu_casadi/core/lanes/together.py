@@ -8,20 +8,24 @@ between call and mover need know of ensembles, if it changes nothing before the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.calling import Caller
-from apu_casadi.core.errors import BackendError
+from apu_casadi.core.calling import Caller, available_threads
+from apu_casadi.core.errors import BackendError, ScenarioError
 from apu_casadi.core.lanes.lanelibrary import in_lanes
 
-__all__ = ["Member", "Question", "Together", "answer", "by_itself"]
+__all__ = ["CHUNK", "Course", "Member", "Question", "Together", "alone", "answer", "ensemble"]
+
+CHUNK = 64  # members that are under way at once
+T = TypeVar("T")
 
 
 class Question(Exception):  # noqa: N818 - no error
@@ -34,6 +38,9 @@ class Question(Exception):  # noqa: N818 - no error
         super().__init__(f"{function.fun.name()} is asked for by a member of an ensemble")
         self.function, self.given = function, given
 
+
+#: What a member does: it yields questions, and returns its result.
+Course = Generator[Question, None, T]
 
 _here: ContextVar[Member | None] = ContextVar("apu_member", default=None)
 
@@ -72,7 +79,7 @@ class Member:
         if self._answer is None:
             return None
         (of, results), self._answer = self._answer, None
-        if of is not function:
+        if hash(of.of) != hash(function.of):
             raise BackendError(f"asked for {of.fun.name()}, then for {function.fun.name()}")
         return results
 
@@ -96,7 +103,7 @@ class Together:
     """
 
     def __init__(self, fun: ca.Function, of: ca.Function) -> None:
-        self.fun, self._one, self._of = fun, Caller(fun, copy=False), of
+        self.fun, self._one, self.of = fun, Caller(fun, copy=False), of
         self._wide: Caller | None = None
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
@@ -146,7 +153,7 @@ class Together:
     @property
     def _call(self) -> Caller:
         if self._wide is None:
-            self._wide = Caller(in_lanes(self._of), copy=False)
+            self._wide = Caller(in_lanes(self.of), copy=False)
         return self._wide
 
 
@@ -157,12 +164,16 @@ def answer(members: Sequence[Member], pool: Executor | None = None) -> None:
         members: those that ask; the others are left alone.
         pool: threads that evaluate packs of lanes at the same time; None evaluates one by one.
     """
-    asking: dict[Together, list[Member]] = {}
+    asking: dict[int, list[Member]] = {}  # by function: each member may have buffers of its own
+    functions: dict[int, Together] = {}
     for m in members:
         if m.asks is not None:
-            asking.setdefault(m.asks.function, []).append(m)
+            key = hash(m.asks.function.of)
+            asking.setdefault(key, []).append(m)
+            functions.setdefault(key, m.asks.function)
     packs = []
-    for function, own in asking.items():
+    for key, own in asking.items():
+        function = functions[key]
         n = function.lanes if len(own) > 1 else 1
         packs += [(function, own[i : i + n]) for i in range(0, len(own), n)]
 
@@ -174,3 +185,58 @@ def answer(members: Sequence[Member], pool: Executor | None = None) -> None:
     for (_, own), results in zip(packs, done, strict=True):
         for m, r in zip(own, results, strict=True):
             m.take(r)
+
+
+def alone(course: Course[T]) -> T:
+    """Return what a course returns that asks nobody, though it may be part of a member's."""
+    try:
+        with by_itself():
+            raise next(course)
+    except StopIteration as end:
+        made: T = end.value
+        return made
+
+
+def ensemble(
+    courses: Iterator[Course[T]], *, chunk: int = CHUNK, n_threads: int | None = 1
+) -> Iterator[tuple[int, T | Exception]]:
+    """Move courses, which pause at questions, and answer these together.
+
+    Args:
+        courses: generators that yield questions; taken when there is room.
+        chunk: members that are under way at once; memory grows with it.
+        n_threads: threads that answer questions; None takes all cores.
+
+    Yields:
+        Number of a member and what it returned or raised, in the order in which they end.
+    """
+    if chunk < 1:
+        raise ScenarioError(f"chunk = {chunk!r}: at least one member must be under way")
+    n = available_threads() if n_threads is None else n_threads
+    waiting = enumerate(courses)
+    with ThreadPoolExecutor(n) if n > 1 else nullcontext() as pool:
+        under_way = deque[tuple[int, Course[T], Member]]()
+        while True:
+            while len(under_way) < chunk and (one := next(waiting, None)) is not None:
+                under_way.append((*one, Member()))
+            if not under_way:
+                return
+            yield from _moved(under_way, pool)
+
+
+def _moved(
+    under_way: deque[tuple[int, Course[T], Member]], pool: Executor | None
+) -> Iterator[tuple[int, T | Exception]]:
+    """Move each member to its next question, and answer; yields those that end."""
+    for _ in range(len(under_way)):
+        k, course, member = under_way.popleft()
+        try:
+            with member:
+                next(course)
+        except StopIteration as end:
+            yield k, end.value
+        except Exception as error:
+            yield k, error
+        else:
+            under_way.append((k, course, member))
+    answer([m for _, _, m in under_way], pool)

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,9 @@ from estimators.models.recording import Recording
 
 __all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "probabilities"]
 
-BEFORE, AFTER = 0.02, 0.04  # s of the piece around the change
+BEFORE, AFTER = 0.01, 0.03  # s of the piece around the change
 UNKNOWN = 1e4  # A; standard deviation of a reading that says nothing
-VOLTAGE_ERRORS = (3.0, 30.0, 300.0)  # V
+VOLTAGE_ERRORS = (10.0, 100.0)  # V
 ORDERS = (5, 7, 11)
 #: Prior weights of the hypotheses' kinds; a kind with several members shares its own.
 PRIOR = {
@@ -145,8 +146,9 @@ class _Piece:
         """Samples after the change."""
         return np.asarray(data.t >= self.change - 1e-9)
 
+    @cached_property
     def healthy(self) -> FilterResult:
-        """Run the healthy machine's filter."""
+        """What the healthy machine's filter says."""
         return self.run(phases=())[0]
 
     def without(self, row: int) -> float:
@@ -226,7 +228,7 @@ def causes_of_change(
         except ApuError:  # a filter that loses itself explains nothing
             found[name] = -math.inf
 
-    judge("healthy", lambda: piece.healthy().loglik)
+    judge("healthy", lambda: piece.healthy.loglik)
     for p in PHASES:
         judge(f"short circuit {p}", lambda p=p: piece.shorted(p))  # type: ignore[misc]
     warm = {f"machine.{n}": Unknown() for n in ("r_fd", "r_s")}
@@ -234,7 +236,7 @@ def causes_of_change(
     for k, n in enumerate(MEASURED):
         judge(f"sensor {n}", lambda k=k: piece.without(k))  # type: ignore[misc]
     judge("voltage sensors", piece.voltages_off)
-    judge("harmonics", lambda: piece.harmonics(piece.healthy()))
+    judge("harmonics", lambda: piece.harmonics(piece.healthy))
     if not any(math.isfinite(v) for v in found.values()):
         return None
     return Causes(change, probabilities(found))

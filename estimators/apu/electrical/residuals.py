@@ -103,27 +103,38 @@ def _windows(
 ) -> _Windows:
     columns = [np.ones_like(angle)]
     columns += [f(m * angle) for m in orders if m for f in (np.cos, np.sin)]
-    basis = np.column_stack(columns)
-    n = 1 + 2 * sum(m in TAKEN and m > 0 for m in orders)
-    begin, rest, found = [], [], []
-    for a in range(0, angle.size - per + 1, per):
-        at, y = slice(a, a + per), r.innovation[:, a : a + per]
-        there = np.isfinite(y)
-        b, y = basis[at], np.where(there, y, 0.0)
-        c = np.full((b.shape[1], y.shape[0]), np.nan)
-        s = np.full(y.shape[0], np.nan)
-        for i, row in enumerate(there):
-            if row.sum() > 0.5 * per:
-                c[:, i] = np.linalg.lstsq(b[row], y[i, row], rcond=None)[0]
-                low = np.linalg.lstsq(b[row][:, :n], y[i, row], rcond=None)[0]
-                left = y[i, row] - b[row][:, :n] @ low
-                s[i] = left @ left / noise[i] * (per - n) / (row.sum() - n)
-        begin.append(r.t[a])
-        rest.append(s)
-        pairs = np.stack([c[1::2], c[2::2]], axis=1)
-        mean = np.stack([c[0], np.zeros_like(c[0])])[None]
-        found.append(np.concatenate([mean, pairs]))
-    return _Windows(np.array(begin), np.array(rest), per - n, np.array(found))
+    n, width, W = 1 + 2 * sum(m in TAKEN and m > 0 for m in orders), len(columns), angle.size // per
+    basis = np.column_stack(columns)[: W * per].reshape(W, per, width)
+    y = r.innovation[:, : W * per].reshape(-1, W, per).transpose(1, 2, 0)
+    there = np.isfinite(y)
+    c, s = (np.full((W, k, y.shape[2]), np.nan) for k in (width, 1))
+    whole = there.all((1, 2))
+    c[whole], s[whole, 0] = _regressed(basis[whole], y[whole], n)
+    for k, i in np.argwhere(there.sum(1) > 0.5 * per):
+        if not whole[k]:
+            row = there[k, :, i]
+            b, e = basis[k, row], y[k, row, i]  # with gaps, harmonics may look alike
+            c[k, :, i] = np.linalg.lstsq(b, e, rcond=None)[0]
+            e = e - b[:, :n] @ np.linalg.lstsq(b[:, :n], e, rcond=None)[0]
+            s[k, 0, i] = e @ e * (per - n) / (row.sum() - n)
+    pairs = np.stack([c[:, 1::2], c[:, 2::2]], axis=2)
+    mean = np.stack([c[:, 0], np.zeros_like(c[:, 0])], axis=1)[:, None]
+    harmonics = np.concatenate([mean, pairs], axis=1)
+    return _Windows(r.t[: W * per : per], s[:, 0] / noise, per - n, harmonics)
+
+
+def _regressed(basis: np.ndarray, y: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of the whole basis, and what its first n columns leave: sums of squares.
+
+    Args:
+        basis: of windows, (W, K, m). y : (W, K, sensors).
+        n: columns that count as explained.
+    """
+    turned = basis.transpose(0, 2, 1)
+    c = np.linalg.solve(turned @ basis, turned @ y)
+    low = basis[:, :, :n]
+    first = np.linalg.solve(turned[:, :n] @ low, turned[:, :n] @ y)
+    return c, ((y - low @ first) ** 2).sum(1)
 
 
 def unexplained_waves(
@@ -160,13 +171,14 @@ def unexplained_waves(
     orders = [m for m in range(HIGHEST + 1) if m * w * step < 0.95 * math.pi]
     noise = MARGIN * _variances(machine, sensors, samples, w)
     windows = _windows(r, angle, noise, per, orders)
-    stepped, odd = _events(windows.t, per * step, samples, resets, faults)
+    jumped = _jumped(samples)
+    stepped, odd = _events(windows.t, per * step, [*jumped, *resets, *faults])
     # the first window is the filter's start
     quiet = ~stepped & (np.arange(stepped.size) > 0)
     out = [Finding("voltages", "steps", 0.0, float(stepped.mean()))] if odd else []
     if odd:
         quiet[1:] = True
-    out += [Finding("machine", "moved", 0.0, t) for t in _moved(samples, resets, faults)]
+    out += [Finding("machine", "moved", 0.0, t) for t in _moved(resets, [*jumped, *faults])]
     if quiet.sum() < FEWEST_WINDOWS:
         return out
     size = {n: _amplitude(samples, n, windows.t, per * step) for n in MEASURED}
@@ -189,28 +201,20 @@ def _jumped(samples: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.asarray(t[(sizes > 0).any(0) & ~far])
 
 
-def _events(
-    begin: np.ndarray,
-    length: float,
-    samples: Mapping[str, np.ndarray],
-    resets: Sequence[float],
-    faults: Sequence[float],
-) -> tuple[np.ndarray, bool]:
+def _events(begin: np.ndarray, length: float, at: Sequence[float]) -> tuple[np.ndarray, bool]:
     """Windows in which something came, and whether these are too many for that."""
-    at = np.concatenate([_jumped(samples), [*resets], [*faults]])
-    k = np.floor((at - begin[0]) / length + 1e-9).astype(int)
+    after = np.asarray(at, float) - begin[0]
+    k = np.floor(after / length + 1e-9).astype(int)
     stepped = np.zeros(begin.size, bool)
-    for near in (k, np.floor((at - 0.2 * length - begin[0]) / length).astype(int)):
+    for near in (k, np.floor(after / length - 0.2).astype(int)):
         stepped[near[(near >= 0) & (near < begin.size)]] = True
     return stepped, bool(stepped.mean() > EXCUSED and begin.size >= 10)
 
 
-def _moved(
-    samples: Mapping[str, np.ndarray], resets: Sequence[float], faults: Sequence[float]
-) -> list[float]:
-    """Resets near which no voltage jumped and no short circuit was reported."""
-    known = np.concatenate([_jumped(samples), [*faults]])
-    return [float(t) for t in resets if not (np.abs(known - t) < NEAR).any()]
+def _moved(resets: Sequence[float], known: Sequence[float]) -> list[float]:
+    """Resets near which nothing is known: no voltage jumped, no short circuit was reported."""
+    at = np.asarray(known, float)
+    return [float(t) for t in resets if not (np.abs(at - t) < NEAR).any()]
 
 
 def _amplitude(

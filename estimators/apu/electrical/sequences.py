@@ -106,7 +106,10 @@ def _phasors(t: np.ndarray, x: np.ndarray, f: float) -> tuple[np.ndarray, float]
     """Symmetrical components of a sinusoid in each phase, and what it leaves, rms."""
     w = 2 * math.pi * f * (t - t[0])
     basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
-    c = fitted(basis, x.T)
+    if np.isfinite(x).all():  # well conditioned, and faster
+        c = np.linalg.solve(basis.T @ basis, basis.T @ x.T)
+    else:
+        c = fitted(basis, x.T)
     parts = np.array(fortescue(c[0] + 1j * c[1]))
     return parts, float(np.sqrt(np.nanmean((x.T - basis @ c) ** 2)))
 

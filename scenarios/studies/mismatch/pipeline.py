@@ -98,8 +98,9 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
     if e.gaspath is not None:
         for n in ("N", *HEALTH):
             put(n, e.gaspath, float(ds[n].values[-1]))
+        changed = any(ds[n].values[-1] != ds[n].values[0] for n in HEALTH)
         found = json.loads(e.gaspath.attrs["alarms"])
-        false += sum(not (fault == "gas path" and a > ONSET - SETTLED) for a in found)
+        false += sum(not (changed and a > ONSET - SETTLED) for a in found)
     for m in e.machines.values():
         h_true = float(ds["mu"].values[-1] / (ds["k_rf"].values[-1] + 1 - ds["mu"].values[-1]))
         for p in PHASES:
@@ -116,7 +117,7 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
             for k in rising
         ]
         false += len(right) - sum(right)
-    return {"z": z, "false": false}
+    return {"z": z, "false": int(false)}
 
 
 def mismatch(

@@ -1,0 +1,1 @@
+"""Data sets of many units with labels, and their scorer."""

@@ -1,0 +1,231 @@
+"""Baselines: what simple methods, a classifier of scikit-learn and our own filters say.
+
+They are there to be beaten.  The waveforms of a run are kept around its onset, so that every method
+that reads them is told roughly when to look; those of the gas path are not cut.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core import files
+from apu_casadi.core.errors import ApuError, ApuWarning, DataError, nearest
+from apu_casadi.gaspath.health import HEALTH
+from estimators.apu.sensors import GAS_PATH
+from scenarios.datasets.recipe import CLASSES
+from scenarios.datasets.scoring import read_labels
+
+Progress = Callable[[float, float], None]
+Rows = list[dict[str, Any]]
+_RATIOS = tuple(f"X_s.{n}" for n in GAS_PATH.names)
+_ALARM = 4.0  # robust standard deviations of healthy training runs: a reading that is told
+
+
+def runs_of(folder: str | Path, labels: Mapping[str, np.ndarray]) -> Iterator[tuple[int, Any, Any]]:
+    """Yield number, gas path and waveforms (or None) of each run, as pandas.DataFrames."""
+    pandas = import_module("pandas")
+    where = dict(zip(labels["run"].tolist(), labels["unit"].tolist(), strict=True))
+    unit: int | None = None
+    tables: dict[str, Any] = {}
+    for run in labels["run"].tolist():
+        if where[run] != unit:
+            unit, tables = where[run], {}
+            for part in ("gaspath", "electrical"):
+                path = Path(folder) / part / f"unit_{unit:05d}.parquet"
+                if path.is_file():
+                    tables[part] = pandas.read_parquet(io.BytesIO(files.read_bytes(path)))
+        gas, waves = (t[t["run"] == run] if (t := tables.get(p)) is not None else None
+                      for p in ("gaspath", "electrical"))  # fmt: skip
+        if gas is None:
+            raise DataError(f"{folder}: the gas path of run {run} is missing")
+        yield run, gas, waves
+
+
+def features(gas: Any, waves: Any) -> np.ndarray:
+    """Return numbers that tell of a change: end over beginning, of readings and of unbalances.
+
+    Log ratios of the gas path's readings, last half second over the first second; of each
+    generator the changes of phase currents, and of what turns backwards in currents and voltages.
+    """
+    t = gas["time"].to_numpy()
+    late, early = t >= t[-1] - 0.5, t < t[0] + 1.0
+    y = gas[list(_RATIOS)].to_numpy(dtype=float)
+    out = [np.log(np.abs(y[late].mean(axis=0) / y[early].mean(axis=0)))]
+    for k in (1, 2):
+        parts: list[np.ndarray] = []
+        if waves is not None:
+            half = len(waves) // 3
+            parts = [_phases(part, k) for part in (waves.iloc[:half], waves.iloc[-half:])]
+        out.append(parts[1] - parts[0] if parts else np.zeros(5))
+    return np.concatenate(out)
+
+
+def _phases(part: Any, k: int) -> np.ndarray:
+    """Relative rms currents of the phases, and V2/V1 and I2/I1 by the rotating vector."""
+    turn = np.exp(2j * np.pi / 3 * np.arange(3))
+    out = []
+    for q in "iv":
+        x = part[[f"{q}_{p}_{k}" for p in "abc"]].to_numpy(dtype=float)
+        rms = np.sqrt((x**2).mean(axis=0))
+        out += [*(rms / rms.mean())] if q == "i" else []
+        vector = np.fft.fft(x @ turn)
+        forward = int(np.argmax(np.abs(vector)))
+        out.append(np.abs(vector[-forward]) / np.abs(vector[forward]))
+    return np.array(out)
+
+
+# ------------------------------------------------------------------------------ methods
+
+
+def _chance(X: np.ndarray, y: np.ndarray, train: np.ndarray, rng: np.random.Generator) -> Rows:
+    """Classes as frequent as in training, at random."""
+    names, counts = np.unique(y[train], return_counts=True)
+    said = rng.choice(names, size=y.size, p=counts / counts.sum())
+    return [
+        {"class": str(c), "score": float(v)} for c, v in zip(said, rng.random(y.size), strict=True)
+    ]
+
+
+def _thresholds(X: np.ndarray, y: np.ndarray, train: np.ndarray, rng: np.random.Generator) -> Rows:
+    """The largest deviation from healthy training runs, then the nearest direction of a class."""
+    healthy = X[train & (y == "healthy")]
+    if len(healthy) < 5:
+        raise DataError("thresholds need at least five healthy runs in the split train")
+    centre = np.median(healthy, axis=0)
+    spread = 1.4826 * np.median(np.abs(healthy - centre), axis=0) + 1e-9
+    Z = (X - centre) / spread
+    size = np.abs(Z).max(axis=1)
+    means = {c: Z[train & (y == c)].mean(axis=0) for c in np.unique(y[train]) if c != "healthy"}
+    rows = []
+    for z, s in zip(Z, size, strict=True):
+        near = max(means, key=lambda c: float(z @ means[c]) / float(np.linalg.norm(means[c])))
+        rows.append({"class": near if s > _ALARM else "healthy", "score": float(s)})
+    return rows
+
+
+def _forest(X: np.ndarray, y: np.ndarray, train: np.ndarray, rng: np.random.Generator) -> Rows:
+    """A random forest on the same features."""
+    try:
+        ensemble = import_module("sklearn.ensemble")
+    except ImportError:
+        raise DataError("forest needs: pip install scikit-learn") from None
+    seed = int(rng.integers(2**31))
+    model = ensemble.RandomForestClassifier(300, random_state=seed, class_weight="balanced")
+    model.fit(X[train], y[train])
+    share = model.predict_proba(X)
+    healthy = list(model.classes_).index("healthy") if "healthy" in model.classes_ else None
+    score = 1.0 - share[:, healthy] if healthy is not None else share.max(axis=1)
+    said = model.classes_[share.argmax(axis=1)]
+    return [{"class": str(c), "score": float(v)} for c, v in zip(said, score, strict=True)]
+
+
+LEARNT = {"chance": _chance, "thresholds": _thresholds, "forest": _forest}
+"""Methods that learn from the split ``train`` of the features."""
+METHODS = (*LEARNT, "estimators")
+
+
+def predict(
+    name: str, folder: str | Path, *, seed: int = 1, progress: Progress | None = None
+) -> Rows:
+    """Predict all runs of a data set by one of ``METHODS``.
+
+    Raises:
+        DataError: an unknown method, a damaged data set, or nothing to learn from.
+    """
+    if name not in METHODS:
+        raise DataError(f"unknown baseline {name!r} {nearest(name, METHODS)}")
+    labels = read_labels(folder)
+    runs, n = runs_of(folder, labels), len(labels["run"])
+    found: list[Any] = []
+    for k, (run, gas, waves) in enumerate(runs, 1):
+        found.append(features(gas, waves) if name in LEARNT else estimated(run, gas, waves))
+        if progress is not None:
+            progress(k / n, 1.0)
+    if name in LEARNT:
+        train, y = labels["split"] == "train", labels["class"]
+        if not train.any():
+            raise DataError(f"{folder}: no unit is in the split train")
+        rows = LEARNT[name](np.array(found), y, train, np.random.default_rng([seed]))
+        return [{"run": int(r), **row} for r, row in zip(labels["run"], rows, strict=True)]
+    return found
+
+
+def estimated(run: int, gas: Any, waves: Any) -> dict[str, Any]:
+    """Return what the filters of this project say of a run, gas path and generators apart.
+
+    A severity or a health factor is told where it is four standard deviations from healthy.
+    """
+    out: dict[str, Any] = {"run": run, "class": "healthy", "score": 0.0}
+    health = _of_gas_path(gas)
+    shorts = {k: _of_machine(waves, k) for k in (1, 2)} if waves is not None else {}
+    z_health = {n: abs(v - 1.0) / s for n, (v, s) in health.items() if s > 0}
+    for n, (v, s) in health.items():
+        out |= {n: v, f"{n}_sigma": s}
+    k, (phase, h, s) = max(shorts.items(), key=lambda i: i[1][1] / i[1][2], default=(0, ("", 0, 1)))
+    out |= {"h": h, "h_sigma": s} if shorts else {}
+    short, sick = bool(shorts) and h > _ALARM * s, max(z_health.values(), default=0.0) > _ALARM
+    if short:
+        out |= {"class": "combined" if sick else "ttsc", "phase": phase, "generator": k}
+    elif sick:
+        out["class"] = max(z_health, key=lambda n: z_health[n])
+    out["score"] = max([h / s if shorts else 0.0, *z_health.values()])
+    return out
+
+
+def _of_gas_path(gas: Any) -> dict[str, tuple[float, float]]:
+    from estimators.apu.recorded_estimate import estimate
+    from estimators.apu.recordings.measured import read_recording
+
+    data = {"t": gas["time"].to_numpy()}
+    data |= {n: gas[f"X_s.{n}"].to_numpy(dtype=float) for n in GAS_PATH.names}
+    data |= {n: gas[f"W.{n}"].to_numpy(dtype=float) for n in ("altitude", "Mach", "dT_isa")}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ApuWarning)
+            e = estimate(read_recording(data), only="gaspath").gaspath
+    except ApuError:
+        return {}
+    assert e is not None
+    return {n: (float(e[n].values[-1]), float(e[f"{n}_sigma"].values[-1])) for n in HEALTH}
+
+
+def _of_machine(waves: Any, k: int) -> tuple[str, float, float]:
+    from estimators.apu.recorded_estimate import estimate
+    from estimators.apu.recordings.measured import read_recording
+
+    ending = f"_{k}"
+    data = {"t": waves["time"].to_numpy()}
+    data |= {
+        c.removesuffix(ending): waves[c].to_numpy(dtype=float)
+        for c in waves
+        if str(c).endswith(ending)
+    }
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ApuWarning)
+            e = estimate(read_recording(data), only="electrical").machines[1]
+    except (ApuError, KeyError):
+        return "", 0.0, math.inf
+    h = {p: (float(e[f"h_{p}"].values[-1]), float(e[f"h_{p}_sigma"].values[-1])) for p in "abc"}
+    phase = max(h, key=lambda p: h[p][0] / h[p][1])
+    return phase, *h[phase]
+
+
+def write_predictions(rows: Rows, path: str | Path) -> Path:
+    """Write predictions as the scorer reads them."""
+    names = list(dict.fromkeys(n for row in rows for n in row))
+    assert all(row["class"] in CLASSES for row in rows)
+    f = io.StringIO()
+    writer = csv.DictWriter(f, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return files.write_text(path, f.getvalue())

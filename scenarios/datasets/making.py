@@ -1,0 +1,328 @@
+"""Make a data set: every unit in a process or on a cluster, resumable, the same bits everywhere.
+
+Layout, in the manner of N-CMAPSS::
+
+    runs.parquet                 one row a run: Y (labels) and A (unit, run, split, status, reason)
+    gaspath/unit_00012.parquet   W (conditions), X_s (measured), X_v (truth), T (health, faults)
+    electrical/unit_00012.parquet  voltages and currents around the onset, as measured
+    recipe.json, CARD.md, croissant.json, checksums.sha256
+
+Columns of the gas path are named ``W.altitude``, ``X_s.T3``, ...; units are in CARD.md.  A unit is
+kept as soon as it is made: one that was interrupted goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, wait
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core import files, interrupts
+from apu_casadi.core.backend import package_digest
+from apu_casadi.core.errors import ApuError, ApuWarning, DataError, SimulationError
+from apu_casadi.gaspath.health import HEALTH
+from estimators.apu.measuring import measure_run
+from estimators.apu.sensors import ELECTRICAL, GAS_PATH
+from scenarios import registry
+from scenarios.datasets.card import croissant, data_card
+from scenarios.datasets.recipe import Drawn, Recipe, draw
+from scenarios.schema import Scenario
+from scenarios.shell import jsontext
+from scenarios.shell.locking import locked
+from scenarios.shell.workers import pool, stoppable
+
+RUNS, LOCK, SUMS = "runs.parquet", "dataset.lock", "checksums.sha256"
+CONDITIONS = ("altitude", "Mach", "dT_isa")
+VIRTUAL = ("T2", "T3", "P3", "T4", "T41", "T5", "P5", "W2", "SM", "PW", "Wf", "N")
+WAVES = {f"{s.name}_{k}": s.unit for k in (1, 2) for s in ELECTRICAL.sensors}
+"""Unit of each column of the waveforms: what is measured at generators 1 and 2."""
+Progress = Callable[[int, int], None]
+
+
+def gas_path_columns() -> dict[str, tuple[str, str]]:
+    """Return unit and meaning of each column of the gas-path tables, by name."""
+    from apu_casadi.core.results import CHANNELS
+    from apu_casadi.gaspath.conditions import CONDITIONS as DAY
+
+    found = {"run": ("1", "number of the run"), "time": ("s", "since the start of the run")}
+    found |= {f"W.{n}": (DAY[n].unit, DAY[n].doc) for n in CONDITIONS}
+    found["W.P_e"] = ("W", "electrical output, both generators")
+    found |= {f"X_s.{s.name}": (s.unit, "as measured") for s in GAS_PATH.sensors}
+    found |= {f"X_v.{n}": CHANNELS[n] for n in VIRTUAL}
+    found |= {f"T.{n}": CHANNELS[n] for n in HEALTH}
+    return found | {"T.h": ("1", "mu/(k_rf + 1 - mu) of the short circuit")}
+
+
+def make_run(r: Recipe, unit: int, run: int) -> tuple[dict[str, Any], dict[str, Any], Any]:
+    """Simulate and measure one run.
+
+    Returns:
+        Labels with ``status`` and ``reason``; columns of the gas path; columns of the waveforms
+        around the onset.  The latter two are empty where the run was refused or failed.
+    """
+    d = draw(r, unit, run)
+    try:
+        scenario = Scenario.from_dict(d.scenario)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ApuWarning)
+            ds = registry.run(scenario)
+            read = measure_run(ds, registry.unit_for(scenario), d.seed)
+    except ApuError as e:
+        why = " ".join(str(e).split())
+        return {**d.labels, "status": "refused", "reason": why}, {}, {}
+    gas = _gas_path(d, ds, read["gaspath"])
+    return {**d.labels, "status": "done", "reason": ""}, gas, _waves(r, d, read.get("electrical"))
+
+
+def _gas_path(d: Drawn, ds: Any, read: Any) -> dict[str, np.ndarray]:
+    t = read["time"].values
+    k = np.clip(np.searchsorted(ds["time"].values, t + 1e-9) - 1, 0, None)
+
+    def truth(name: str) -> np.ndarray:
+        v = ds[name]
+        both = v.sum("generator") if name == "P_e" and "generator" in v.dims else v
+        a = both.values[k] * (2 if name == "P_e" and "generator" not in v.dims else 1)
+        return np.asarray(a, dtype=np.float32)
+
+    n = t.size
+    out: dict[str, np.ndarray] = {"run": np.full(n, d.labels["run"], dtype=np.int32), "time": t}
+    day = d.scenario["ambient"]
+    out |= {f"W.{c}": np.full(n, day[c], dtype=np.float32) for c in CONDITIONS}
+    out["W.P_e"] = truth("P_e")
+    for s in GAS_PATH.sensors:
+        out[f"X_s.{s.name}"] = np.asarray(_faulty(d, s.name, t, read[s.name].values), np.float32)
+    out |= {f"X_v.{v}": truth(v) for v in VIRTUAL}
+    out |= {f"T.{f}": truth(f) for f in HEALTH}
+    out["T.h"] = _severity(ds, k).astype(np.float32)
+    return out
+
+
+def _severity(ds: Any, k: np.ndarray) -> np.ndarray:
+    mu, k_rf = (ds[n].max("generator") if "generator" in ds[n].dims else ds[n]
+                for n in ("mu", "k_rf"))  # fmt: skip
+    m, q = mu.values[k], k_rf.values[k]
+    return np.where(m > 0, m / (np.nan_to_num(q) + 1.0 - m), 0.0)
+
+
+def _faulty(d: Drawn, name: str, t: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a reading with the fault of its sensor, if it is the faulty one."""
+    if d.sensor is None or d.sensor[0] != name:
+        return y
+    _, kind, size = d.sensor
+    on, over = d.labels["onset"], d.labels["over"]
+    since = np.clip(t - on, 0.0, None)
+    if kind == "stuck":
+        return np.where(t >= on, y[np.searchsorted(t, on) - 1], y)
+    step = kind == "bias" and not over
+    grown = np.where(t >= on, 1.0, 0.0) if step else since / (over or t[-1] - on)
+    return y * (1.0 + size * np.clip(grown, 0.0, 1.0))
+
+
+def _waves(r: Recipe, d: Drawn, read: Any) -> dict[str, np.ndarray]:
+    """Return what was measured of the generators around the onset, or mid-run if healthy."""
+    if read is None:
+        return {}
+    onset = d.labels["onset"]
+    at = r.duration / 2 if math.isnan(onset) else onset
+    t = read["time"].values
+    inside = (t >= at - r.waveforms["before"]) & (t < at + r.waveforms["after"])
+    n = int(inside.sum())
+    out: dict[str, np.ndarray] = {"run": np.full(n, d.labels["run"], dtype=np.int32)}
+    out["time"] = t[inside]
+    for name in WAVES:
+        plain = name if name in read else name.rpartition("_")[0]  # generators that are alike
+        out[name] = read[plain].values[inside].astype(np.float32)
+    return out
+
+
+# ------------------------------------------------------------------------------ units
+
+
+def make_unit(recipe: Mapping[str, Any], unit: int) -> dict[str, Any]:
+    """Make all runs of a unit: ``{"rows": labels, "files": {path: bytes}}``; nothing is written."""
+    r = Recipe.of(recipe)
+    rows, gas, waves = [], [], []
+    for run in range(r.runs_per_unit):
+        labels, g, w = make_run(r, unit, run)
+        rows.append(labels)
+        gas += [g] if g else []
+        waves += [w] if w else []
+    made = {
+        f"{folder}/unit_{unit:05d}.parquet": _parquet(parts)
+        for folder, parts in (("gaspath", gas), ("electrical", waves))
+        if parts
+    }
+    return {"rows": rows, "files": made}
+
+
+def _parquet(parts: list[dict[str, np.ndarray]]) -> bytes:
+    frame = import_module("pandas").DataFrame(
+        {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
+    )
+    f = io.BytesIO()
+    try:
+        frame.to_parquet(f, index=False)
+    except ImportError as e:
+        raise DataError(f"a data set needs: pip install 'apu-casadi[parquet]' ({e})") from None
+    return f.getvalue()
+
+
+def make_dataset(
+    r: Recipe,
+    out: str | Path,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, int]:
+    """Make a data set in a folder, or go on with one that was interrupted.
+
+    Args:
+        r: the recipe.
+        out: the folder; it holds nothing else.
+        workers: processes; default: all cores.  1 makes everything in this one.
+        cluster: address of a Dask scheduler whose workers have this package; they need no common
+            file system.
+        progress: called with the number of finished units and of all.
+
+    Returns:
+        Number of runs by status.
+
+    Raises:
+        DataError: the folder belongs to another recipe or version, or cannot be written.
+    """
+    folder = files.folder(out)
+    table = json.loads(json.dumps({k: getattr(r, k) for k in r.__dataclass_fields__}))
+    told = {"recipe": table, "program": package_digest()}
+    with locked(folder, LOCK), stoppable() as stop:
+        _claim(folder, told)
+        left = [u for u in range(r.units) if not _whole(folder, u)]
+        done = r.units - len(left)
+        for unit, made in _all(table, left, workers, cluster):
+            _keep(folder, unit, made)
+            done += 1
+            if progress is not None:
+                progress(done, r.units)
+            stop()
+        return _finish(folder, r, told)
+
+
+def _all(
+    table: dict[str, Any], left: list[int], workers: int | None, cluster: str | None
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    from apu_casadi.core.calling import available_threads
+
+    if cluster is not None:
+        yield from _on_cluster(table, left, cluster)
+        return
+    n = min(available_threads() if workers is None else workers, max(1, len(left)))
+    if n <= 1:
+        yield from ((u, make_unit(table, u)) for u in left)
+        return
+    waiting, lost = left[::-1], 0
+    with pool(n) as executor:
+        under_way: dict[Any, int] = {}
+        while waiting or under_way:
+            while waiting and len(under_way) < 2 * n:
+                with interrupts.kept_from_children():
+                    under_way[executor.submit(make_unit, table, waiting[-1])] = waiting[-1]
+                waiting.pop()
+            for f in wait(under_way, return_when=FIRST_COMPLETED).done:
+                unit = under_way.pop(f)
+                try:
+                    yield unit, f.result()
+                except OSError as e:
+                    lost += 1
+                    raise SimulationError(f"unit {unit}: its process ended: {e}") from e
+
+
+def _on_cluster(
+    table: dict[str, Any], left: list[int], address: str
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield units as they end; one whose worker was lost is made again by another."""
+    try:
+        distributed = import_module("distributed")
+    except ImportError:
+        raise DataError("--cluster needs: pip install distributed") from None
+    try:
+        client = distributed.Client(address, timeout=10)
+    except (OSError, ValueError) as e:
+        raise DataError(f"no Dask scheduler at {address!r}: {e}") from None
+    with client:
+        futures = {client.submit(make_unit, table, u, pure=False): u for u in left}
+        for f in distributed.as_completed(futures):
+            yield futures[f], f.result()
+            f.release()
+
+
+# ------------------------------------------------------------------------------ on disk
+
+
+def _claim(folder: Path, told: Mapping[str, Any]) -> None:
+    """Make sure that the folder is this recipe's, by this program."""
+    path = folder / "recipe.json"
+    if not path.exists():
+        if any(p.name != LOCK for p in folder.iterdir()):
+            raise DataError(f"{folder} holds other files: give a folder of its own")
+        files.write_text(path, jsontext.dumps(told) + "\n")
+        return
+    try:
+        before = json.loads(files.read_text(path))
+    except ValueError as e:
+        raise DataError(f"{path}: damaged: {e}") from None
+    for key, what in (("recipe", "another recipe"), ("program", "another version of the program")):
+        if before.get(key) != told[key]:
+            raise DataError(f"{folder} was begun with {what}: give another folder, or remove it")
+
+
+def _record(folder: Path, unit: int) -> Path:
+    return folder / "units" / f"unit_{unit:05d}.json"
+
+
+def _whole(folder: Path, unit: int) -> bool:
+    """Whether a unit stands whole in the folder, every file as it was written."""
+    try:
+        kept = json.loads(_record(folder, unit).read_text(encoding="utf-8"))
+        sums = {p: hashlib.sha256((folder / p).read_bytes()).hexdigest() for p in kept["files"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return bool(sums == kept["files"])
+
+
+def _keep(folder: Path, unit: int, made: Mapping[str, Any]) -> None:
+    """Write a unit's files, and last its record."""
+    for name, data in made["files"].items():
+        files.folder((folder / name).parent)
+        with files.whole(folder / name) as part:
+            part.write_bytes(data)
+    sums = {n: hashlib.sha256(d).hexdigest() for n, d in made["files"].items()}
+    files.folder(folder / "units")
+    record = {"files": sums, "rows": made["rows"]}
+    files.write_text(_record(folder, unit), json.dumps(record) + "\n")
+
+
+def _finish(folder: Path, r: Recipe, told: Mapping[str, Any]) -> dict[str, int]:
+    """Write labels, card, metadata and checksums of a data set whose units are all there."""
+    records = [json.loads(files.read_text(_record(folder, u))) for u in range(r.units)]
+    rows = [row for record in records for row in record["rows"]]
+    labels = {n: np.array([row[n] for row in rows]) for n in rows[0]}
+    with files.whole(folder / RUNS) as part:
+        part.write_bytes(_parquet([labels]))
+    sums = {n: s for record in records for n, s in record["files"].items()}
+    sums[RUNS] = hashlib.sha256((folder / RUNS).read_bytes()).hexdigest()
+    files.write_text(folder / "CARD.md", data_card(r, rows, gas_path_columns(), WAVES, told))
+    meta = croissant(r, sums, rows[0], gas_path_columns(), WAVES)
+    files.write_text(folder / "croissant.json", jsontext.dumps(meta) + "\n")
+    lines = [f"{s}  {n}\n" for n, s in sorted(sums.items())]
+    files.write_text(folder / SUMS, "".join(lines))
+    status = [row["status"] for row in rows]
+    return {s: status.count(s) for s in sorted(set(status))}

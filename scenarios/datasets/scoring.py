@@ -1,0 +1,241 @@
+"""Score predictions about a data set: detection, latency, classes, severities, coverage.
+
+Predictions are a CSV file with one row a run: ``run`` and ``class`` are needed; ``score`` (higher
+is more faulty), ``alarm_time`` (s, empty for none), ``phase``, ``generator``, severities (``h``,
+``f_eta_c``, ...) and their standard deviations (``h_sigma``, ...) are scored where they are given.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apu_casadi.core import files
+from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.gaspath.health import HEALTH
+from scenarios.datasets.making import RUNS
+from scenarios.datasets.recipe import CLASSES, SPLITS
+
+SEVERITIES = ("h", *HEALTH)
+COLUMNS = ("run", "class", "score", "alarm_time", "phase", "generator", *SEVERITIES,
+           *(f"{n}_sigma" for n in SEVERITIES))  # fmt: skip
+FALSE_ALARMS = 0.05
+"""Share of healthy runs that may be called faulty where a detection rate is stated."""
+LEVEL = 1.959963984540054  # of a 95 % band
+
+
+def read_labels(folder: str | Path) -> dict[str, np.ndarray]:
+    """Return the labels of a data set's runs that were done, by column.
+
+    Raises:
+        DataError: no data set there, or its labels cannot be read.
+    """
+    path = Path(folder) / RUNS
+    if not path.is_file():
+        raise DataError(f"{path} is not there: the folder of apu dataset make is expected")
+    try:
+        frame = import_module("pandas").read_parquet(io.BytesIO(files.read_bytes(path)))
+    except ImportError as e:
+        raise DataError(f"{path} needs: pip install 'apu-casadi[parquet]' ({e})") from None
+    except Exception as e:
+        raise DataError(f"{path}: damaged ({type(e).__name__}: {e})") from None
+    frame = frame[frame["status"] == "done"]
+    return {str(n): frame[n].to_numpy() for n in frame}
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What was predicted of each run, in the order of the labels.
+
+    Args:
+        values: by column; text for ``class`` and ``phase``, NaN where nothing was said.
+    """
+
+    values: Mapping[str, np.ndarray]
+
+
+def read_predictions(path: str | Path, labels: Mapping[str, np.ndarray]) -> Predictions:
+    """Read predictions of all runs given by their labels.
+
+    Raises:
+        DataError: an unknown column or class, a run that is missing, doubled or not there, no
+            number; with line and value.
+    """
+    rows = list(csv.reader(io.StringIO(files.read_text(path))))
+    if not rows:
+        raise DataError(f"{path}: empty")
+    head = [h.strip() for h in rows[0]]
+    for h in head:
+        if h not in COLUMNS:
+            raise DataError(f"{path}: column {h!r} {nearest(h, COLUMNS)}")
+    if missing := [n for n in ("run", "class") if n not in head]:
+        raise DataError(f"{path}: column {missing[0]} is missing")
+    found: dict[int, dict[str, Any]] = {}
+    for line, row in enumerate(rows[1:], 2):
+        if not any(c.strip() for c in row):
+            continue
+        if len(row) != len(head):
+            raise DataError(f"{path}: line {line} has {len(row)} cells, {len(head)} are expected")
+        cells = {n: _cell(path, line, n, c.strip()) for n, c in zip(head, row, strict=True)}
+        run = cells["run"]
+        if run in found:
+            raise DataError(f"{path}: line {line}: run {run} is there twice")
+        found[run] = cells
+    runs = [int(n) for n in labels["run"]]
+    _compare(path, found, runs)
+    return Predictions({n: np.array([found[k][n] for k in runs]) for n in head})
+
+
+def _compare(path: str | Path, found: Mapping[int, Any], runs: Sequence[int]) -> None:
+    for what, odd in (
+        ("are missing", sorted(set(runs) - set(found))),
+        ("are not in the data set", sorted(set(found) - set(runs))),
+    ):
+        if odd:
+            some = ", ".join(map(str, odd[:5])) + (", ..." if len(odd) > 5 else "")
+            raise DataError(f"{path}: {len(odd)} runs {what}: {some}")
+
+
+def _cell(path: str | Path, line: int, name: str, text: str) -> Any:
+    if name == "class":
+        if text not in CLASSES:
+            raise DataError(f"{path}: line {line}: class {text!r} {nearest(text, CLASSES)}")
+        return text
+    if name == "phase":
+        if text not in ("", "a", "b", "c"):
+            raise DataError(f"{path}: line {line}: phase {text!r}: a, b, c or nothing is expected")
+        return text
+    if name == "run":
+        if not text.isdecimal():
+            raise DataError(f"{path}: line {line}: run {text!r} is no whole number")
+        return int(text)
+    try:
+        return float(text) if text else math.nan
+    except ValueError:
+        raise DataError(f"{path}: line {line}: {name} = {text!r} is no number") from None
+
+
+# ------------------------------------------------------------------------------ scores
+
+
+def score(p: Predictions, labels: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return all scores, by split, ready for JSON."""
+    split = labels["split"]
+    parts = {"all": np.ones(split.size, dtype=bool)}
+    parts |= {s: split == s for s in SPLITS if (split == s).any()}
+    return {
+        name: _score(
+            {n: v[mask] for n, v in p.values.items()}, {n: v[mask] for n, v in labels.items()}
+        )
+        for name, mask in parts.items()
+    }
+
+
+def _score(p: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    true, said = y["class"], p["class"]
+    ill = true != "healthy"
+    out: dict[str, Any] = {
+        "runs": int(true.size),
+        "accuracy": float(np.mean(true == said)),
+        "kappa": cohen_kappa(true, said),
+        "detected": _share(said[ill] != "healthy"),
+        "false_alarms": _share(said[~ill] != "healthy"),
+        "confusion": confusion(true, said),
+        "by_class": {
+            c: {
+                "runs": int((true == c).sum()),
+                "right": _share(said[true == c] == c),
+                "detected": _share(said[true == c] != "healthy"),
+            }
+            for c in CLASSES
+            if (true == c).any()
+        },
+    }
+    if "score" in p:
+        out["detected_at_false_alarms"] = {
+            "false_alarms": FALSE_ALARMS, "detected": at_false_alarms(p["score"], ill),
+        }  # fmt: skip
+    if "alarm_time" in p:
+        out["latency"] = _latency(p["alarm_time"], y)
+    short = np.isin(true, ["ttsc", "combined"]) & np.isin(said, ["ttsc", "combined"])
+    for name in ("phase", "generator"):
+        if name in p and short.any():
+            out[f"{name}_right"] = _share(p[name][short] == y[name][short])
+    out["severities"] = {n: _severity(n, p, y) for n in SEVERITIES if n in p}
+    return out
+
+
+def _share(hit: np.ndarray) -> float | None:
+    return float(hit.mean()) if hit.size else None
+
+
+def cohen_kappa(true: np.ndarray, said: np.ndarray) -> float | None:
+    """Return Cohen's kappa: agreement beyond chance, over what is possible beyond it."""
+    names = np.unique(np.concatenate([true, said]))
+    a = np.array([(true == n).mean() for n in names])
+    b = np.array([(said == n).mean() for n in names])
+    chance = float(a @ b)
+    return None if chance >= 1.0 else (float((true == said).mean()) - chance) / (1.0 - chance)
+
+
+def confusion(true: np.ndarray, said: np.ndarray) -> dict[str, dict[str, int]]:
+    """Return how often each class was called what."""
+    return {
+        t: {s: int(n) for s in CLASSES if (n := ((true == t) & (said == s)).sum())}
+        for t in CLASSES
+        if (true == t).any()
+    }
+
+
+def at_false_alarms(value: np.ndarray, ill: np.ndarray, share: float = FALSE_ALARMS) -> Any:
+    """Return the share of faulty runs above the threshold that ``share`` of healthy ones exceed."""
+    if not (~ill).any() or not ill.any() or not np.isfinite(value).all():
+        return None
+    healthy = np.sort(value[~ill])
+    k = math.floor(share * healthy.size)  # so many healthy runs may lie above
+    return float((value[ill] > healthy[healthy.size - 1 - k]).mean())
+
+
+def _latency(alarm: np.ndarray, y: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Time from onset to alarm; an alarm before the onset is a false one."""
+    ill = y["class"] != "healthy"
+    late = alarm[ill] - y["onset"][ill]
+    right = late[late >= 0]
+    return {
+        "median": float(np.median(right)) if right.size else None,
+        "p90": float(np.quantile(right, 0.9)) if right.size else None,
+        "found": _share(late >= 0),
+        "early": _share(late < 0),
+        "false_alarms": _share(np.isfinite(alarm[~ill])),
+    }
+
+
+def _severity(name: str, p: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray]) -> Any:
+    said, true = p[name], y[name]
+    there = np.isfinite(said)
+    out: dict[str, Any] = {"runs": int(there.sum())}
+    if not there.any():
+        return out
+    e = (said - true)[there]
+    out["rmse"] = float(np.sqrt(np.mean(e**2)))
+    present = there & (true != (0.0 if name == "h" else 1.0))
+    if present.any():
+        size = np.abs(true - (0.0 if name == "h" else 1.0))[present]
+        miss = (said - true)[present]
+        out["relative_rmse_if_faulty"] = float(np.sqrt(np.mean((miss / size) ** 2)))
+        halves = size <= np.median(size)
+        out["rmse_small"], out["rmse_large"] = (
+            float(np.sqrt(np.mean(miss[m] ** 2))) if m.any() else None for m in (halves, ~halves)
+        )
+    sigma = p.get(f"{name}_sigma")
+    if sigma is not None and (ok := there & (sigma > 0)).any():
+        out["coverage_95"] = float((np.abs(said - true)[ok] <= LEVEL * sigma[ok]).mean())
+    return out

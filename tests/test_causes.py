@@ -1,0 +1,122 @@
+"""What a change is, told of runs in which it is known: phase, sensor, winding, harmonics, gas path.
+
+The truths are joint runs of 0.2 s; sensors have gain errors and noise.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import FaultChange, HealthChange
+from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.electrical.causes import causes_of_change
+from estimators.apu.gascauses import causes_of_alarms
+from estimators.apu.gaspath import gas_path_filter
+from estimators.apu.healthjumps import Tracked
+from estimators.apu.measuring import measure_run
+from estimators.apu.sensors import ELECTRICAL
+
+# each runs a dozen filters that are made for it
+pytestmark = pytest.mark.ci
+
+APU, AT = Apu(), 0.1
+
+
+def run(*events, apu=APU, duration=0.2):
+    return simulate_joint(
+        apu, duration=duration, load=SeriesLoad.from_power(150e3), events=events, dt=0.005,
+        exchange="corrected", waveform_dt=1e-4,
+    )  # fmt: skip
+
+
+def waves(*events, apu=APU, seed=1):
+    made = measure_run(run(*events, apu=apu), APU, seed)["electrical"]
+    return {"t": made["time"].values} | {str(n): made[n].values.copy() for n in made}
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return waves()
+
+
+def cause(samples):
+    return causes_of_change(APU.generator.machine, ELECTRICAL, samples, AT)
+
+
+@pytest.mark.parametrize("phase", "abc")
+def test_a_short_circuit_and_its_phase(phase):
+    """h = 5e-4: too small to be told from gain errors if it had been there before."""
+    found = cause(waves(FaultChange(AT, Ttsc.of_h(0.02, 5e-4, phase=phase))))
+    assert found.best == f"short circuit {phase}" and found.probability[found.best] > 0.99
+
+
+def test_nothing_happened(healthy):
+    found = cause(healthy)
+    assert found.best == "healthy" and found.probability["healthy"] > 0.9
+    assert sum(found.probability.values()) == pytest.approx(1.0)
+
+
+def test_a_current_sensor_that_fails(healthy):
+    t = healthy["t"]
+    rng = np.random.default_rng(0)
+    stuck = np.where(t >= AT, healthy["i_b"][int(np.searchsorted(t, AT))], healthy["i_b"])
+    for n, v in (
+        ("i_b", stuck),
+        ("i_a", healthy["i_a"] + 20.0 * (t >= AT)),
+        ("i_c", healthy["i_c"] + (t >= AT) * 10 * rng.standard_normal(t.size)),
+    ):
+        found = cause(healthy | {n: v})
+        assert found.best == f"sensor {n}" and found.probability[found.best] > 0.99
+
+
+def test_a_voltage_sensor_harmonics_a_hot_winding(healthy):
+    t = healthy["t"]
+    off = healthy | {"v_a": healthy["v_a"] + 10.0 * (t >= AT)}
+    assert cause(off).best == "voltage sensors"
+    fifth = {
+        f"i_{p}": healthy[f"i_{p}"] + 5.0 * np.cos(5 * (2513.27 * t - k * 2.0944))
+        for k, p in enumerate("abc")
+    }
+    assert cause(healthy | fifth).best == "harmonics"
+    r_fd = APU.generator.machine.r_fd
+    hot = APU.change({"machine.r_fd": 1.2 * r_fd})
+    assert cause(waves(apu=hot)).best == "hot winding"
+
+
+def test_too_few_samples_tell_nothing(healthy):
+    early = {n: v[:80] for n, v in healthy.items()}
+    assert causes_of_change(APU.generator.machine, ELECTRICAL, early, 0.005) is None
+
+
+# ------------------------------------------------------------------------------ gas path
+
+
+@pytest.fixture(scope="module")
+def gas():
+    """2 s of a healthy unit, and of one that loses 3 % of compressor efficiency at 1 s."""
+    filt = gas_path_filter()
+    lost = HealthChange(1.0, {"f_eta_c": 0.97})
+    return filt, run(duration=2.0), run(lost, duration=2.0)
+
+
+def told(filt, data, k=55):
+    r = filt.run(data, backend="vm")
+    (c,) = causes_of_alarms(filt, Tracked(r, (k,), (k - 5,), data))
+    return c
+
+
+def test_the_gas_path_or_one_of_its_sensors(gas):
+    filt, quiet, worn = gas
+    c = told(filt, filt.recording(worn, 3))
+    assert c.best == "gas path" and c.probability["gas path"] > 0.9
+    assert told(filt, filt.recording(quiet, 3)).best == "none"
+    for name, share in (("P3", 0.04), ("T5", 0.06), ("T3", 0.06), ("N", 0.02)):
+        data = filt.recording(quiet, 3)
+        y = data.y.copy()
+        y[filt.model.y.index(name), 50:] *= 1 + share
+        c = told(filt, dataclasses.replace(data, y=y))
+        assert c.best == f"sensor {name}" and c.probability[c.best] > 0.9, c.probability

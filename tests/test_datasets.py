@@ -1,0 +1,245 @@
+"""Data sets: recipes are checked, runs depend on seeds alone, nothing is lost, scores are right."""
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from apu_casadi.core.errors import DataError, ScenarioError
+from scenarios import cli
+from scenarios.datasets import making, scoring
+from scenarios.datasets.recipe import CLASSES, Recipe, draw, read_recipe
+from scenarios.schema import Scenario
+
+pd = pytest.importorskip("pandas")
+pytest.importorskip("pyarrow")
+REFERENCE = read_recipe()
+
+
+def table(r=REFERENCE, **changed):
+    return {f.name: getattr(r, f.name) for f in dataclasses.fields(r)} | changed
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Eleven units, one of each class and two of the weighty, 0.6 s each, waveforms at 5 kHz."""
+    return Recipe.of(
+        table(
+            units=11, duration=0.6, onset=[0.2, 0.3], growing=0.0,
+            waveforms={"rate": 5000.0, "before": 0.05, "after": 0.1},
+        )
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(small, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("set") / "data"
+    assert making.make_dataset(small, folder, workers=1) == {"done": 11}
+    return folder
+
+
+def test_classes_and_splits_are_as_the_recipe_says():
+    drawn = [draw(REFERENCE, u, 0) for u in range(110)]
+    count = Counter(d.labels["class"] for d in drawn)
+    assert count == {c: 10 * REFERENCE.classes[c] for c in CLASSES}
+    split = Counter(REFERENCE.split_of(u) for u in range(1000))
+    assert all(abs(split[s] - 1000 * share) < 5 for s, share in REFERENCE.split.items())
+    for d in drawn[:22]:
+        s = Scenario.from_dict(d.scenario)
+        outside = d.labels["split"] == "range"
+        assert (s.ambient.altitude > 6999) == outside
+        assert (d.labels["h"] > 0) == (d.labels["class"] in ("ttsc", "combined"))
+    assert draw(REFERENCE, 5, 0) == draw(dataclasses.replace(REFERENCE, units=7), 5, 0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"unit": 3}, r"unknown key 'unit' \(did you mean 'units'"),
+        ({"units": 0}, "units = 0 must be a whole number >= 1"),
+        ({"seed": True}, "seed = True must be a whole number"),
+        ({"onset": [1.0, 7.0]}, "onset = .* is not inside the run"),
+        ({"growing": 2.0}, "growing = 2 is outside"),
+        ({"classes": {"healty": 1}}, r"'healty' \(did you mean 'healthy'"),
+        ({"classes": {"healthy": -1}}, "shares >= 0"),
+        ({"size": {**REFERENCE.size, "h": [0.0, 1.0]}}, r"\[size\] h = \[0, 1\] is no range"),
+        ({"spread": {"machine.rs": 0.1}}, r"machine.rs.*machine.r_s"),
+        ({"spread": {"machine.r_s": 0.5}}, "outside"),
+        ({"range": 3}, "range must be a table"),
+    ],
+)
+def test_a_wrong_recipe_is_told(changed, words):
+    with pytest.raises(ScenarioError, match=words):
+        Recipe.of(table(**changed))
+
+
+@pytest.mark.long
+def test_what_a_data_set_holds(small, made):
+    labels = scoring.read_labels(made)
+    assert sorted(labels["run"]) == list(range(11))
+    for u in range(11):
+        d = draw(small, u, 0)
+        gas = pd.read_parquet(made / f"gaspath/unit_{u:05d}.parquet")
+        assert list(gas) == list(making.gas_path_columns())
+        before, last = gas["time"] < d.labels["onset"] - 0.02, gas.iloc[-1]
+        for f in ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t"):
+            assert (gas.loc[before, f"T.{f}"] == 1).all()
+            assert last[f"T.{f}"] == pytest.approx(d.labels[f], rel=1e-6)
+        assert last["T.h"] == pytest.approx(d.labels["h"], rel=1e-3)
+        # noise and gain errors, no more, but where the sensor is the fault
+        names = [n for n in ("T3", "T5", "P3") if n != d.labels["sensor"]]
+        for n in names:
+            assert gas[f"X_s.{n}"].iloc[5] == pytest.approx(gas[f"X_v.{n}"].iloc[5], rel=0.03)
+        waves = pd.read_parquet(made / f"electrical/unit_{u:05d}.parquet")
+        assert len(waves) == 750 and not waves.isna().any().any()
+    assert Counter(labels["class"]) == {c: int(small.classes[c]) for c in CLASSES}
+
+
+def test_a_faulty_sensor_reads_wrong_from_its_onset():
+    t, y = np.linspace(0, 1, 51), np.full(51, 500.0)
+    for kind, ends in (("bias", 510.0), ("drift", 510.0), ("stuck", 500.0)):
+        d = draw(REFERENCE, 0, 0)
+        d = dataclasses.replace(d, sensor=("T5", kind, 0.02))
+        d.labels.update(onset=0.4, over=0.0)
+        read = making._faulty(d, "T5", t, y)
+        assert read[-1] == pytest.approx(ends) and (read[t < 0.4] == 500).all()
+        assert making._faulty(d, "T3", t, y) is y
+
+
+@pytest.mark.long
+def test_an_interrupted_one_goes_on_with_the_same_bits(small, made, tmp_path):
+    """Two units fewer, a damaged file, a record cut short: made again, and nothing else."""
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for p in made.rglob("*"):
+        if p.is_file():
+            (folder / p.relative_to(made)).parent.mkdir(exist_ok=True)
+            (folder / p.relative_to(made)).write_bytes(p.read_bytes())
+    (folder / "gaspath/unit_00003.parquet").write_bytes(b"damaged")
+    (folder / "units/unit_00004.json").write_text('{"files": {')
+    again = []
+    making.make_dataset(small, folder, workers=1, progress=lambda k, n: again.append((k, n)))
+    assert again == [(10, 11), (11, 11)]
+    for line in (made / "checksums.sha256").read_text().splitlines():
+        digest, name = line.split()
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest
+    with pytest.raises(DataError, match="another recipe"):
+        making.make_dataset(dataclasses.replace(small, seed=1), folder)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("")
+    with pytest.raises(DataError, match="holds other files"):
+        making.make_dataset(small, tmp_path / "full")
+
+
+def test_a_refused_run_keeps_its_reason(small):
+    r = dataclasses.replace(small, range={**small.range, "power_kW": (900.0, 900.0)})
+    labels, gas, waves = making.make_run(r, 0, 0)
+    assert labels["status"] == "refused" and labels["reason"] and not gas and not waves
+
+
+def predictions(path, rows):
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
+def test_scores_against_numbers_by_hand(tmp_path):
+    """Kappa 0.5 of the textbook's table; latencies, rates and coverage that can be counted."""
+    true = np.array(["ttsc"] * 25 + ["healthy"] * 25)
+    labels = {
+        "run": np.arange(50),
+        "class": true,
+        "split": np.array(["test"] * 50),
+        "onset": np.where(true == "ttsc", 2.0, np.nan),
+        "h": np.where(true == "ttsc", 1e-3, 0.0),
+        "phase": np.array(["a"] * 50),
+        "generator": np.ones(50),
+    }
+    said = ["ttsc"] * 20 + ["healthy"] * 5 + ["ttsc"] * 10 + ["healthy"] * 15
+    rows = [
+        {"run": k, "class": s, "score": float(s == "ttsc") + (k < 10), "alarm_time": 2.5,
+         "phase": "a" if k < 10 else "b", "h": 1.1e-3, "h_sigma": 1e-4}
+        for k, s in enumerate(said)
+    ]  # fmt: skip
+    p = scoring.read_predictions(predictions(tmp_path / "p.csv", rows), labels)
+    s = scoring.score(p, labels)["test"]
+    assert s["accuracy"] == pytest.approx(0.7) and s["kappa"] == pytest.approx(0.4)
+    assert s["detected"] == 0.8 and s["false_alarms"] == 0.4
+    assert s["confusion"]["ttsc"] == {"healthy": 5, "ttsc": 20}
+    assert s["detected_at_false_alarms"] == {"false_alarms": 0.05, "detected": 0.4}
+    assert s["latency"]["median"] == 0.5 and s["latency"]["false_alarms"] == 1.0
+    assert s["phase_right"] == 0.5
+    assert s["severities"]["h"]["coverage_95"] == 0.5  # 1e-4 off: one sigma; healthy ones eleven
+    assert s["severities"]["h"]["relative_rmse_if_faulty"] == pytest.approx(0.1)
+    assert scoring.cohen_kappa(true, true) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: rows[:-1], "1 runs are missing: 2"),
+        (lambda rows: [*rows, rows[0]], "line 5: run 0 is there twice"),
+        (lambda rows: [*rows, {"run": 9, "class": "ttsc"}], "1 runs are not in the data set: 9"),
+        (lambda rows: [{**r, "class": "tstc"} for r in rows], r"'tstc' \(did you mean 'ttsc'"),
+        (lambda rows: [{**r, "hh": 1} for r in rows], r"column 'hh' \(did you mean 'h'"),
+        (lambda rows: [{**r, "h": "big"} for r in rows], "line 2: h = 'big' is no number"),
+        (lambda rows: [{"run": r["run"]} for r in rows], "column class is missing"),
+    ],
+)
+def test_predictions_that_do_not_fit_are_refused(tmp_path, change, words):
+    labels = {"run": np.arange(3), "class": np.array(["healthy"] * 3)}
+    rows = change([{"run": k, "class": "healthy"} for k in range(3)])
+    with pytest.raises(DataError, match=words):
+        scoring.read_predictions(predictions(tmp_path / "p.csv", rows), labels)
+
+
+@pytest.mark.long
+def test_commands(made, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["dataset", "recipe"]) == 0
+    (tmp_path / "mine.toml").write_text(capsys.readouterr().out)
+    assert read_recipe(tmp_path / "mine.toml") == REFERENCE
+    assert cli.main(["dataset", "baseline", "chance", "--dataset", str(made), "--quiet"]) == 0
+    assert cli.main(["score", "predictions.csv", "--dataset", str(made), "--split", "all"]) == 0
+    out = capsys.readouterr().out
+    assert "split all: 11 runs" in out and "Cohen's kappa" in out
+    assert cli.main(["score", "predictions.csv", "--dataset", str(made), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["all"]["runs"] == 11
+    assert cli.main(["score", "predictions.csv", "--dataset", str(tmp_path)]) == 2
+    assert "apu dataset make" in capsys.readouterr().err
+
+
+@pytest.mark.ci  # starts a scheduler and its workers
+def test_a_cluster_whose_worker_is_killed_gives_the_same_bits(small, made, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as c:
+        killed = []
+
+        def progress(k, n):
+            if k == 2 and not killed:
+                killed.append(next(iter(c.workers.values())))
+                killed[0].process.process.kill() if hasattr(killed[0], "process") else None
+
+        making.make_dataset(
+            small, tmp_path / "data", cluster=c.scheduler_address, progress=progress
+        )
+    sums = (tmp_path / "data/checksums.sha256").read_text()
+    assert sums == (made / "checksums.sha256").read_text()
+
+
+@pytest.mark.long
+def test_metadata_names_every_file_and_column(small, made):
+    meta = json.loads((made / "croissant.json").read_text())
+    assert (
+        meta["distribution"][0]["sha256"]
+        == hashlib.sha256((made / "runs.parquet").read_bytes()).hexdigest()
+    )
+    fields = {r["@id"]: [f["name"] for f in r["field"]] for r in meta["recordSet"]}
+    assert fields["gaspath_samples"] == list(making.gas_path_columns())
+    assert fields["runs"] == list(pd.read_parquet(made / "runs.parquet"))
+    card = (made / "CARD.md").read_text()
+    assert "11 runs" in card and "{{" not in card and "| `X_s.T5` | K |" in card
+    assert math.isfinite(small.duration)
