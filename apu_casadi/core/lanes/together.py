@@ -110,7 +110,7 @@ class Together:
         one: Callable[..., tuple[np.ndarray, ...]] | None = None,
     ) -> None:
         self.fun, self.of = fun, of
-        self._one = Caller(fun, copy=False) if one is None else one
+        self._one = one  # a member's own is never made where all ask
         self._wide: Caller | None = None
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
@@ -123,17 +123,22 @@ class Together:
         """
         member = _here.get()
         if member is None:
-            return self._one(*given)
+            return self._alone(*given)
         results = member.answered(self)
         if results is None:
             member.asks = Question(self, tuple(np.array(a, dtype=float) for a in given))
             raise member.asks
         return results
 
+    def _alone(self, *given: Any) -> tuple[np.ndarray, ...]:
+        if self._one is None:
+            self._one = Caller(self.fun, copy=False)
+        return self._one(*given)
+
     def evaluate(self, asked: Sequence[tuple[np.ndarray, ...]]) -> list[tuple[np.ndarray, ...]]:
         """Return the results for some members, as many as there are lanes at most."""
         if len(asked) == 1:
-            return [tuple(a.copy() for a in self._one(*asked[0]))]
+            return [tuple(a.copy() for a in self._alone(*asked[0]))]
         wide, n = self._call, len(asked)
         lanes = wide.fun.size2_out(0) // self._outputs[0][1]
         if n > lanes:
