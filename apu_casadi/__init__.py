@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from apu_casadi.machine.loads.open import OpenLoad
     from apu_casadi.machine.loads.series import SeriesLoad
     from apu_casadi.unit.apu import Apu, trim
+    from apu_casadi.unit.ensemble import simulate_ensemble
     from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
     from apu_casadi.unit.multirate import simulate_joint
     from apu_casadi.unit.noise import Noise
@@ -57,6 +58,7 @@ __all__ = [
     "Steps",
     "Ttsc",
     "__version__",
+    "simulate_ensemble",
     "simulate_joint",
     "trim",
     "trim_batch",
@@ -87,6 +89,7 @@ _HOME = {
     "StateSpace": "apu_casadi.core.statespace",
     "Steps": "apu_casadi.core.profiles.points",
     "Ttsc": "apu_casadi.machine.faults.ttsc",
+    "simulate_ensemble": "apu_casadi.unit.ensemble",
     "simulate_joint": "apu_casadi.unit.multirate",
     "trim": "apu_casadi.unit.apu",
     "trim_batch": "apu_casadi.gaspath.steady.trimbatch",

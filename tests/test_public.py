@@ -41,6 +41,7 @@ PUBLIC = {
     "Steps",
     "Ttsc",
     "__version__",
+    "simulate_ensemble",
     "simulate_joint",
     "trim",
     "trim_batch",
