@@ -301,6 +301,21 @@ def test_caller_returns_copies_unless_told_otherwise():
     assert a[0] == X[1] and b[0] == 2 * X[1]
 
 
+@needs_compiler
+def test_what_is_called_a_few_times_needs_no_compiler(monkeypatch):
+    """The compiler runs once, when calls are many; a library that is there is loaded at once."""
+    runs, f = count_compilations(monkeypatch), pendulum()
+    call = backend.Gradual(f)
+    made = [call(X, P)[0].tolist() for _ in range(backend.OFTEN - 1)]
+    assert not runs and backend.loaded_functions() == []
+    made += [call(X, P)[0].tolist() for _ in range(backend.OFTEN)]
+    assert len(runs) == 1 and backend.loaded_functions() == ["pendulum"]
+    np.testing.assert_allclose(made, np.broadcast_to(made[0], (len(made), 2)), rtol=1e-15)
+    again = backend.Gradual(pendulum())
+    assert again(X, P)[0].tolist() == made[-1] and len(runs) == 1
+    assert again._call.fun.class_name() == "External"
+
+
 @pytest.mark.parametrize("n_threads", [1, 2, 3])
 @pytest.mark.parametrize("n", [1, 5, 16, 17, 300])
 def test_mapped_is_the_function_column_by_column(n, n_threads):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import ScenarioError, SignalError
-from scenarios.bench import benchmarks, linearity, runparts
+from scenarios.bench import benchmarks, laneparts, linearity, runparts
 from scenarios.bench.measuring import Row, Size, child
 from scenarios.cli import main
 from scenarios.figures.benchplot import fit, plot_costs
@@ -47,6 +47,14 @@ def test_the_joint_parts_run_and_are_accurate(monkeypatch):
     monkeypatch.setattr(runparts, "_virtual_machine", lambda *_: [])
     rows = runparts.joint(TINY) + runparts.campaign(TINY)
     assert len(rows) == 3 and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
+
+
+@pytest.mark.ci  # as above
+def test_lanes_are_timed_beside_scalar_code_with_the_same_results():
+    rows = laneparts.lanes(TINY)
+    assert len(rows) == 4 and all(r.accurate and r.ratio > 0 for r in rows)
+    assert laneparts.off([1.0, np.nan], [1.0, np.nan]) == 0.0
+    assert laneparts.off([1.0, np.nan], [1.0, 2.0]) == np.inf
 
 
 def test_errors_leave_out_the_first_half_millisecond():

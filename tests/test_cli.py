@@ -130,6 +130,41 @@ def test_an_interruption_says_what_was_written(fake, capsys, monkeypatch):
     )
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (
+            "rum",
+            "apu: error: argument COMMAND: unknown 'rum' (did you mean 'run'?); see apu --help",
+        ),
+        (
+            "estimate jiont",
+            "apu estimate: error: argument ACTION: unknown 'jiont' (did you mean 'jo",
+        ),
+        (
+            "export fmu apuu",
+            "apu export fmu: error: argument model: unknown 'apuu' (did you mean 'a",
+        ),
+        ("linearise --model gass", "argument --model: unknown 'gass' (did you mean 'gas'?)"),
+        ("campaign --runs 1.5", "argument --runs: a whole number is expected, got '1.5'"),
+        ("trim --power abc", "argument --power: a finite number is expected, got 'abc'"),
+        (
+            "trim --load kind=R",
+            "'key = value, ...' is expected, as TOML has it, words as in kind = ",
+        ),
+        ("run", "the following arguments are required: SCENARIO; see apu run --help"),
+        (
+            "run joint --strct",
+            "unrecognized arguments: --strct (did you mean '--strict'?); see apu ",
+        ),
+    ],
+)
+def test_wrong_usage_is_one_line_with_the_nearest_word(capsys, line, words):
+    assert cli.main(line.split()) == 2
+    err = capsys.readouterr().err
+    assert words in err and err.count("\n") == 1 and " error: " in err
+
+
 def test_failed_simulation_is_status_1_and_interrupt_130(fake, capsys, monkeypatch):
     def fails(*_):
         raise OperatingPointError("beyond surge at 3.2 s")

@@ -1,6 +1,7 @@
 """Loads and faults that change in time, propagated with interpolated tables, against CVODES."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from apu_casadi.core.profiles.points import Points
 from apu_casadi.core.profiles.profile import at, varying
 from apu_casadi.core.profiles.shapes import Growth, Ramp
 from apu_casadi.machine import transition
-from apu_casadi.machine.course import Course
+from apu_casadi.machine.course import Course, Piece
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -167,3 +168,16 @@ def test_tables_are_made_once_for_all_runs(monkeypatch):
         before = len(made)
         course_of(load, None).numbers(np.array([20.0]))
         assert (len(made) > before) == bool(least)
+
+
+def test_pieces_of_unequal_harmonics_go_on_by_single_steps(monkeypatch):
+    """Two pieces of one layout whose tables have more or fewer harmonics: no block of both."""
+    fast = SimpleNamespace(layout=("same",), smooth=1.0)
+    pieces = {
+        k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), np.zeros(2), np.zeros(2)) for k in (0, 1)
+    }
+    course = object.__new__(Course)
+    course._only, course.ss = None, SimpleNamespace(name="model")
+    monkeypatch.setattr(course, "_piece", lambda s: pieces[int(s)], raising=False)
+    with pytest.raises(NotApplicable, match="model: the structure changes on the way"):
+        course.numbers(np.array([0.9, 1.1]))

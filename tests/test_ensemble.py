@@ -6,7 +6,7 @@ import pytest
 from apu_casadi import Apu, FaultChange, HealthChange, LoadChange, SeriesLoad, Ttsc, simulate_joint
 from apu_casadi.core.backend import find_compiler
 from apu_casadi.core.errors import BackendError, OperatingPointError, ScenarioError, SimulationError
-from apu_casadi.core.lanes.together import Member, Question, Together, answer
+from apu_casadi.core.lanes.together import Member, Question, Together, answer, ensemble
 from apu_casadi.unit.ensemble import simulate_ensemble
 from apu_casadi.unit.noise import Noise
 
@@ -141,3 +141,27 @@ def test_a_hook_that_simulates_does_so_by_itself(alone):
 
     (ds,) = simulate_ensemble([{"load": LOAD, "hook": hook, **COMMON, "duration": 0.1}])
     assert float(ds["time"][-1]) == 0.1
+
+
+def test_no_more_members_are_under_way_than_a_chunk():
+    """Memory is that of a chunk: courses begin when others have ended."""
+    f, x, alive, most = doubled(), np.eye(2), [0], [0]
+
+    def course(k):
+        alive[0] += 1
+        most[0] = max(most[0], alive[0])
+        for _ in range(k % 3):
+            while True:
+                try:
+                    made = f(k * x)[0]
+                    break
+                except Question as question:
+                    asked = question
+                yield asked
+            assert np.array_equal(made, 2 * k * x)
+        alive[0] -= 1
+        return k
+
+    done = dict(ensemble(map(course, range(20)), chunk=4))
+    assert done == {k: k for k in range(20)}
+    assert 1 < most[0] <= 4

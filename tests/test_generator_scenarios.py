@@ -172,7 +172,7 @@ def test_the_table_of_the_command_tells_each_generator(ds):
 
 
 def test_captions_tell_generator_and_phase(ds):
-    note = runwords._severity_note(ds)
+    note = runwords.severity_note(ds)
     assert note.startswith("TTSC of phase c of generator 2: µ = 5 %")
     told = runwords.made_with(ds)
     assert "Load of generator 1 100 kW, then 80 kW, power factor 0.85;" in told

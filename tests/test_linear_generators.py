@@ -5,11 +5,11 @@ import pytest
 from test_linearisation import NOT_SMOOTH, central_differences, stacked
 
 from apu_casadi import Apu, Generator, SeriesLoad, Ttsc
-from apu_casadi.core.errors import SignalError
+from apu_casadi.core.errors import ScenarioError, SignalError
 from apu_casadi.core.simulation import stepper
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.unit.assembled import assembled
-from apu_casadi.unit.averaged import joint_vectors
+from apu_casadi.unit.averaged import joint_averaged, joint_vectors
 from apu_casadi.unit.linearisation import (
     linearise_gas_generator,
     linearise_generator,
@@ -197,6 +197,18 @@ def test_parameters_beside_a_fault_are_refused(faulty):
         linearise_joint(PLAIN, point, free=["machine.r_s"])
     with pytest.raises(SignalError, match=r"'machine.r_s' .*generator\d.machine.r_s"):
         linearise_joint(OTHER, OTHER.steady_state(KW100), free=["machine.r_s"])
+
+
+def test_wrong_groups_are_told():
+    for of, words in (
+        (((1,),), "must be in one"),
+        (((1, 2), (2,)), "in one"),
+        (((1, 2),), "differ"),
+    ):
+        with pytest.raises(SignalError, match=words):
+            joint_averaged(OTHER, "resistive", (), of)
+    with pytest.raises(ScenarioError, match="load_kind: 2 entries expected"):
+        joint_averaged(OTHER, ("resistive",))
 
 
 def test_a_parameter_of_one_machine_is_free():

@@ -44,6 +44,17 @@ def test_norms_are_what_they_say():
     assert max(study.errors(truth, truth).values()) == 0.0
 
 
+def test_of_generators_that_differ_the_worst_voltage_counts():
+    """Where each has its own power, the error of one of them is that of the unit."""
+    truth, wrong = run_of(0.02), run_of(0.02, V=0.999)
+    two = [ds.drop_vars("P_e").copy() for ds in (truth, truth)]
+    for ds, others in zip(two, ((truth, truth), (truth, wrong)), strict=True):
+        ds["P_e"] = ("generator", "time"), np.array([d.P_e.values for d in others])
+    assert study.errors(two[1], two[0])["V"] == pytest.approx(0.001, rel=1e-9)
+    assert set(study.OF_ONE).isdisjoint(study.CASES)
+    assert all(case.event.generator for case in study.OF_ONE.values())
+
+
 def test_order_is_the_slope():
     """First and second power come out as orders 1 and 2."""
     orders = {r["exchange"]: r["N"] for r in study.report(rows())["orders"]}

@@ -6,10 +6,12 @@ import struct
 
 import numpy as np
 import pytest
+import xarray as xr
 from synthetic_joint import synthetic_joint
 
 from apu_casadi.core.errors import DataError
-from scenarios.figures import plotting
+from scenarios.figures import chosen, plotting
+from scenarios.figures import figstyle as fs
 from scenarios.figures.threephase import cycle_rms, envelope
 
 
@@ -67,6 +69,48 @@ def test_phase_names_do_not_overlap_or_leave_the_figure(ds, key):
     for one, other in itertools.pairwise(boxes):
         assert one.x1 <= other.x0 + 2
     assert all(b.y1 <= fig.bbox.y1 and b.x0 >= 0 for b in boxes)
+
+
+def test_the_phases_that_matter_are_enlarged():
+    """Of seven: those in which wear and a fault begin and end, not the first ones."""
+    t = np.linspace(0.0, 7.0, 701)
+    starts = range(7)
+    rows = [{"name": f"phase {k}", "start": float(k), "end": k + 1.0} for k in starts]
+    step = np.floor(np.clip(t - 1e-9, 0, 6))
+    rms = {f"I_{p}_rms": 100.0 + 20.0 * np.minimum(step, 3) for p in "abc"}
+    rms["I_a_rms"] = rms["I_a_rms"] - 2.0 * (step == 5)
+    values = {
+        **rms, "f_eta_c": np.where(step >= 4, 0.99, 1.0), "mu": np.where(step == 5, 0.05, 0.0),
+        "k_rf": np.where(step == 5, 20.0, np.nan), "N": 3775.0 - step,
+    }  # fmt: skip
+    ds = xr.Dataset({n: ("time", v) for n, v in values.items()}, {"time": t})
+    assert chosen.worn(ds, rows) == [4, 5, 6]
+    assert chosen.largest(ds, rows, list(rms), 3) == [4, 5, 6]
+    assert chosen.largest(ds, rows, list(rms), 4)[1:] == [4, 5, 6]
+    assert chosen.quietest(ds, rows, ds["N"].values) in (4, 5, 6)
+    quiet = ds.assign(f_eta_c=("time", np.ones(701)), mu=("time", np.zeros(701)))
+    assert chosen.worn(quiet.drop_vars("k_rf"), rows) == []
+    assert set(chosen.largest(quiet.drop_vars("k_rf"), rows, list(rms), 3)) == {1, 2, 3}
+
+
+def test_only_the_papers_scenario_has_the_papers_numbers(ds):
+    own = ds.copy()
+    own.attrs = {**ds.attrs, "scenario": json.dumps({"name": "mine"})}
+    captions = [[t.get_text() for t in plotting.figure_21(x).texts][-1] for x in (ds, own)]
+    assert captions[0].startswith("Figure 21. Shaft speed")
+    assert captions[1].startswith("Shaft speed")
+
+
+def test_tick_labels_of_a_long_run_do_not_touch():
+    """An enlargement at the end of half an hour, three abreast."""
+    fig = fs.new_figure(2.0)
+    with fs.drawing():
+        ax = fig.add_axes((0.1, 0.2, 0.25, 0.7))
+        ax.set_xlim(1799.8, 1801.4)
+        fs.few_ticks(ax, 1801.4)
+        fig.canvas.draw()
+    boxes = [b.get_window_extent() for b in ax.get_xticklabels() if b.get_text()]
+    assert all(a.x1 + 4 < b.x0 for a, b in itertools.pairwise(boxes))
 
 
 def test_envelope_loses_no_peak():

@@ -13,10 +13,11 @@ from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
-from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.apu import Apu, trim
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
 from apu_casadi.unit.monolithic import simulate_monolithic
 from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.severity import severity
 from scenarios import registry
 from scenarios.schema import Scenario
 
@@ -345,6 +346,25 @@ def test_speed_and_jumps_of_a_generator_alone():
 def test_a_steady_point_is_of_one_instant(given, words):
     with pytest.raises(ScenarioError, match=words):
         UNIT.steady_state(**{"load": KW100, **given})
+
+
+def test_models_and_studies_of_one_instant_say_so():
+    gen, grow = UNIT.generator, varying(Ttsc, 0.05, Ramp(90.0, 20.0, over=2.0))
+    at = {"N": 3775.0, "PW": 2e5}
+    for wrong in (
+        lambda: gen.variant(RAMP),
+        lambda: gen.inputs(RAMP),
+        lambda: gen.variant(KW100, grow),
+        lambda: gen.fault_vector(KW100, grow),
+        lambda: severity(grow),
+        lambda: trim(UNIT.gas_generator, at, theta={"f_W_c": Ramp(1.0, 0.9, over=3.0)}),
+        lambda: trim(UNIT.gas_generator, at, altitude=Ramp(0.0, 9e3, over=60.0)),
+        lambda: trim(UNIT.gas_generator, at | {"PW": Ramp(1e5, 2e5, over=60.0)}),
+    ):
+        with pytest.raises(
+            ScenarioError, match=r"is of one instant: give what it is then, .* t = "
+        ):
+            wrong()
 
 
 def test_a_load_of_a_command_must_not_change(tmp_path, capsys):

@@ -418,6 +418,7 @@ def test_commands(run, tmp_path, capsys, monkeypatch):
         assert words in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_noise_is_tuned_from_a_recording(files, tmp_path, capsys):
     """The command: ten samples know the noise of T5 to a quarter; JSON, figure and text agree."""
     gas = str(files[0])

@@ -6,7 +6,10 @@ import pytest
 import xarray as xr
 
 from apu_casadi.core import backend
+from apu_casadi.core.means import RMS, SEQUENCES
+from apu_casadi.machine.generator import Generator
 from scenarios.cli import main
+from scenarios.commands.trim import _electrical, _table
 
 
 def out(capsys, *argv):
@@ -26,6 +29,33 @@ def test_trim_prints_table_5(capsys):
     assert report["residual"] < 1e-9
     status, text, _ = out(capsys, "trim", *ambient, "--power", "222e3")
     assert status == 0 and "T3              534" in text and "residual" in text
+
+
+def test_every_output_of_a_generator_has_unit_and_meaning():
+    """At rest, and those of a periodic state."""
+    told = _electrical()
+    y = Generator().state_space().y.names
+    for name in (*y, *RMS, *SEQUENCES, "V_ref", "i_fault_rms"):
+        assert all(told[name]), name
+    table = _table({"V_ref": 1.0, "I_2_angle": -1.0}, ["V_ref", "I_2_angle"], told).splitlines()
+    assert table[0].endswith("1        voltage reference, per unit") and "  rad  " in table[1]
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (
+            ("--load", "225"),
+            "load = 225 W is outside 450 to 3.6e+05, a generator is rated 225000 W",
+        ),
+        (("--power", "222"), "--power = 222 W is outside"),
+        (("--speed", "3775", "--power", "2e5"), "--speed = 3775 r/min is outside 1.442e+04 to"),
+    ],
+)
+def test_likely_slips_of_a_unit_are_told(capsys, argv, words):
+    """kW for W, rad/s for r/min: taken, with one line."""
+    _, _, err = out(capsys, "trim", *argv)
+    assert f"warning: {words}" in err and "is the unit of the number right?" in err
 
 
 def test_trim_by_other_quantities(capsys):

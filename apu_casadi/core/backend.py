@@ -41,6 +41,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from apu_casadi.core.cachefolder import cache_folder, say, unsafe_file
 from apu_casadi.core.calling import Caller, Mapped, available_threads, mapped
@@ -50,6 +51,7 @@ from apu_casadi.core.sharing import BUILDING
 __all__ = [
     "Caller",
     "Code",
+    "Gradual",
     "Mapped",
     "available_threads",
     "backend_in_use",
@@ -73,6 +75,7 @@ BACKENDS = ("auto", "vm", "c")
 FLAGS = ("-fPIC", "-shared", "-fno-math-errno")  # no -ffast-math, because NaN must survive
 LEVELS = (1, 2, 3)  # -O1, -O2, -O3
 COMPILE_TIMEOUT = 900.0  # s
+OFTEN = 50  # calls that are enough for a :class:`Gradual` function to be compiled
 
 _chosen: list[use_backend | None] = [None]  # the last one is the choice of the process
 _here: ContextVar[str | None] = ContextVar("apu_backend", default=None)  # of a ``with`` block
@@ -234,6 +237,38 @@ def compiled(
         return known
     with BUILDING:
         return _find_or_make(fun, wanted, build, level)
+
+
+class Gradual:
+    """A :class:`Caller` that compiles its function when it has been called often.
+
+    A few steps between longer blocks then need no compiler: it takes seconds, and they some
+    milliseconds each in the virtual machine.  A library that is there is loaded at once.
+
+    Args:
+        fun, level: as for :func:`compiled`.
+        copy: as for :class:`Caller`.
+    """
+
+    def __init__(self, fun: ca.Function, *, level: int = 1, copy: bool = True) -> None:
+        self._fun, self._level, self._copy, self._calls = fun, level, copy, 0
+        self._call = self._made(build=False)
+
+    def _made(self, *, build: bool) -> Caller:
+        return Caller(compiled(self._fun, build=build, level=self._level), copy=self._copy)
+
+    @property
+    def inputs(self) -> list[np.ndarray]:
+        """Input buffers of this thread; see :class:`Caller`."""
+        return self._call.inputs
+
+    def __call__(self, *arrays: np.ndarray | float) -> tuple[np.ndarray, ...]:
+        """Evaluate."""
+        if self._calls < OFTEN:
+            self._calls += 1
+            if self._calls == OFTEN and self._call.fun is self._fun:
+                self._call = self._made(build=True)
+        return self._call(*arrays)
 
 
 def _ceiling() -> int:

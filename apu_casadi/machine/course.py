@@ -164,8 +164,9 @@ class Course(Generic[F]):
         alone = pieces[0] is pieces[1]
         if not alone:
             pieces = [self._piece(float(v)) for v in s]
-        fast = pieces[0].fast
-        if any(p.fast.layout != fast.layout for p in pieces[1:]):
+        fast, width = pieces[0].fast, pieces[0].powers.shape[1]
+        # as many harmonics of the rotor angle, too, which a layout need not tell
+        if any(p.fast.layout != fast.layout or p.powers.shape[1] != width for p in pieces[1:]):
             raise NotApplicable(f"{self.ss.name}: the structure changes on the way")
         first = s[0] if before is None else self._coordinate(np.array([before]))[0]
         jump = self._jump(pieces, s, float(first))

@@ -124,11 +124,13 @@ class Generator(Parametric):
         return _variant(self, self._structure(beside, found))
 
     def _structure(self, load: Load, fault: FaultStructure | None = None) -> Structure:
+        load = fixed(load, "load", "a model or its input")
         how = (self.neutral, self.exciter.absent, self.excitation, type(self.machine), self.power)
         return Structure(LoadStructure.of(load), fault, *how)
 
     def fault_kind(self, load: Load, fault: Fault | None) -> str | None:
         """Return which equations a fault needs beside this load."""
+        fault = fixed(fault, "fault", "a model or its parameter")
         return None if fault is None else fault.kind(load, self.neutral)
 
     def variant(self, load: Load, fault: Fault | None = None) -> GeneratorModel:
@@ -160,7 +162,8 @@ class Generator(Parametric):
         """Return the parameters theta of :meth:`variant` for this load and fault."""
         if fault is None:
             return np.zeros(0)
-        kind = fault.kind(load, self.neutral)
+        kind = self.fault_kind(load, fault)
+        assert kind is not None
         return Signals(fault.own(kind, self.neutral).theta).pack(fault.parameters(kind))
 
     def transfer(

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled
-from apu_casadi.core.calling import Caller
+from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.core.sharing import Rebuilt, kept
@@ -518,9 +517,9 @@ def _function(
 @kept
 def _caller(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int, _in_use: str
-) -> Caller:
+) -> Gradual:
     """The same in the backend in use, one for each layout."""
-    return Caller(compiled(_function(ss, quad, turn, harmonics), level=3))
+    return Gradual(_function(ss, quad, turn, harmonics), level=3)
 
 
 class MeanStep(Rebuilt):
@@ -599,7 +598,7 @@ class MeanStep(Rebuilt):
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]
         self.limits = np.array([drive] if self.constant else [drive, END_TOL])
         self._iw = ss.u.index("w_r")
-        self._compiled: Caller | None = None
+        self._compiled: Gradual | None = None
 
     # -- other numbers of the same structure (:mod:`apu_casadi.machine.course`) -----------------
 

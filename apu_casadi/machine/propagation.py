@@ -30,8 +30,7 @@ from typing import Any, ClassVar, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled
-from apu_casadi.core.calling import Caller
+from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
@@ -459,7 +458,7 @@ class Propagator(Rebuilt):
         self.function = _advance(*self.layout)
         self.tol = DRIVE_TOL["fine" if fine else "constant" if constant else "periodic"]
         self.limits = np.array([self.tol])
-        self._compiled: Caller | None = None
+        self._compiled: Gradual | None = None
         self._t = dt * (np.arange(1, n_out + 1) / n_out)  # rounded as a Stepper does
         self._angle = ss.x.index("theta_e")
         self._iw = ss.u.index("w_r")
@@ -583,6 +582,6 @@ def _caller(
     quad: tuple[str, ...],
     constant: bool,
     _in_use: str,
-) -> Caller:
+) -> Gradual:
     """Function of :func:`_advance` in the backend in use, one for each layout."""
-    return Caller(compiled(_advance(ss, n_out, plan, outputs, quad, constant), level=3), copy=False)
+    return Gradual(_advance(ss, n_out, plan, outputs, quad, constant), level=3, copy=False)

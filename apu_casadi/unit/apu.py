@@ -91,16 +91,6 @@ class JointPoint:
         """Operating point of one generator, counted from 1."""
         return (self.generator, *self.others)[number - 1] if self.others else self.generator
 
-    def common(self, what: str) -> GeneratorPoint:
-        """Operating point of each generator, for ``what`` needs them alike.
-
-        Raises:
-            OperatingPointError: they differ.
-        """
-        if self.others:
-            raise OperatingPointError(f"{what} needs equal generators with equal loads")
-        return self.generator
-
 
 @dataclass(frozen=True)
 class Apu(Parametric):

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 
+from apu_casadi.core.errors import SignalError
 from apu_casadi.core.sharing import keep
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.statespace import StateSpace
@@ -96,7 +97,17 @@ class Group(NamedTuple):
 def grouped(
     apu: Apu, of: Sequence[tuple[int, ...]], gens: Mapping[tuple[int, ...], StateSpace]
 ) -> tuple[Group, ...]:
-    """Return the groups of these numbers, whose first generators have these models."""
+    """Return the groups of these numbers, whose first generators have these models.
+
+    Raises:
+        SignalError: a generator in no group or in two, or a group whose generators differ.
+    """
+    n = len(apu.machines)
+    if sorted(k for group in of for k in group) != [*range(1, n + 1)]:
+        raise SignalError(f"groups {of}: each of the generators 1 to {n} must be in one of them")
+    for group in of:
+        if any(apu.machines[k - 1] != apu.machines[group[0] - 1] for k in group):
+            raise SignalError(f"groups {of}: {who(group)} differ, and are no group")
     return tuple(Group(k, gens[k], apu.machines[k[0] - 1].coupling, len(of) == 1) for k in of)
 
 

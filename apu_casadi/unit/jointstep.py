@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.lanes.together import Together
 from apu_casadi.core.sharing import Rebuilt, keep
@@ -242,7 +242,7 @@ def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: 
         kind = "joint_course_" if wide else "joint_block_"
         name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
         function = block_function(machines, family.step, link, name, wide=wide)
-        return Together(compiled(function, level=3), function)
+        return Together(function, function, Gradual(function, level=3, copy=False))
 
     key = (link.structure, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

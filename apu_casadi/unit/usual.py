@@ -13,8 +13,6 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS
-
 if TYPE_CHECKING:
     from apu_casadi.gaspath.steady.steadypoint import Limits
     from apu_casadi.unit.apu import Apu
@@ -90,6 +88,8 @@ def unusual(
         limits: of steady points, which may be among them.
     """
     names = [*names]
+    if limits is not None:  # else what lists scenarios would wait for the trim's imports
+        from apu_casadi.gaspath.steady.steadypoint import LIMIT_UNITS
     units = {f"{s}.{n}": u for s, p in unit.parameter_sets().items() for n, _, u, *_ in p.table()}
     values = unit.parameters()
     for n, unit_of_it in LIMIT_UNITS.items() if limits is not None else ():

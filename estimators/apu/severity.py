@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import ParameterError
+from apu_casadi.core.profiles.profile import fixed
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.machine.faults.ttsc import Ttsc
@@ -99,7 +100,9 @@ def severity(
 
     Raises:
         ParameterError: periods not positive, or k_rf = 0, which has no logarithm.
+        ScenarioError: a fault that changes in time.
     """
+    fault = fixed(fault, "fault", "what is known of its severity")
     if periods < 1 or not fault.k_rf > 0:
         raise ParameterError(f"periods >= 1 and k_rf > 0 expected, got {periods!r}, {fault!r}")
     gen = Generator() if generator is None else generator

@@ -1,7 +1,7 @@
 """Noise by maximum likelihood: Q and R from a recording, with how well they are known.
 
 The likelihood of a recording is the filter's own, sum of log N(nu; 0, S) over its innovations
-(Schweppe 1965; Särkkä 2013, section 12.3.1).  It is maximised over the logarithms of standard
+(Schweppe 1965; Särkkä 2013, chapter 12).  It is maximised over the logarithms of standard
 deviations: of random walks (Q), of measured outputs (R) and of the noises w.  Derivatives are
 exact: the filter's step is differentiated, forwards along the recording.  So is the Fisher
 information,
@@ -49,6 +49,7 @@ STEP = 1.5  # longest step of a logarithm
 CONVERGED = 1e-4  # distance from the maximum, standard errors
 NEARLY = 0.03  # the same of the others where a limit is sought: 1e-3 of twice the likelihood
 INSTANT = 1e-200  # s, stands for a step of nothing, whose root has no derivative
+MANY = 1000  # samples
 VAGUE = 0.4  # standard error of a logarithm from which zero is tried as well
 LIKELY = 2.706  # twice the loss of log-likelihood at a one-sided limit of 95 %
 
@@ -382,7 +383,8 @@ def fit_noise(
         inputs: noises w (``w_Wf``) whose standard deviation is found, by one factor.
         iterations, iterated: of the filter, see :func:`estimators.filters.ekf.ekf_step`.
         max_iterations: of the scoring.
-        backend: see :func:`apu_casadi.core.backend.compiled`.
+        backend: see :func:`apu_casadi.core.backend.compiled`; where None, fewer than ``MANY``
+            samples are not worth the compiler's time.
 
     Raises:
         ParameterError: nothing to find, unknown or doubled names, an output that is never measured.
@@ -391,6 +393,8 @@ def fit_noise(
     """
     data = [recordings] if isinstance(recordings, Recording) else list(recordings)
     beliefs = [prior] * len(data) if isinstance(prior, Belief) else list(prior)
+    if backend is None and sum(r.size for r in data) < MANY:
+        backend = "vm"
     _check(model, data, beliefs, noise=noise, walk=walk, inputs=inputs)
     names = (*walk, *inputs, *noise)
     kinds = ("walk",) * len(walk) + ("input",) * len(inputs) + ("noise",) * len(noise)
@@ -402,11 +406,8 @@ def fit_noise(
     every = range(len(names))
     begin = likelihood(np.zeros(len(names)))
     best, n = likelihood.climb(np.zeros(len(names)), every, max_iterations)
-    start = np.array(
-        [model.walk[model.x.index(n)] for n in walk]
-        + [1.0] * len(inputs)
-        + [_rms(data, i) for i in rows]
-    )
+    walks = [model.walk[model.x.index(n)] for n in walk]
+    start = np.array([*walks, *(1.0 for _ in inputs), *(_rms(data, i) for i in rows)])
     lowest, highest = math.log(FLOOR) + 1e-9, math.log(CEILING) - 1e-9
     moving = [i for i in every if lowest < best.theta[i] < highest]
     cov = np.full((len(names), len(names)), math.nan)

@@ -31,7 +31,7 @@ from scenarios.studies.electrical.truth import generator_truth, samples_of
 
 FLOPS = (ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT)
 CHAINS, LENGTH = 10, 400  # of the function that tells the peak: independent sums and products
-OFTEN = 50
+OFTEN, MANY = 5, 32  # calls, and packs in a call, of the roofline
 SAME = "largest difference from scalar C, relative"
 
 
@@ -112,28 +112,30 @@ def lanes(size: Size) -> list[Row]:
 
 def _runs(size: Size, repeats: int) -> Row:
     """Joint runs with random faults in one loop."""
-    count = 2 * max(size.counts)
-    runs = [s.change(waveform_dt=None) for s in random_faults(count, seed=3, base=size.joint)]
+    half = max(size.counts)
+
+    def drawn(seed: int) -> list[Scenario]:
+        return [s.change(waveform_dt=None) for s in random_faults(half, seed=seed, base=size.joint)]
 
     def one(s: Scenario) -> Any:
         return simulate(s, solver="propagator", noise=s.noise, seed=s.seed)["N"].values[-1]
 
     def together(some: list[Scenario]) -> list[Any]:
-        return simulate_ensemble(
-            [asked_of(s) for s in some], keep=lambda _, ds: ds["N"].values[-1], refused="keep"
-        )
+        asked = [asked_of(s) for s in some]
+        return simulate_ensemble(asked, keep=lambda _, ds: ds["N"].values[-1], refused="keep")
 
-    error = off(together(runs[:2]), [one(s) for s in runs[:2]])
-    # faults not met before in either half, in turn: what is made for a fault is kept
+    warm = drawn(3)  # compiles; as many as are timed, since packs of others need other functions
+    error = off(together(warm)[:2], [one(s) for s in warm[:2]])
+    # faults not met before in either, in turn: what is made for a fault is kept
     took = {"lanes": 0.0, "scalar": 0.0}
-    half = count // 2
-    t = time.process_time()
-    together(runs[:half])
-    took["lanes"] = time.process_time() - t
-    t = time.process_time()
-    for s in runs[half:]:
-        one(s)
-    took["scalar"] = (time.process_time() - t) * half / (count - half)
+    for k in range(repeats):
+        t = time.process_time()
+        together(drawn(10 + k))
+        took["lanes"] += (time.process_time() - t) / repeats
+        t = time.process_time()
+        for s in drawn(100 + k):
+            one(s)
+        took["scalar"] += (time.process_time() - t) / repeats
     ms, ratio = 1e3 * took["lanes"] / half, took["scalar"] / took["lanes"]
     what = f"joint {size.joint.duration:g} s run with a random fault, in an ensemble of {half}"
     more: dict[str, Any] = {"peer": "single runs, other faults", "ratio": ratio}
@@ -170,16 +172,17 @@ def _roofline(step: ca.Function, repeats: int) -> Row:
     """How far a filter's step is from what the processor computes at most, without fused adds."""
     rates = {}
     for name, fun in (("step", step), ("peak", peak_function())):
-        call = Caller(in_lanes(fun), copy=False)
+        wide = in_lanes(fun)
+        points = OFTEN * MANY * wide.size2_out(0) // fun.size2_out(0)
+        call = Caller(wide.map(MANY), copy=False)
         for a in call.inputs:
             a[...] = 1.0
         took = in_turn({name: partial(_often, call)}, repeats)
-        points = OFTEN * call.fun.size2_out(0) // fun.size2_out(0)
         rates[name] = 1e-9 * flops(fun) * points / took[name]
     scalar_step = compiled(step)
-    call = Caller(scalar_step, copy=False)
+    call = Caller(scalar_step.map(MANY), copy=False)
     took = in_turn({"one": partial(_often, call)}, repeats)
-    one = 1e-9 * flops(step) * OFTEN / took["one"]
+    one = 1e-9 * flops(step) * OFTEN * MANY / took["one"]
     what = f"electrical EKF step: of {rates['peak']:.1f} Gflop/s that lanes reach in registers"
     text = f"{rates['step']:.1f} Gflop/s in lanes, {one:.1f} in scalar C; nothing is judged"
     share = 100 * rates["step"] / rates["peak"]

@@ -192,7 +192,8 @@ def few_ticks(ax: Axes, last: float, most: int = 6) -> None:
     """Have so few ticks along the time that their numbers, up to ``last`` s, do not touch."""
     from matplotlib.ticker import MaxNLocator
 
-    ax.xaxis.set_major_locator(MaxNLocator(min(most, 6 if last < 100 else 4 if last < 1000 else 3)))
+    bins = min(most, 6 if last < 100 else 4)
+    ax.xaxis.set_major_locator(MaxNLocator(bins, steps=[1, 2, 5, 10]))
 
 
 def abc_legend(ax: Axes, where: str) -> None:

@@ -12,7 +12,7 @@ from apu_casadi.core.results import RPM, generators_of, of_generator, phases
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures import figstyle as fs
 from scenarios.figures.chosen import quietest
-from scenarios.figures.runwords import SEVERITY, caption_of, fault_phase, scenario_of
+from scenarios.figures.runwords import SEVERITY, caption_of, fault_phase, scenario_of, severity_note
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -187,7 +187,7 @@ def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
 
 def _change(first: float, last: float) -> str:
     """Return a change of a factor in per cent, or two where it follows a profile."""
-    ends = [f"{100 * (v - 1):+.3g}" for v in (first, last)]
+    ends = [f"{p:+.3g}" if abs(p) >= 5e-3 else "0" for p in (100 * (first - 1), 100 * (last - 1))]
     return ends[0] if first == last else " → ".join(ends)
 
 
@@ -218,8 +218,8 @@ def _h(stator: np.ndarray) -> np.ndarray:
     return np.where(mu > 0, mu / (np.nan_to_num(k_rf) + 1.0 - mu), 0.0)
 
 
-def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> None:
-    """Write into a stretch of a lane, smaller or not at all where there is no room."""
+def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> bool:
+    """Write into a stretch of a lane, smaller or not at all for want of room; tell whether."""
     text = "\n".join(
         line
         for part in words.split("\n")
@@ -231,6 +231,8 @@ def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> 
     if longest <= 1.3 * letters and len(lines) < 5:
         look: dict[str, Any] = {"ha": "center", "va": "center", "linespacing": 1.25}
         ax.text(x, y, text, color=ink, fontsize=size, **look)
+        return True
+    return False
 
 
 def figure_20(ds: xr.Dataset) -> Figure:
@@ -260,12 +262,14 @@ def figure_20(ds: xr.Dataset) -> Figure:
         fs.bands(ax, rows, names=True)
         span = rows[-1]["end"] - rows[0]["start"]
         per_letter = 0.075 * span / (0.86 * fs.WIDTH)
+        untold = False  # a fault for whose words there is no room
         for y, items in enumerate(lanes.values()):
             for a, b, words, (ground, ink) in items:
                 box: dict[str, Any] = {"height": 0.7, "edgecolor": "white", "lw": 1.6, "zorder": 2}
                 ax.barh(y, b - a, left=a, color=ground, **box)
                 letters = max(int((b - a) / per_letter) - 1, 1)
-                _write(ax, (a + b) / 2, y, words, ink, letters)
+                there = _write(ax, (a + b) / 2, y, words, ink, letters)
+                untold |= not there and words.startswith("TTSC")
         ax.set_yticks(range(len(lanes)), list(lanes), fontsize=9.5)
         ax.set_ylim(len(lanes) - 0.5, -0.5)
         ax.grid(False)
@@ -273,5 +277,6 @@ def figure_20(ds: xr.Dataset) -> Figure:
         ax.spines["left"].set_visible(False)
         ax.set_xlabel("Time [s]")
         of = {1: "the generator", 2: "each of the two generators"}.get(n, f"each of {n} generators")
-        caption_of(fig, ds, "fig20_phases", f"Load of {of} at rated voltage.")
+        more = f"{severity_note(ds)} " if untold else ""
+        caption_of(fig, ds, "fig20_phases", f"{more}Load of {of} at rated voltage.")
     return fig

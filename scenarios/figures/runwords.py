@@ -92,7 +92,7 @@ def scenario_of(ds: xr.Dataset) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _severity_note(ds: xr.Dataset) -> str:
+def severity_note(ds: xr.Dataset) -> str:
     """Tell the severity of the last stator fault: always mu, k_rf and kappa together."""
     if not all(n in ds for n in SEVERITY):
         return ""
@@ -130,5 +130,5 @@ def caption_of(
     title = FIGURES[key] if number is None else f"{FIGURES[key]} {number}"
     number_of_it = f"Figure {key[3:5]}. " if name in ("", PAPER) else ""
     words = [f"{number_of_it}{title}.", f"Scenario “{name}”." if name else ""]
-    words += [_severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
+    words += [severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
     caption(fig, " ".join(w for w in words if w))

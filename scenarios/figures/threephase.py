@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_SLOW = 0.2  # of a phase's change: where its beginning shows less, all of it is drawn
 _CYCLES = 5e-3  # s, two cycles at 400 Hz: a bin of the envelope is never shorter
 
 
@@ -102,7 +103,7 @@ def _three_phase(
     with fs.drawing():
         top, bottom, gap = 0.45, 0.95, 0.72
         fig = fs.new_figure(sum(heights) + gap * len(drawn) + top + bottom)
-        place = {"left": 0.08, "right": 0.985, "hspace": gap * len(heights) / sum(heights)}
+        place = {"left": 0.088, "right": 0.985, "hspace": gap * len(heights) / sum(heights)}
         place |= fs.margins(fig, top=top, bottom=bottom)
         outer = fig.add_gridspec(len(heights), 1, height_ratios=heights, **place)
         ax = fig.add_subplot(outer[0])
@@ -114,7 +115,10 @@ def _three_phase(
             for name, p in zip(rms, "abc", strict=True):
                 ax.plot(ds["time"].values, ds[name].values, color=fs.ABC[p], lw=fs.NESTED[p])
             ax.set_ylabel(f"{label}, rms")
-        ax.margins(y=0.06)
+        if waves:
+            ax.margins(y=0.06)
+        else:
+            fs.roomy(ax, np.concatenate([ds[name].values for name in rms]), 0.06)
         ax.set_xlabel("Time [s]", labelpad=2)
         fs.abc_legend(ax, "below")
         for row, draw in enumerate(drawn, 1):
@@ -171,7 +175,7 @@ def _event_row(
     """Draw the waveforms around the beginning of some later phases."""
     from matplotlib.ticker import MultipleLocator
 
-    grid = spec.subgridspec(1, len(events), wspace=0.23)
+    grid = spec.subgridspec(1, len(events), wspace=0.3)
     for i, k in enumerate(events):
         p = rows[k]
         ax = fig.add_subplot(grid[i])
@@ -198,13 +202,15 @@ def _rms_row(
     events: Sequence[int],
 ) -> None:
     """Draw the rms values around the beginning of some later phases, each on its own scale."""
-    grid = spec.subgridspec(1, len(events), wspace=0.23)
+    grid = spec.subgridspec(1, len(events), wspace=0.3)
     t = ds["time"].values
     for i, k in enumerate(events):
         p = rows[k]
         ax = fig.add_subplot(grid[i])
         ink = fs.phase_colours(k)[1]
         lo, hi = max(p["start"] - 0.2, t[0]), min(p["start"] + 1.6, p["end"])
+        moved = [_moved(ds, rms, p["start"], end) for end in (hi, p["end"])]
+        hi = p["end"] if moved[0] < _SLOW * moved[1] else hi
         inside = (t >= lo - 1e-9) & (t <= hi + 1e-9)
         fs.change(ax, lo, p["start"], hi, k - 1)
         fs.few_ticks(ax, hi)
@@ -220,6 +226,13 @@ def _rms_row(
         if i == 0:
             unit = ds[rms[0]].attrs.get("units", "")
             ax.set_ylabel(f"rms [{unit}]")
+
+
+def _moved(ds: xr.Dataset, names: Sequence[str], start: float, end: float) -> float:
+    """Return the largest change of some quantities between two instants, s."""
+    t = ds["time"].values
+    inside = (t >= start - 1e-9) & (t <= end + 1e-9)
+    return max(float(np.ptp(ds[n].values[inside])) for n in names) if inside.any() else 0.0
 
 
 def figure_24(ds: xr.Dataset, generator: int | None = None) -> Figure:

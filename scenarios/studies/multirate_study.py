@@ -63,7 +63,7 @@ _HEALTH = {"f_eta_c": 0.99, "f_eta_t": 0.98, "f_W_c": 0.97, "f_W_t": 1.04}
 class Case:
     """One event: load and health before it, and the event."""
 
-    load: SeriesLoad
+    load: SeriesLoad | Sequence[SeriesLoad]
     event: Event
     health: dict[str, float] = dataclasses.field(default_factory=dict)
 
@@ -82,6 +82,11 @@ CASES = {
     "TTSC fault": Case(KW100, FaultChange(T_EVENT, Ttsc(0.05, 20.0)), _HEALTH),
 }
 """The three events of the paper's joint run (section 6.3), each from the steady state before it."""
+OF_ONE = {
+    "load step of one": Case((KW225, KW100), LoadChange(T_EVENT, KW100, generator=1)),
+    "TTSC fault of one": Case(KW100, FaultChange(T_EVENT, Ttsc(0.05, 20.0), generator=2), _HEALTH),
+}
+"""Events of one generator alone, which are measured where they are asked for."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ class Measured:
     """One run against the truth.
 
     Args:
-        case: name in :data:`CASES`.
+        case: name in :data:`CASES` or :data:`OF_ONE`.
         exchange: of ``simulate_joint``; ``"one model"`` is the truth's model at the tolerance of
             the multi-rate runs, so that its errors are what the tolerance alone makes.
         dt: exchange step, s; NaN for the one model.
@@ -113,9 +118,12 @@ class Measured:
 def _blocks(ds: xr.Dataset, name: str) -> np.ndarray:
     """Means over each 80 ms of what is stored as means over the exchange steps."""
     t = ds["time"].to_numpy()
-    total = np.concatenate([[0.0], np.cumsum(ds[name].to_numpy()[1:] * np.diff(t))])
     at = np.arange(round(DURATION / COMMON) + 1) * COMMON
-    return np.asarray(np.diff(np.interp(at, t, total)) / COMMON)
+    made = []
+    for row in np.atleast_2d(ds[name].to_numpy()):  # of each generator, where they differ
+        total = np.concatenate([[0.0], np.cumsum(row[1:] * np.diff(t))])
+        made.append(np.diff(np.interp(at, t, total)) / COMMON)
+    return np.squeeze(np.array(made))
 
 
 def errors(ds: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
@@ -160,7 +168,7 @@ def measure(
 
     Args:
         steps: exchange steps, s; divisors of 80 ms.
-        cases: names in :data:`CASES`.
+        cases: names in :data:`CASES` or :data:`OF_ONE`.
         exchanges: of ``simulate_joint``.
         contributions: exchange step, s, with which speed and fuel are predicted one without the
             other as well, so that the two parts of the paper's error stand apart; None: not.
@@ -181,7 +189,7 @@ def measure(
 
     result = []
     for name in cases:
-        case = CASES[name]
+        case = {**CASES, **OF_ONE}[name]
         truth = case.run(
             simulate_monolithic, apu, duration=DURATION, rtol=_RTOL / 10, progress=tick
         )

@@ -9,7 +9,7 @@ between call and mover need know of ensembles, if it changes nothing before the 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
@@ -100,10 +100,17 @@ class Together:
     Args:
         fun: as compiled for one call.
         of: what it was compiled from, with dense inputs and outputs.
+        one: evaluates one call; a ``Caller`` of ``fun`` if not given.
     """
 
-    def __init__(self, fun: ca.Function, of: ca.Function) -> None:
-        self.fun, self._one, self.of = fun, Caller(fun, copy=False), of
+    def __init__(
+        self,
+        fun: ca.Function,
+        of: ca.Function,
+        one: Callable[..., tuple[np.ndarray, ...]] | None = None,
+    ) -> None:
+        self.fun, self.of = fun, of
+        self._one = one  # a member's own is never made where all ask
         self._wide: Caller | None = None
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
@@ -116,17 +123,22 @@ class Together:
         """
         member = _here.get()
         if member is None:
-            return self._one(*given)
+            return self._alone(*given)
         results = member.answered(self)
         if results is None:
             member.asks = Question(self, tuple(np.array(a, dtype=float) for a in given))
             raise member.asks
         return results
 
+    def _alone(self, *given: Any) -> tuple[np.ndarray, ...]:
+        if self._one is None:
+            self._one = Caller(self.fun, copy=False)
+        return self._one(*given)
+
     def evaluate(self, asked: Sequence[tuple[np.ndarray, ...]]) -> list[tuple[np.ndarray, ...]]:
         """Return the results for some members, as many as there are lanes at most."""
         if len(asked) == 1:
-            return [tuple(a.copy() for a in self._one(*asked[0]))]
+            return [tuple(a.copy() for a in self._alone(*asked[0]))]
         wide, n = self._call, len(asked)
         lanes = wide.fun.size2_out(0) // self._outputs[0][1]
         if n > lanes:

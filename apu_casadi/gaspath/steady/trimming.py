@@ -28,6 +28,7 @@ import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import SignalError
+from apu_casadi.core.profiles.profile import fixed as still
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator, GasGeneratorState
 from apu_casadi.gaspath.steady.steadypoint import (
@@ -79,10 +80,13 @@ def trim_gas_generator(
 
     Raises:
         SignalError: not two names, an unknown one, or two that do not determine a point together.
+        ScenarioError: a value that changes in time.
         Refusal: no such point, or beyond a limit; says what failed, by how much, and the best point
             reached.  It is an OperatingPointError.
     """
     limits = Limits() if limits is None else limits
+    for n, v in {**fixed, **(theta or {}), **ambient}.items():
+        still(v, n, "a steady state")
     try:
         fixed = {
             n: v if isinstance(v, LoadLaw) else number(f"fixed {n}", v) for n, v in fixed.items()

@@ -59,7 +59,7 @@ from estimators.filters.belief import Belief
 from estimators.models.filtermodel import FilterModel, Unknown, augment
 from estimators.models.recording import SAME_TIME, Recording, plain_numbers
 
-__all__ = ["GAINS", "ElectricalFilter", "electrical_filter", "window_starts"]
+__all__ = ["GAINS", "ElectricalFilter", "electrical_filter", "jump_floor", "window_starts"]
 
 #: Harmonics that each channel consists of, for what is missing of it.
 HARMONICS_OF: dict[str, tuple[int, ...]] = dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3))
@@ -124,8 +124,7 @@ class ElectricalFilter(Parametric):
         t = a["t"]
         given = {n: a[n] for n in INPUTS.names}
         v = np.array([a[n] for n in PHASES_V])
-        # what is white beside the noise for which JUMP is made: jitter, digits
-        floor = max(JUMP, *(10 * self.sensors[n].rest for n in PHASES_V))
+        floor = jump_floor(self.sensors)
         given |= dict(zip(JUMP_SIZES.names, jumps(t, v, a["w_r"], floor=floor), strict=True))
         jumped = np.any([given[n] > 0 for n in JUMP_SIZES.names], axis=0)
         mid = _middles(t, v, a["w_r"], jumped)
@@ -329,6 +328,14 @@ def _middles(t: np.ndarray, v: np.ndarray, w_r: np.ndarray, jumped: np.ndarray) 
         piece = midpoints(t[part], v[:, part], w_r[part], periods=HARMONIC_PERIODS)
         out[:, begin : end - 1] = piece[:, :-1]
     return out
+
+
+def jump_floor(sensors: SensorSet) -> float:
+    """Return what may be noise of a jump of the voltage, V.
+
+    ``JUMP`` is made for the sensors' noise; what is white beside it, jitter and digits, adds.
+    """
+    return max(JUMP, *(10 * sensors[n].rest for n in PHASES_V))
 
 
 def window_starts(t: np.ndarray, window: float, start: float | None) -> np.ndarray:

@@ -20,6 +20,7 @@ the voltage jumped nor a fault was found is told: ``moved``.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,9 +31,8 @@ import numpy as np
 from apu_casadi.core.sharing import last
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.terminals import jumps
-from estimators.apu.electrical.electricalfilter import electrical_filter
+from estimators.apu.electrical.electricalfilter import electrical_filter, jump_floor
 from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_V, VOLTAGES
-from estimators.apu.electrical.tuning import JUMP
 from estimators.apu.sensors import SensorSet
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, run
@@ -47,6 +47,10 @@ TAKEN = (0, 1, 2, 3)  # harmonics that gain errors leave; 0 and 2 are those of t
 HIGHEST = 13
 PROBE = 8  # periods from which the noise of the innovations is told; the last four count
 FEWEST_WINDOWS = 3
+#: Share of missing readings from which the filter's gain is another in each sample: its innovations
+#: are no longer those of a steady one, with which they are compared.
+GAPPY = 0.02
+TOLD = 0.2  # least singular value of the orders over the largest; 0.7 without gaps
 NEAR = 0.03  # s from a cause to the reset that it makes
 EXCUSED = 0.34  # largest share of windows with steps of the voltage; more are no steps of load
 
@@ -114,7 +118,10 @@ def _windows(
         if not whole[k]:
             row = there[k, :, i]
             b, e = basis[k, row], y[k, row, i]  # with gaps, harmonics may look alike
-            c[k, :, i] = np.linalg.lstsq(b, e, rcond=None)[0]
+            every, _, _, size = np.linalg.lstsq(b, e, rcond=None)
+            if size[-1] < TOLD * size[0]:  # gaps at the same angles, as clipping makes
+                continue
+            c[k, :, i] = every
             e = e - b[:, :n] @ np.linalg.lstsq(b[:, :n], e, rcond=None)[0]
             s[k, 0, i] = e @ e * (per - n) / (row.sum() - n)
     pairs = np.stack([c[:, 1::2], c[:, 2::2]], axis=2)
@@ -169,9 +176,11 @@ def unexplained_waves(
     t, speed = samples["t"], np.nan_to_num(samples["w_r"], nan=w)
     angle = np.concatenate([[0.0], np.cumsum(np.interp(r.t[:-1], t, speed) * np.diff(r.t))])
     orders = [m for m in range(HIGHEST + 1) if m * w * step < 0.95 * math.pi]
-    noise = MARGIN * _variances(machine, sensors, samples, w)
+    jumped = _jumped(samples, sensors)
+    # jitter at no load is nothing: its most in the recording stands for it
+    steady = tuple(dataclasses.replace(s, jitter=0.0) for s in sensors.sensors)
+    noise = MARGIN * _variances(machine, SensorSet(steady), samples, w)
     windows = _windows(r, angle, noise, per, orders)
-    jumped = _jumped(samples)
     stepped, odd = _events(windows.t, per * step, [*jumped, *resets, *faults])
     # the first window is the filter's start
     quiet = ~stepped & (np.arange(stepped.size) > 0)
@@ -179,7 +188,7 @@ def unexplained_waves(
     if odd:
         quiet[1:] = True
     out += [Finding("machine", "moved", 0.0, t) for t in _moved(resets, [*jumped, *faults])]
-    if quiet.sum() < FEWEST_WINDOWS:
+    if quiet.sum() < FEWEST_WINDOWS or np.isnan(r.innovation).mean() > GAPPY:
         return out
     size = {n: _amplitude(samples, n, windows.t, per * step) for n in MEASURED}
     rated = math.sqrt(2) * machine.P_rated / 3 / machine.V_rated_rms
@@ -187,13 +196,13 @@ def unexplained_waves(
     return out + least(found, level)
 
 
-def _jumped(samples: Mapping[str, np.ndarray]) -> np.ndarray:
+def _jumped(samples: Mapping[str, np.ndarray], sensors: SensorSet) -> np.ndarray:
     """Instants at which the voltage jumped, s."""
     v = np.array([samples[n] for n in PHASES_V])
     there = np.isfinite(v).all(0)
     t = samples["t"][there]
     w = float(np.nanmedian(samples["w_r"]))
-    sizes = np.array(jumps(t, v[:, there], np.full(t.size, w), floor=JUMP))
+    sizes = np.array(jumps(t, v[:, there], np.full(t.size, w), floor=jump_floor(sensors)))
     step = np.diff(t)
     far = np.append(step > 1.5 * np.median(step), False)
     # over a gap, and from it, a jump is none
@@ -257,12 +266,14 @@ def _tests(
         own = c[:, 0, :1] if field else c[:, 1]
         dof, spread = own.shape[1], variance * (1 if field else 2)
         if not field:
-            q = c[:, 0, 0] ** 2 / variance
+            q = c[:, 0, 0] ** 2 / (variance + sensors[name].unsure("bias") ** 2)
             k = int(q.argmax())
             chance = float(above(q[k], 1)) * good.size
             out.append(Finding(name, "offset", chance, float(c[k, 0, 0]), int(good[k])))
         amplitude = np.hypot(size[name][good], 0.0 if field else rated)
-        gain = sensors[name].gain * math.sqrt(2.0)  # of the current itself, and of the voltages
+        gain = sensors[name].unsure("gain") * math.sqrt(
+            2.0
+        )  # of the current itself, and of the voltages
         q = (own**2).sum(1) / ((gain * amplitude) ** 2 + spread)
         k = int(q.argmax())
         found = math.sqrt(float((own[k] ** 2).sum())) / float(amplitude[k])

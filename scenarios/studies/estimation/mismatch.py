@@ -24,7 +24,7 @@ __all__ = ["STUDY"]
 
 GOAL = {"realistic": 0.01, "large": 0.05}
 """Largest share of runs that may be silently wrong, by size."""
-START, EACH = 8.0, 0.7  # expected seconds of a part: once (truths), and for each seed
+START, EACH = 10.0, 1.2  # expected seconds of a part: once (truths), and for each seed
 HOUR = 3600.0
 
 
