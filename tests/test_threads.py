@@ -340,6 +340,8 @@ PLAIN_CACHES = {
     "apu_casadi/core/cachefolder.py",
     "apu_casadi/core/signals.py",
     "estimators/batch/fitresult.py",
+    # of an object that lives during one call
+    "estimators/apu/electrical/causes.py",
     # texts, in modules that must not load casadi
     "apu_casadi/core/version.py",
     "scenarios/commands/identify.py",

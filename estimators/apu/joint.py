@@ -2,22 +2,23 @@
 
 What passes between them is what couples the models, eqs. (1) and (2):
 
-* Electrical to gas path: the mean mechanical power of each 20 ms window with its variance.  Its 200
-  samples are one measurement: the energy since the window's start is a state of the electrical
-  filter, so the correlation of the samples, and of power with h, fluxes and gain errors, is in that
-  variance.  What is common to all windows (efficiency, gain errors of the electrical sensors) does
-  not average out; it is the state ``gain_PW`` of the gas-path filter as well.
-* A short circuit is there or not.  Gain errors of 0.5 % look like an h of up to 3e-4, whose loss of
-  3 % of the power is no loss at all.  So until a fault is found the power is that of a healthy
-  machine's filter, which takes no h for real; afterwards that of a filter with the found phase's h,
-  and as the error of h is new then, ``gain_PW`` is allowed to jump by what that filter claims.
+* Electrical to gas path: the mean mechanical power of each 20 ms window with all that is uncertain
+  in it (:mod:`estimators.apu.electrical.electricalside`).  Its 200 samples are one measurement: the
+  energy since the window's start is a state of the electrical filter.  What is common to all
+  windows does not average out and is a state of the gas-path filter as well: ``gain_PW`` for the
+  efficiency and the gain errors of the electrical sensors, ``loss_PW`` for the loss of a short
+  circuit that may be there, or of the error of its severity.
+* Nothing is decided before that: until a short circuit is found, power is the mean over a healthy
+  machine and a short circuit in each phase.  When one is found, the course of the power since it
+  came is known better, and the gas-path filter goes over it again: what it is told from then on
+  rests on the corrected course, while what it said before stays.
 * Speed, both ways: the generators' speed pick-ups are inputs of the electrical filter; by (2) they
   measure the rotor speed as well, better than its own sensor, and the gas-path filter takes a
   weighted mean of both.
 
-The power that a short circuit costs is in the electrical filter's power, because h is; so the
-gas-path filter need not explain it.  :func:`estimate_joint` can leave h out (``ttsc=False``), to
-show what is mistaken then.
+Of generators that differ in the run each has filters and gain errors of its own, and which one is
+faulty is found; the gas path gets the mean of their powers.  :func:`estimate_joint` can leave h out
+(``ttsc=False``), to show what is mistaken then.
 """
 
 from __future__ import annotations

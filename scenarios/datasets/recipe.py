@@ -10,7 +10,6 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError, nearest
+from apu_casadi.core.sharing import once
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.apu import Apu
 from estimators.apu.sensors import GAS_PATH
@@ -104,7 +104,7 @@ class Recipe:
         except (TypeError, ValueError) as e:
             raise ScenarioError(f"{where}: {e}") from None
 
-    @cached_property
+    @property
     def order(self) -> tuple[str, ...]:
         """Classes by weight, each as often as it is in every stretch of so many runs."""
         least = min(w for w in self.classes.values() if w > 0)
@@ -120,7 +120,7 @@ class Recipe:
         return next(n for n in reversed(SPLITS) if self.split.get(n, 0.0) > 0)
 
 
-@cache
+@once
 def _default() -> Mapping[str, Any]:
     return Apu().parameters()
 

@@ -24,7 +24,6 @@ highest number of lanes; 1 evaluates everything by map.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import logging
 import os
@@ -39,7 +38,7 @@ from apu_casadi.core.cachefolder import say
 from apu_casadi.core.calling import Mapped
 from apu_casadi.core.errors import BackendError
 from apu_casadi.core.lanes.lanegraph import graph_writer
-from apu_casadi.core.sharing import BUILDING, keep
+from apu_casadi.core.sharing import BUILDING, keep, once
 
 __all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "single", "source", "unsupported"]
 
@@ -63,7 +62,7 @@ def lanes_in_use() -> int:
     return min(int(text), _widest()) if backend_in_use() == "c" else 1
 
 
-@functools.lru_cache(maxsize=1)
+@once
 def _widest() -> int:
     if platform.machine() not in _X86:
         return 2
@@ -75,7 +74,7 @@ def _widest() -> int:
     return max((n for n, needs in _NEEDS.items() if needs <= set(flags)), default=2)
 
 
-@functools.lru_cache(maxsize=1)
+@once
 def _digest() -> str:
     """Tell one writer of code from another."""
     h = hashlib.sha256()

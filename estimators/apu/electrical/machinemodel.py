@@ -324,7 +324,10 @@ def _family(
             for n, e in zip(MEASURED, extra, strict=True)
         ]
     if power:
-        x1[X.index("energy")] = u["keep"] * x["energy"] + dt * y["P_total"]
+        # by the trapezoidal rule: with a fault power swings by all of its loss in half a cycle, and
+        # a window of another speed than the rated one holds no whole number of cycles
+        mean = (y["P_total"] + equations(x1, seen.end)[1]["P_total"]) / 2
+        x1[X.index("energy")] = u["keep"] * x["energy"] + dt * mean
     name = f"electrical_{'shunts' if branch is None else 'leaky'}"
     name += ("_power" if power else "") + ("_gains" if with_gains else "")
     signals = X, U, PAR + MACHINE, W, Signals([OUTPUTS[k] for k in MEASURED])
