@@ -21,6 +21,7 @@ from apu_casadi.core import files
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, nearest
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.sensors import GAS_PATH
+from scenarios.datasets.making import VARIED
 from scenarios.datasets.recipe import CLASSES
 from scenarios.datasets.scoring import read_labels
 
@@ -187,7 +188,7 @@ def _of_gas_path(gas: Any) -> dict[str, tuple[float, float]]:
 
     data = {"t": gas["time"].to_numpy()}
     data |= {n: gas[f"X_s.{n}"].to_numpy(dtype=float) for n in GAS_PATH.names}
-    data |= {n: gas[f"W.{n}"].to_numpy(dtype=float) for n in ("altitude", "Mach", "dT_isa")}
+    data |= {n: gas[f"W.{n}"].to_numpy(dtype=float) for n in VARIED}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ApuWarning)

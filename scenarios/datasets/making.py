@@ -29,6 +29,7 @@ import numpy as np
 from apu_casadi.core import files, interrupts
 from apu_casadi.core.backend import package_digest
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, SimulationError
+from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.measuring import measure_run
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH
@@ -41,7 +42,7 @@ from scenarios.shell.locking import locked
 from scenarios.shell.workers import pool, stoppable
 
 RUNS, LOCK, SUMS = "runs.parquet", "dataset.lock", "checksums.sha256"
-CONDITIONS = ("altitude", "Mach", "dT_isa")
+VARIED = tuple(n for n in CONDITIONS if n != "war")  # what a recipe draws of the day
 VIRTUAL = ("T2", "T3", "P3", "T4", "T41", "T5", "P5", "W2", "SM", "PW", "Wf", "N")
 WAVES = {f"{s.name}_{k}": s.unit for k in (1, 2) for s in ELECTRICAL.sensors}
 """Unit of each column of the waveforms: what is measured at generators 1 and 2."""
@@ -51,10 +52,9 @@ Progress = Callable[[int, int], None]
 def gas_path_columns() -> dict[str, tuple[str, str]]:
     """Return unit and meaning of each column of the gas-path tables, by name."""
     from apu_casadi.core.results import CHANNELS
-    from apu_casadi.gaspath.conditions import CONDITIONS as DAY
 
     found = {"run": ("1", "number of the run"), "time": ("s", "since the start of the run")}
-    found |= {f"W.{n}": (DAY[n].unit, DAY[n].doc) for n in CONDITIONS}
+    found |= {f"W.{n}": (CONDITIONS[n].unit, CONDITIONS[n].doc) for n in VARIED}
     found["W.P_e"] = ("W", "electrical output, both generators")
     found |= {f"X_s.{s.name}": (s.unit, "as measured") for s in GAS_PATH.sensors}
     found |= {f"X_v.{n}": CHANNELS[n] for n in VIRTUAL}
@@ -96,7 +96,7 @@ def _gas_path(d: Drawn, ds: Any, read: Any) -> dict[str, np.ndarray]:
     n = t.size
     out: dict[str, np.ndarray] = {"run": np.full(n, d.labels["run"], dtype=np.int32), "time": t}
     day = d.scenario["ambient"]
-    out |= {f"W.{c}": np.full(n, day[c], dtype=np.float32) for c in CONDITIONS}
+    out |= {f"W.{c}": np.full(n, day[c], dtype=np.float32) for c in VARIED}
     out["W.P_e"] = truth("P_e")
     for s in GAS_PATH.sensors:
         out[f"X_s.{s.name}"] = np.asarray(_faulty(d, s.name, t, read[s.name].values), np.float32)
