@@ -343,28 +343,15 @@ def gas_path_filter(
         SignalError: unknown parameter in ``free``.
     """
     gg = GasGenerator() if gg is None else gg
-    held = ("Wf", "PW") if power == "measured" else ("Wf",)
-    if missing := [n for n in held if n not in sensors]:
-        raise ParameterError(f"a gas-path filter takes {missing[0]} as an input: no sensor of it")
-    if late := [n for n in held if sensors[n].tau]:
-        raise ParameterError(f"sensor {late[0]}: the lag of a measured input is not modelled")
+    held = _held(sensors, power)
     named = (sensors.uncertain if gains else ()) if isinstance(gains, bool) else tuple(gains)
-    sigma = {"N": N_SIGMA} | dict.fromkeys(HEALTH, health_sigma)
-    walks = {"N": N_WALK} | dict.fromkeys(HEALTH, HEALTH_WALK)
-    if power == "unknown":
-        sigma["PW"] = PW_PRIOR[1]
-        walks["PW"] = PW_WALK
-    if loss:
-        sigma["loss_PW"] = 0.0
-        walks["loss_PW"] = LOSS_WALK
+    sigma, walks = _spreads(health_sigma, power=power, loss=loss)
     sigma |= {f"gain_{n}": math.hypot(sensors[n].unsure("gain"), model_error) for n in named}
     biased, consider = _offsets(sensors, named, (*sensors.outputs, *held))
     sigma |= {f"bias_{s.name}": s.bias for s in biased}
     walks |= {f"bias_{s.name}": s.drift for s in biased if s.drift}
-    if consider_inertia and inertia is not None and power == "measured":
-        consider += ("gain_J",)
     if inertia is not None and power == "measured":
-        named = (*named, "J")
+        named, consider = (*named, "J"), (*consider, *(["gain_J"] if consider_inertia else []))
         sigma["gain_J"] = inertia
     if eta is not None:
         named, consider = (*named, "PW"), (*consider, *(["gain_PW"] if consider_eta else []))
@@ -385,6 +372,27 @@ def gas_path_filter(
     )
     sigma |= {n: FREE_SIGMA * model.x[n].nominal for n in free or {}}
     return GasPathFilter(gg, sensors, model, sigma)
+
+
+def _held(sensors: SensorSet, power: str) -> tuple[str, ...]:
+    """Return the measured inputs of a filter, all of which have a sensor without a lag."""
+    held = ("Wf", "PW") if power == "measured" else ("Wf",)
+    if missing := [n for n in held if n not in sensors]:
+        raise ParameterError(f"a gas-path filter takes {missing[0]} as an input: no sensor of it")
+    if late := [n for n in held if sensors[n].tau]:
+        raise ParameterError(f"sensor {late[0]}: the lag of a measured input is not modelled")
+    return held
+
+
+def _spreads(health: float, *, power: str, loss: bool) -> tuple[dict[str, float], dict[str, float]]:
+    """Return standard deviations at the start and random walks of the states without sensors."""
+    sigma = {"N": N_SIGMA} | dict.fromkeys(HEALTH, health)
+    walks = {"N": N_WALK} | dict.fromkeys(HEALTH, HEALTH_WALK)
+    if power == "unknown":
+        sigma["PW"], walks["PW"] = PW_PRIOR[1], PW_WALK
+    if loss:
+        sigma["loss_PW"], walks["loss_PW"] = 0.0, LOSS_WALK
+    return sigma, walks
 
 
 def _offsets(

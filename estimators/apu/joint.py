@@ -278,10 +278,8 @@ def estimate_joint(
         measured = electrical_samples(view, one, rng, sensors=electrical_sensors, gains=own)
         sides[number] = electrical_side(one, electrical_sensors, measured, t, **also, **how)
         pickups.append((measured["t"], measured["w_r"]))
-    for n in gas_gains or {}:
-        gas_sensors[n]
-    truth = true_readings(gas_sensors, ds)[1]
-    read = gas_sensors.measure(truth, noise, gains=gas_gains)
+    gas_sensors.only([*(gas_gains or ())])  # all of them are there
+    read = gas_sensors.measure(true_readings(gas_sensors, ds)[1], noise, gains=gas_gains)
     how |= {"power": power, "eta": eta, "step": step}
     gas, tracked = fused(
         apu,
