@@ -92,6 +92,7 @@ def test_a_share_of_the_faults_grows_into_what_is_drawn(base):
             random_faults(1, base=base, growing=g)
 
 
+@pytest.mark.long
 def test_a_campaign_of_growing_faults_says_how_they_grow(base):
     ds = run_campaign(random_faults(2, 1, base=base, growing=1.0), workers=1)
     assert counts(ds)["done"] == 2 and ds["h"].values[0, 2] > 1e-5
@@ -145,6 +146,7 @@ def test_an_unforeseen_error_is_recorded_and_tried_again(base, tmp_path, monkeyp
     assert counts(run_campaign(runs, workers=1, out=tmp_path))["done"] == 2
 
 
+@pytest.mark.long
 def test_an_interrupted_campaign_goes_on_where_it_stopped(base, tmp_path, monkeypatch):
     runs = random_faults(3, base=base)
     whole = run_campaign(runs, workers=1)

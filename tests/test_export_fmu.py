@@ -205,6 +205,7 @@ def generator_run(asked):
     return asked.unit.generator.simulate(LOAD, 0.1, switches=switches, w_r=w_r, **how)
 
 
+@pytest.mark.long
 @needs_compiler
 def test_generator_by_cosimulation(built, generator_run, tmp_path):
     names = GENERATOR

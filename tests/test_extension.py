@@ -99,6 +99,7 @@ def test_each_part_is_less_than_fifty_lines():
     assert not [a.name for n in imported for a in n.names if a.name.startswith("_")]
 
 
+@pytest.mark.long
 def test_a_load_in_run_linearisation_and_estimator(mine):
     """The same numbers as the shipped R-C load; its states are in the linear model."""
     own, shipped = mine["MyCapacitors"](1.0, 2e-3), CapacitorLoad((1.0,) * 3, (2e-3,) * 3)
@@ -267,6 +268,7 @@ def test_commands_take_the_parts(folder, argv, capsys):
     assert json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_sensors_in_commands(folder, capsys):
     """``apu fit`` reads their columns and a sigma; ``apu identify`` takes them by name."""
     gg = GasGenerator()

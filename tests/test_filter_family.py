@@ -131,6 +131,7 @@ def test_another_engine_builds_and_compiles_nothing(truth, step, asked, monkeypa
     assert before and asked == before
 
 
+@pytest.mark.long
 def test_a_parameter_of_the_engine_is_a_state_of_the_filter():
     """The compressor's efficiency, as a random walk, is found in a unit that has another one."""
     name = "gas_generator.eta_c"
@@ -310,6 +311,7 @@ def test_a_step_of_a_member_takes_the_members_parameters():
         assert_allclose(flat(a), flat(b), rtol=1e-13)
 
 
+@pytest.mark.long
 def test_a_filter_of_another_engine_compiles_nothing(truth, asked):
     """What the first engine's filter asks for serves five others."""
     how = {"gains": False, "inertia": None}

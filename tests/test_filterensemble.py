@@ -20,6 +20,7 @@ def assert_same(a, b, full=False):
     assert np.array_equal(a.final.cov, b.final.cov)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step_of", [ekf_step, ukf_step])
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.compiled)])
 def test_each_filter_is_the_single_run(step_of, compiled):

@@ -30,6 +30,7 @@ def out(capsys, *argv):
     return status, got.out, got.err
 
 
+@pytest.mark.long
 def test_the_report_says_what_can_be_known(capsys, tmp_path):
     """The paper's sensors at the design point: the null direction, what to add, what power does."""
     status, text, _ = out(capsys, "--figure", str(tmp_path / "new" / "power.png"))
@@ -277,6 +278,7 @@ def test_the_figure_refuses_what_it_cannot_draw():
         plot_gain_of_a_sensor(prior, {"a": curve}, aims={"b": (0.02, 0.5)}, note="")
 
 
+@pytest.mark.long
 def test_generators_whose_efficiencies_err_on_their_own(capsys, tmp_path):
     """Two equal loads: 0.71 of one's error; one of two with another r_s: its own severity."""
     assert study.independent_bias(0.02, [3.0, 3.0]) == pytest.approx(0.02 / math.sqrt(2))

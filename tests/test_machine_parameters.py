@@ -128,6 +128,7 @@ def test_a_second_exciter_without_saturation_is_a_structure_of_its_own():
     assert point.y["E_fd"] == pytest.approx(point.ss.x.unpack(point.x)["V_R"], rel=1e-12)
 
 
+@pytest.mark.long
 def test_units_leave_nothing_behind_and_compile_nothing(asked):
     """200 units with a step each: their models are gone, and only the first is compiled."""
     gone = []

@@ -111,6 +111,7 @@ def at_rest(load, fault, share):
     return ss, u, theta, simulation.stepper(ss, 1)(x, u, theta, 2.0).x_end
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("load", "fault"),
     [(KW100, Ttsc(0.005, 20.0)), (KW100, Ttsc(0.05, 1.0, 1.0, phase="b")),
@@ -214,6 +215,7 @@ def test_load_dump_of_an_inductive_load(solver):
     assert_allclose(V[:, 3:], np.tile([274.0507, 264.7447, 259.6482], (3, 1)), rtol=1e-4)
 
 
+@pytest.mark.long
 def test_power_that_eq_8_leaves_out_is_warned_of():
     """Near a terminal short the torque takes more than eq. (8) says; a load step is no reason."""
     short = SeriesLoad(R=(1e-3, 1e-3, 1e-3))

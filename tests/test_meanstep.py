@@ -72,6 +72,7 @@ def test_means_equal_those_of_cvodes(gen, load, fault):
         assert ours[ss.x.index("theta_e")] == pytest.approx(x[ss.x.index("theta_e")], rel=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", [None, Ttsc(0.05, 20.0)], ids=["healthy", "fault"])
 def test_every_speed_of_the_range_and_other_lengths_of_step(fault):
     """From -3 to +3 % the step ends at all places between samples; 10 and 30 ms as well.

@@ -23,6 +23,7 @@ def runs():
     return {sign: paper_figures._gas(sign, "discrete") for sign in paper_figures.HEALTH}
 
 
+@pytest.mark.long
 def test_the_run_of_section_6_1_2(runs):
     """Steady at 230 kW and 36050 r/min for 3 s, then faster and hotter with 10 % more fuel."""
     for sign, ds in runs.items():

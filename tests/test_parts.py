@@ -82,6 +82,7 @@ def test_unbalanced_capacitive_load_obeys_each_harmonic(gen):
     assert currents[0] > 1.05 * currents[1] > 1.05**2 * currents[2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("load", "fault", "constant"),
     [(LEADING, None, True), (UNEVEN, None, False), (LEADING, Ttsc(0.05, 20.0), False)],

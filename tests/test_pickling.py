@@ -104,6 +104,7 @@ def test_a_used_unit_is_pickled_as_its_parameters(used, elsewhere):
     assert (run(again), point(again.gas_generator)) == want
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", [2, pickle.HIGHEST_PROTOCOL])
 def test_copies_of_a_used_unit_are_equal_and_share_what_was_made(used, protocol):
     """Deep and flat copies, and pickles in the same process."""
@@ -175,6 +176,7 @@ def models(used):
     }
 
 
+@pytest.mark.long
 def test_everything_that_holds_functions_is_small(models):
     """Pickles and deep copies of each kind of model, used."""
     for name, model in models.items():

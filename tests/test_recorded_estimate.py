@@ -70,6 +70,7 @@ def gas_of(readings, *names):
 # ------------------------------------------------------------------------------ the same numbers
 
 
+@pytest.mark.long
 def test_run_measure_estimate_is_the_joint_estimation(run, joint):
     """Efficiency has no error in a recording: it is the truth's. All else is of the same draws."""
     case = joint_case(SEED)
@@ -106,6 +107,7 @@ def test_gas_path_alone_is_the_filter_of_the_studies(run, files):
         assert_allclose(e.gaspath[f"{n}_sigma"], r[n][1], rtol=1e-7, err_msg=n)
 
 
+@pytest.mark.long
 def test_generators_alone(joint, files):
     e = estimate(read_recording(*files), only="electrical", backend="vm")
     assert e.gaspath is None
@@ -113,6 +115,7 @@ def test_generators_alone(joint, files):
         assert_allclose(e.machines[1][n], joint.machines[1][n], rtol=1e-12)
 
 
+@pytest.mark.long
 def test_two_machines_and_their_mean_power(readings):
     """Machine 2 with other noise: power is the mean, known better than either's."""
     w = readings["electrical"]
@@ -267,6 +270,7 @@ def test_a_wrong_sensor_is_doubted(readings):
     assert "NOT TO BE BELIEVED" in e.summary()
 
 
+@pytest.mark.long
 def test_a_short_circuit_too_small_to_report_is_no_change_of_health():
     """h = 7e-5 is not reported, but neither is the change of health believed; 5e-4 is reported."""
     for k_rf, found in ((713.0, False), (100.0, True)):
@@ -286,6 +290,7 @@ def test_a_short_circuit_too_small_to_report_is_no_change_of_health():
         assert any(d.startswith("a short circuit of h_b") for d in e.doubts) != found
 
 
+@pytest.mark.long
 def test_a_filter_that_begins_again_and_again_is_doubted(readings):
     """All currents jump by 30 % every 25 ms, and nothing else does."""
     w = readings["electrical"]
@@ -305,6 +310,7 @@ def test_a_stuck_sensor_is_doubted(readings):
     assert any("T5 stands still from 0.2 to 0.86 s" in d for d in e.doubts)
 
 
+@pytest.mark.long
 def test_waveforms_of_a_short_part(readings):
     """Then the gas path keeps its own shaft power, and both are estimated."""
     gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW").items()}
@@ -315,6 +321,7 @@ def test_waveforms_of_a_short_part(readings):
     assert any("cover less than half" in n for n in e.notes)
 
 
+@pytest.mark.long
 def test_generators_that_differ():
     """Each is measured and estimated as itself; r_s of the second is 20 % higher."""
     g = APU.generator

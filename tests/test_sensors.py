@@ -124,6 +124,7 @@ def test_a_lagging_sensor_is_followed_through_a_load_drop(drop):
     assert true[-1] - true[0] < -150.0
 
 
+@pytest.mark.long
 def test_another_sensor_tells_more(drop):
     """P5 and the thermocouple each leave less uncertainty of the health than the table alone."""
 
@@ -292,6 +293,7 @@ def test_declared_sensors_are_believed_and_right_and_undeclared_lags_are_not(dro
         assert not e.believable
 
 
+@pytest.mark.long
 def test_a_prior_is_taken_and_a_wrong_state_named(drop, many):
     m = recorded(drop, many, 1)
     known = Prior({"f_eta_c": 1.0}, {"f_eta_c": 1e-4})

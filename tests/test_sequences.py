@@ -84,6 +84,7 @@ def test_against_fourier_analysis_of_the_waveforms(load, fault):
         assert ratio == pytest.approx(expected[1] / expected[0], abs=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["auto", "cvodes"])
 def test_an_unbalanced_load_by_phasors(solver):
     """Currents of all sequences from the voltages by the load's admittances, angles included.

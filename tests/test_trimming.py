@@ -73,6 +73,7 @@ def test_every_pair_gives_the_same_point(gg, reference, pair):
         assert "N" not in pair
 
 
+@pytest.mark.long
 def test_speed_and_another_quantity_give_the_point_itself(gg, reference):
     """Guards the test above: with the speed fixed there is no second solution to hide behind."""
     for n in FIXABLE[1:]:
