@@ -101,6 +101,12 @@ def write_pages(app: Sphinx) -> None:
             path.write_text(text, encoding="utf-8")
 
 
+def lead(app: Sphinx, name: str, source: list[str]) -> None:
+    """Let links to pages beside ``docs`` lead to where the site has them."""
+    for page in ("VALIDATION", "ESTIMATION", "BENCHMARKS", "CHANGELOG"):
+        source[0] = source[0].replace(f"](../{page}.md", f"](reference/{page.lower()}.md")
+
+
 def inline(self, node) -> None:
     """Write a formula within a line."""
     self.body.append(convert(node.astext()))
@@ -122,4 +128,5 @@ def setup(app: Sphinx) -> dict:
         "mathml", inline_renderers=(inline, None), block_renderers=(block, None)
     )
     app.connect("builder-inited", write_pages)
+    app.connect("source-read", lead)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

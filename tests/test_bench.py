@@ -49,7 +49,7 @@ def test_the_joint_parts_run_and_are_accurate(monkeypatch):
     assert len(rows) == 3 and all(r.accurate for r in rows), [(r.what, r.error) for r in rows]
 
 
-@pytest.mark.ci  # as above
+@pytest.mark.slow  # half a minute of compiling
 def test_lanes_are_timed_beside_scalar_code_with_the_same_results():
     rows = laneparts.lanes(TINY)
     assert len(rows) == 4 and all(r.accurate and r.ratio > 0 for r in rows)

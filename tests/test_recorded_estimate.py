@@ -162,7 +162,8 @@ def test_the_joint_command_writes_its_recording_and_estimates_from_it(run, tmp_p
 @pytest.mark.parametrize(
     ("names", "text"),
     [
-        (ELECTRICAL.names, "jitter = 5e-6"),
+        # half a minute
+        pytest.param(ELECTRICAL.names, "jitter = 5e-6", marks=pytest.mark.slow),
         (("i_a", "i_b", "i_c"), "lag = 20e-6\ndelay = 5e-5"),
         (("i_a", "i_b", "i_c"), "quantum = 4.0\nrange = [-200, 200]"),
     ],

@@ -279,7 +279,7 @@ def test_offsets_are_states_estimated_or_considered(many):
     assert y["T41"] == pytest.approx(at["T41"], rel=1e-8)
 
 
-@pytest.mark.ci  # sixteen estimates
+@pytest.mark.slow  # a minute: sixteen estimates
 def test_declared_sensors_are_believed_and_right_and_undeclared_lags_are_not(drop, many):
     """NEES near 1 with lags, delay, offsets, digits and jitter declared; a lag left out shows."""
     found = [estimate(recorded(drop, many, s), sensors=many, backend="vm") for s in range(12)]

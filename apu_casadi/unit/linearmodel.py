@@ -32,10 +32,10 @@ class Eigenvalue:
     Args:
         value: 1/s; of a pair the one with positive imaginary part.
         time_constant: -1/real part, s; negative: it grows, infinite: it stays.
-        damping: -real part/|value|; 1 for a real stable one.
+        damping: -real part/abs(value); 1 for a real stable one.
         frequency: imaginary part/(2 pi), Hz.
         participation: share of each state in the mode, largest first, those below 5 % left out.  It
-            is |w_k v_k| of left and right eigenvector, over its sum; units cancel in it.
+            is abs(w_k v_k) of left and right eigenvector, over its sum; units cancel in it.
     """
 
     value: complex

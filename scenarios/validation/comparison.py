@@ -31,7 +31,7 @@ class Row:
         quantity, unit: what is compared; ``unit`` in the reference's own units.
         reference, ours: the two values; for a check, ``reference`` is the target of the error.
         error: relative error, or the error that the check defines.
-        tolerance: largest acceptable |error|; infinite where nothing is asked.
+        tolerance: largest acceptable abs(error); infinite where nothing is asked.
         reason: why this tolerance.
         kind: one of ``KINDS``.
     """

@@ -317,7 +317,7 @@ def split_power(
     f: float,
     unbalance: tuple[float, float, float],
 ) -> list[complex]:
-    """Return |R + jX| per phase, ohm, X >= 0, that draw a power from a balanced rated voltage.
+    """Return abs(R + jX) per phase, ohm, X >= 0, that draw a power from a balanced rated voltage.
 
     Raises:
         ParameterError: a value out of range; ``where`` begins the text.

@@ -7,14 +7,12 @@ three are estimated, linearly and without bounds, and the faulty phase is found 
 k_rf are then a ridge, mu = h (1 + k_rf)/(1 + h), and are reported as such.  A leaky fault
 (kappa > mu) is estimated for a phase and a kappa that are given.
 
-=============================================== ==============================================
-:mod:`estimators.apu.electrical.tuning`   random walks, starts, levels, and why
-:mod:`estimators.apu.electrical.terminalsignals`  what is measured, and signals of the model
-:mod:`estimators.apu.electrical.machinemodel`    errors of voltages, gains, leaky faults, jumps
-:mod:`estimators.apu.electrical.electricalfilter`   the filter, its recordings and its start
-:mod:`estimators.apu.electrical.tracking` faults that come and go; mean power
-:mod:`estimators.apu.electrical.faults`   which phase, how much, what cannot be told
-:mod:`estimators.apu.electrical.hypotheses`   a short circuit that may be there
-:mod:`estimators.apu.electrical.electricalside` what is handed to the gas path
-=============================================== ==============================================
+- :mod:`estimators.apu.electrical.tuning`: random walks, starts, levels, and why
+- :mod:`estimators.apu.electrical.terminalsignals`: what is measured, and signals of the model
+- :mod:`estimators.apu.electrical.machinemodel`: errors of voltages, gains, leaky faults, jumps
+- :mod:`estimators.apu.electrical.electricalfilter`: the filter, its recordings and its start
+- :mod:`estimators.apu.electrical.tracking`: faults that come and go; mean power
+- :mod:`estimators.apu.electrical.faults`: which phase, how much, what cannot be told
+- :mod:`estimators.apu.electrical.hypotheses`: a short circuit that may be there
+- :mod:`estimators.apu.electrical.electricalside`: what is handed to the gas path
 """
