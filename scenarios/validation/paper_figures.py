@@ -156,7 +156,7 @@ def machine_transient(kind: str = "healthy", solver: str = "cvodes") -> xr.Datas
 
 
 def mean_error(a: Mapping[str, Any], b: Mapping[str, Any], names: tuple[str, ...]) -> float:
-    """Mean over signals and instants of abs(a - b) over the rms of b: finite where b crosses zero."""
+    """Mean over signals and instants of abs(a - b), over the rms of b: finite where b is zero."""
     each = []
     for n in names:
         x, y = np.asarray(a[n]), np.asarray(b[n])
