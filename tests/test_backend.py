@@ -182,6 +182,7 @@ def test_a_compiler_that_fails_gives_one_warning(monkeypatch, tmp_path, caplog):
         backend.compiled(f, backend="c")
 
 
+@pytest.mark.long
 @needs_compiler
 @pytest.mark.parametrize("damage", ["truncated", "changed", "empty", "no sum"])
 def test_a_damaged_library_is_compiled_again(monkeypatch, fresh, damage):
@@ -215,6 +216,7 @@ print(repr(backend.Caller(c)(X, P)[0].tolist()))
 """
 
 
+@pytest.mark.long
 @needs_compiler
 def test_processes_that_compile_at_once_all_succeed(fresh):
     """Each writes a file of its own and puts it in place in one step."""

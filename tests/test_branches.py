@@ -60,6 +60,7 @@ def states(gg):
     return list(found.values())
 
 
+@pytest.mark.long
 def test_both_points_are_steady_and_differ(gg, states):
     """The points of a published case, 980.9 and 973.3 K; neither run leaves its own."""
     T4 = gg.Y.index("T4")
@@ -91,6 +92,7 @@ def test_a_run_through_the_region_follows_its_branch(gg, states, share):
         assert_allclose(coarse[1:], fine[4::4], atol=max(0.3 * largest, 0.3))
 
 
+@pytest.mark.long
 def test_the_shipped_map_has_one_point_there(gg):
     """The same question to the engine as shipped: one root from every start, and a run keeps it."""
     made = GasGenerator()

@@ -52,6 +52,7 @@ def bench(gg, *, n_points=3, sigma=1e-3, outputs=("W2", "T3", "P3", "T5", "SM"))
     return points
 
 
+@pytest.mark.long
 def test_defaults_are_made_again(defaults):
     """The numbers in the code are those that `apu calibrate` finds, to all digits printed there."""
     code = {"compressor_map": COMPRESSOR_CALIBRATION, "turbine_map": TURBINE_CALIBRATION}

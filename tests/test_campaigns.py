@@ -189,6 +189,7 @@ def test_a_changed_scenario_runs_again(base, tmp_path):
     assert len((tmp_path / RUNS).read_text().splitlines()) == 2
 
 
+@pytest.mark.long
 def test_datasets_of_runs_are_kept_when_asked_for(base, tmp_path, caplog):
     (run,) = random_faults(1, base=base.change(waveform_dt=1e-3))
     run_campaign([run], workers=1, out=tmp_path, summary_only=False)

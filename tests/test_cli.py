@@ -35,6 +35,7 @@ def test_list(capsys):
     assert json.loads(capsys.readouterr().out)[0]["name"] == "joint"
 
 
+@pytest.mark.long
 def test_list_loads_nothing_heavy():
     code = (
         "import sys; from scenarios.cli import main; main(['list'])\n"

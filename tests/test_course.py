@@ -123,6 +123,7 @@ def test_a_profile_of_many_points_needs_few_tables(monkeypatch):
     assert len(made) < 60
 
 
+@pytest.mark.long
 def test_what_changes_too_fast_or_in_structure_is_left_to_others():
     """A jump, an end that is another model, a profile of no load."""
     fast = varying(SeriesLoad.from_power, Ramp(100e3, 200e3, over=0.1), 0.9)

@@ -55,6 +55,7 @@ def test_exact_on_the_riccati_equation():
     assert march(step, [1.0], 9.0, 100)[0] == pytest.approx(0.1, rel=1e-13)
 
 
+@pytest.mark.long
 def test_second_order_on_a_nonlinear_system():
     """Lotka-Volterra, against the same method with 64 times smaller steps (error 4096 smaller)."""
     step = step_function(lambda x: ca.vertcat(x[0] * (1 - x[1]), x[1] * (x[0] - 1)), 2)

@@ -287,6 +287,7 @@ def test_gains_are_told_from_a_fault():
     assert faulty_phase(r).phase == "b"
 
 
+@pytest.mark.long
 def test_considered_gains_leave_the_angle_free():
     """A speed 0.01 % off moves h by 2e-5 if the angle walks with the speed's noise only.
 
@@ -310,6 +311,7 @@ def test_considered_gains_leave_the_angle_free():
     assert sigma[ANGLE_WALK_CONSIDERED] == pytest.approx(sigma[0.0], rel=0.01)
 
 
+@pytest.mark.long
 def test_leaky_fault_and_what_kappa_does():
     """kappa = 1 known: mu and k_rf; another kappa gives another pair for the same shunt."""
     fault = Ttsc(0.01, 1.0, kappa=1.0)

@@ -45,6 +45,7 @@ def state(gg):
     return p.x, u, np.array([0.98, 0.99, 0.985, 1.01]), p.z
 
 
+@pytest.mark.long
 def test_derivatives_by_every_parameter_are_those_of_replaced_units(gg, state):
     """f and g of units with one number moved, against the Jacobian that solves the design point.
 
@@ -129,6 +130,7 @@ def test_a_design_point_that_does_not_exist_is_told_by_the_residual(gg, state, T
     assert not float(y[gg.Y.index("residual")]) <= 1e-9
 
 
+@pytest.mark.long
 def test_a_new_engine_builds_and_compiles_nothing(asked):
     """Another set of numbers runs, trims and batches on what the first engine made."""
 
@@ -159,6 +161,7 @@ def test_a_state_space_takes_its_numbers_from_the_unit(gg, state):
     np.testing.assert_allclose(flat(ss.shared.f(x, u, full)), flat(ss.f(x, u, theta)), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_parameters_are_unknowns_of_a_fit_like_health_factors():
     """Burner efficiency and a map number of a replaced unit are found from its steady points.
 

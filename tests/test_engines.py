@@ -64,6 +64,7 @@ def small(tmp_path_factory):
     return path
 
 
+@pytest.mark.long
 def test_another_engine_is_trimmed_run_and_batched(small):
     """Balances of mass and energy hold at its points, and its run settles on its trim."""
     gg = read_engine(small)

@@ -129,6 +129,7 @@ def test_collocation(stages):
         assert m.values[0].real == pytest.approx(3 + 3 ** (2 / 3) - 3 ** (1 / 3), rel=1e-12)
 
 
+@pytest.mark.long
 @needs_compiler
 @VERSIONS
 @pytest.mark.parametrize("name", MODELS)
@@ -216,6 +217,7 @@ def test_generator_by_cosimulation(built, generator_run, tmp_path):
     close(v[:, BETWEEN], names, generator_run, BETWEEN, 1e-7)
 
 
+@pytest.mark.long
 @needs_compiler
 def test_generator_by_model_exchange(built, generator_run, tmp_path):
     how = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10, "changes": SWITCHES}

@@ -118,6 +118,7 @@ def test_a_load_in_run_linearisation_and_estimator(mine):
     assert abs(found["f_eta_c"].values[-1] - 1) < 0.05
 
 
+@pytest.mark.long
 def test_a_fault_in_run_linearisation_and_estimator(mine):
     """As the shipped field fault; the filter finds the fraction of shorted turns."""
     own = mine["MyFieldShort"](0.1)

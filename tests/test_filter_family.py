@@ -324,6 +324,7 @@ def test_a_filter_of_another_engine_compiles_nothing(truth, asked):
     assert before and asked == before
 
 
+@pytest.mark.long
 def test_interacting_models_of_another_engine_compile_nothing(truth, asked):
     """Modes are members: the block is the families', the numbers of each mode are arguments."""
     probabilities = []
@@ -367,6 +368,7 @@ def test_horizons_fits_and_signatures_of_another_engine_compile_nothing(truth, a
     assert (np.abs(np.subtract(*found)) > 1e-6).all()
 
 
+@pytest.mark.long
 def test_a_fit_of_another_engine_compiles_nothing(asked):
     """The lifted model and the program are the family's; the numbers are among the data."""
     before, found = set(asked), []

@@ -273,6 +273,7 @@ def read_rightly_or_refused(seeds, folder):
     return counts
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:Times can't be serialized faithfully")
 def test_random_layouts_are_read_rightly_or_refused_with_the_remedy(tmp_path):
     counts = read_rightly_or_refused(range(SEED, SEED + CASES), tmp_path)

@@ -192,6 +192,7 @@ def test_coupled_fault_is_an_unbalanced_load_of_the_healthy_machine():
 INDUCTIVE = SeriesLoad.from_power(150e3, 0.8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gen", "switches"),
     [

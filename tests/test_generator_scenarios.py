@@ -192,6 +192,7 @@ def test_figures_draw_each_generator(ds, tmp_path):
     assert ticks == ["Load 1", "Load 2", "Gas path", "Stator 1", "Stator 2"]
 
 
+@pytest.mark.long
 def test_the_library_has_a_fault_in_one_machine():
     one, both = (registry.run(n, waveform_dt=None) for n in ("joint_one_machine", "joint"))
     a, b = (results.phase_summary(x) for x in (one, both))

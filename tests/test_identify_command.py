@@ -45,6 +45,7 @@ def test_the_report_says_what_can_be_known(capsys, tmp_path):
     assert (tmp_path / "new" / "power.png").stat().st_size > 20_000
 
 
+@pytest.mark.long
 def test_json_holds_the_same(capsys):
     """Infinite bounds become null; nothing is NaN."""
     status, text, _ = out(capsys, "--json", "--sensors", "N,P3,T3,T5", "--point", "offdesign")
@@ -56,6 +57,7 @@ def test_json_holds_the_same(capsys):
     assert {r["fault"] for r in report["add"]} == set(these)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
@@ -118,6 +120,7 @@ def test_the_reduction_agrees_with_the_matrix_inversion_lemma():
         assert r["rms_after"] == pytest.approx(rms, rel=1e-5)
 
 
+@pytest.mark.long
 def test_random_snapshots_of_the_nonlinear_engine_confirm_the_bounds():
     """60 seeds: errors within 4 standard errors of the bounds (500 in the command's --trials).
 
@@ -170,6 +173,7 @@ GEN = Generator()
 LOAD = SeriesLoad.from_power(225e3)
 
 
+@pytest.mark.long
 def test_severities_of_one_h_have_the_same_currents():
     """kappa = mu: along mu(k_rf) with constant h, 20 ms of the coupled model agree to 1e-9.
 

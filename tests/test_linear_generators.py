@@ -122,6 +122,7 @@ def test_assembled_of_its_parts_it_is_the_linear_unit():
         assert getattr(parts, k) == pytest.approx(getattr(whole, k), rel=1e-9, abs=1e-8), k
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gen", "load", "fault"),
     [

@@ -134,6 +134,7 @@ def test_equal_to_central_differences(apu, point):
         assert sharp < 1e-3, f"{ss.name}: the differences are too coarse to check with: {sharp:.1e}"
 
 
+@pytest.mark.long
 def test_both_routes_agree(apu, point, joint):
     """Eliminating z by the root finder's derivative and by hand are two routes to one answer.
 

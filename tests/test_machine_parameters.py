@@ -93,6 +93,7 @@ def test_every_parameter_counts_somewhere():
     assert idle == ["machine.P_rated"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", [None, Ttsc(0.05, 20.0)], ids=["healthy", "fault"])
 def test_another_unit_builds_and_compiles_nothing(fault):
     """Functions of the steps and of the integrators are the very same; results are its own."""

@@ -98,6 +98,7 @@ def test_swapped_lines_are_found():
     assert findings(t, "eta", eta)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [10.0, 1.5, 0.7])
 def test_surge_points_are_found(factor):
     """Each point in turn; the ends have one neighbour only and are found from a factor of two."""

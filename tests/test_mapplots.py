@@ -41,6 +41,7 @@ def curve(ax, label):
     return next(line for line in ax.lines if line.get_label().startswith(label)).get_xydata()
 
 
+@pytest.mark.long
 def test_operating_line_lies_on_its_own_points(gg, lines):
     """At design ambient the line ends at the design point, at standard-day flow 3.2034 kg/s.
 

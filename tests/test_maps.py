@@ -343,6 +343,7 @@ def test_newton_finds_the_point_from_far_off_the_map(compressor):
     assert_allclose(compressor.lookup(1.02, found).PR, 8.1, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_generated_c_agrees(compressor, turbine, tmp_path, monkeypatch):
     """Two routes: CasADi's virtual machine and generated C, values and Jacobian; round-off only."""

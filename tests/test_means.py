@@ -135,6 +135,7 @@ def test_true_unbalance_is_that_over_whole_periods(load, fault):
     assert_allclose(found, by_hand, rtol=2e-6)
 
 
+@pytest.mark.long
 def test_all_integrators_give_the_same_rms_values():
     """One faulty step off rated speed by CVODES, IDAS, samples and means only: 1e-6."""
     fault = Ttsc(0.05, 20.0, phase="c")
@@ -178,6 +179,7 @@ def test_a_gas_path_fault_unbalances_nothing(solver):
     assert spread[-1] == pytest.approx(0.50, abs=0.02)  # A, of 100 kW
 
 
+@pytest.mark.long
 def test_events_at_one_instant_are_one_switch():
     """Every order of load, fault and health, and of the two given for the start: the same bits."""
     for load in (ConstantPowerLoad(120e3), SeriesLoad.from_power(120e3, 0.85)):
@@ -199,6 +201,7 @@ def test_events_at_one_instant_are_one_switch():
             np.testing.assert_array_equal(pair[0][n], pair[1][n], err_msg=n)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["cvodes", "idas", "propagator"])
 def test_load_dump_of_an_inductive_load(solver):
     """Megavolts for nanoseconds are in no rms value, and the run says when and how many.

@@ -195,6 +195,7 @@ def _with_parameter(m):
     )
 
 
+@pytest.mark.long
 def test_a_short_horizon_loses_little():
     """The arrival cost stands for what left: 10 samples of 60 come near the batch estimate."""
     m = pendulum()

@@ -66,6 +66,7 @@ def recordings(hole):
     return missing, noisy
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hole", HOLES)
 @pytest.mark.parametrize("name", FILTERS)
 def test_is_skipped_and_the_rest_kept(name, hole):

@@ -13,6 +13,7 @@ from estimators.detection.alarms import HOUR
 from estimators.detection.nis import nis_test, nis_threshold, upcrossing_rate, windowed_nis
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("dof", "window"), [(1, 1), (1, 6), (4, 10), (3, 80)])
 def test_upcrossings_of_the_moving_sum_come_at_the_stated_rate(dof, window):
     """2e6 samples at a rate of 1e-3: 2000 crossings, so 5 standard deviations are 11 %."""

@@ -106,6 +106,7 @@ def test_against_scipy_on_a_likelihood_by_hand():
     assert found.units == ("1/sqrt(s)", "1", "1") and found.kinds == ("walk", "noise", "noise")
 
 
+@pytest.mark.long
 def test_known_noise_is_found_within_its_intervals():
     """Six recordings: 18 errors over their standard errors, mean square about 1 (chi-squared with
     18 degrees of freedom: 0.27 to 2.4 at 99.9 %); two recordings together know more."""

@@ -182,6 +182,7 @@ def test_what_is_not_read_is_told(write):
         read_map(write(python))
 
 
+@pytest.mark.long
 def test_damaged_files_are_refused_or_read_never_lost(write):
     """Cut anywhere, tokens swapped, numbers replaced: an error of the package, or the same map."""
     t, rng = shipped("axi5"), random.Random(1)

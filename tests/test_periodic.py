@@ -91,6 +91,7 @@ def test_what_is_balanced_but_for_rounding_is_the_balanced_state():
             assert b.turn.rms(n) == pytest.approx(a.turn.rms(n), rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_power_balance_of_a_turn(name):
     """Shaft and field power are output and losses, the fault's included; 1e-8 of the rating."""

@@ -198,6 +198,7 @@ def test_copied_steppers_and_propagators_give_the_same_bits(used, models):
             assert call(pickle.loads(pickle.dumps(models[name]))) == call(models[name]), name
 
 
+@pytest.mark.long
 def test_a_filters_model_of_own_functions_goes_along():
     """Models that no function of the package made are pickled with their functions."""
     from estimation_models import pendulum, pendulum_data, random_belief

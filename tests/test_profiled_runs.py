@@ -110,6 +110,7 @@ def test_slow_changes_end_at_the_trim_of_their_ends():
         assert float(ds[name][-1]) == pytest.approx(at_rest.gas[name], rel=1e-6), name
 
 
+@pytest.mark.long
 def test_what_was_held_is_recorded():
     """Health, severity, day, speed and load of every step, at mid-step; profiles in words."""
     after = Ramp(0.05, 0.06, over=0.2)
@@ -182,6 +183,7 @@ def test_one_model_follows_profiles():
     assert one["mu"].values[0].max() == 0 and one["k_rf"].values[1, -1] < 60
 
 
+@pytest.mark.long
 def test_where_a_profile_jumps_the_one_model_begins_an_interval():
     """A fault that comes and goes, a governed speed that steps: as events at the same instants."""
     t = (0.02, 0.05)

@@ -70,6 +70,7 @@ def test_equals_cvodes(gen, load, fault):
         x_fast, x = ours.x_end.copy(), theirs.x_end.copy()
 
 
+@pytest.mark.long
 def test_long_strides_agree_with_single_samples():
     """Several samples for each step of the exciter: the same within 1e-6 of peak once settled."""
     point = GEN.steady_state(KW100)

@@ -95,6 +95,7 @@ def test_run_measure_estimate_is_the_joint_estimation(run, joint):
     assert "short circuit in phase a, reported at 0.12 s" in joint.summary()
 
 
+@pytest.mark.long
 def test_gas_path_alone_is_the_filter_of_the_studies(run, files):
     filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)
     noise = np.random.default_rng([SEED, 2])
@@ -184,6 +185,7 @@ def test_declared_imperfections_of_the_generators_sensors(run, tmp_path, names, 
     assert e.believable, e.doubts
 
 
+@pytest.mark.long
 def test_a_subset_of_the_gas_path(readings):
     """Without shaft power, speed and temperatures: wider, and said so."""
     few = estimate(read_recording(gas_of(readings, "P3", "Wf")), backend="vm")
@@ -260,6 +262,7 @@ def test_what_cannot_be_used_is_refused(readings):
         estimate(read_recording(gap))
 
 
+@pytest.mark.long
 def test_a_wrong_sensor_is_doubted(readings):
     """T5 is 10 % too high in each second sample: no health explains that."""
     gas = {n: np.tile(v, 4) for n, v in gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW").items()}
@@ -391,6 +394,7 @@ def test_all_formats_hold_the_same(readings, tmp_path, ending):
             assert_allclose(m[n].values, readings[kind][n].values, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.long
 def test_commands(run, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     results.save(run, "run.nc")

@@ -482,6 +482,7 @@ def test_the_command_says_how_it_read(tmp_path, capsys):
     assert "column valid is not heeded: 1 of 12 rows" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_the_command_takes_layouts(tmp_path, capsys):
     """Names, units and rate by options or by a file; words for gaps; many rows without time."""
     path, layout = tmp_path / "x.csv", tmp_path / "x.toml"

@@ -69,6 +69,7 @@ def test_about_its_own_point_the_linear_model_is_the_model():
     assert lin.u.names[-3:] == ("at_q", "at_r", "at_k")
 
 
+@pytest.mark.long
 def test_passes_lead_to_the_most_probable_path():
     """Twelve samples, against SciPy's least squares, in sigmas: 0.03 off, then 2e-4, then not.
 

@@ -56,6 +56,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path, ds, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["joint.nc"]
 
 
+@pytest.mark.long
 def test_missing_and_damaged_files_are_data_errors(tmp_path):
     with pytest.raises(DataError, match=r"none\.nc: cannot be read: No such file"):
         results.load(tmp_path / "none.nc")

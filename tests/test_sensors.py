@@ -138,6 +138,7 @@ def test_another_sensor_tells_more(drop):
     assert spread(WITH_TC) < 0.99 * base
 
 
+@pytest.mark.long
 def test_a_fit_takes_sensors_of_any_kind(drop):
     """Through the load drop with the lag as a state, and at steady points, where it is over."""
     t, rows = samples(drop)

@@ -67,6 +67,7 @@ def test_it_is_where_a_run_from_the_balanced_start_ends():
         assert float(ds[n][-1]) == pytest.approx(float(late[n][-1]), rel=1e-4)
 
 
+@pytest.mark.long
 def test_events_go_on_from_there():
     events = [FaultChange(0.2, None), LoadChange(0.4, KW225)]
     ds = run(load=UNEVEN, fault=FAULT, events=events, start_from="settled")
@@ -90,6 +91,7 @@ def test_a_trim_of_the_unit_with_faults():
         trim(APU, load=KW100, fault={3: FAULT})
 
 
+@pytest.mark.long
 def test_in_scenarios_and_commands(tmp_path, capsys):
     text = """
     name = "settled"
@@ -162,6 +164,7 @@ def test_torque_and_paper_agree_at_the_rated_point():
     assert b.ss.name == "generator_resistive_healthy_torque"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("load", "fault"),
     [(KW100, None), (UNEVEN, FAULT), (SHORT, None),

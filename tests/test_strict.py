@@ -105,6 +105,7 @@ EACH = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", EACH)
 def test_every_kind_is_data_and_stops_a_strict_run(kind):
     """With the reason, the instant and what to do; the run that goes on has it as data."""

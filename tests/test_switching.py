@@ -73,6 +73,7 @@ def some_load(rng):
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_idas_starts_from_any_angle():
     """120 switches at random rotor angles, speeds, loads, faults, neutrals: none fails.
 

@@ -90,6 +90,7 @@ def test_one_unit_in_four_threads_gives_the_serial_bits(options, cold, monkeypat
     assert got == [digest(run(Apu(), k, **options)) for k in range(THREADS)]
 
 
+@pytest.mark.long
 def test_the_virtual_machine_in_four_threads_gives_the_serial_bits():
     """Chosen for the process; the choice of a block stays with its thread."""
     apu = Apu()

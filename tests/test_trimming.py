@@ -146,6 +146,7 @@ REFUSED = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", list(REFUSED))
 def test_refusals_name_reason_number_and_limit(gg, case):
     """Each is an OperatingPointError with status and best point; a batch has the same status."""

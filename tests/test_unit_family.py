@@ -120,6 +120,7 @@ def test_pole_pairs_are_whole_but_differentiable(point):
         joint_averaged(UNIT).with_free("gas_generator.eta_c")
 
 
+@pytest.mark.long
 def test_a_free_parameter_changes_nothing_at_its_own_value(point):
     """Matrices by state and input are those without; theta has the unit's value as default."""
     plain = linearise_joint(UNIT, point)

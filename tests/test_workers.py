@@ -60,6 +60,7 @@ def gone(pid):
         return not os.path.exists("/proc") or not os.path.exists(f"/proc/{pid}")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL there")
 @pytest.mark.parametrize("how", ["kill", "exit", "error"])
 def test_workers_end_with_their_parent(how):
