@@ -2,7 +2,7 @@
 
 The unknowns are all there is: shared parameters, own parameters of each recording, and for every
 sample its state, lifted unknowns and noises (direct multiple shooting with one step an interval;
-Bock and Plitt 1984).  With e all of unit variance,
+Bock and Plitt 1984).  With e all of unit variance::
 
     minimise   1/2 e'e,       e = ((y - g)/sigma, w, xi, xi0, (theta - mean)/sigma)
     so that    x(k+1) = f(x(k), u(k), p, w(k), dt(k)) + sqrt(dt(k)) walk xi(k)

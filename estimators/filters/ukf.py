@@ -10,7 +10,7 @@ m +- sqrt(c) L_i in pairs, let, for a function h,
 
     d_i = (h_i+ - h_i-) / (2 sqrt(c)),   s_i = (h_i+ + h_i- - 2 h_0) / (2 c),   delta = sum s_i.
 
-Then the scaled transform is, exactly,
+Then the scaled transform is, exactly::
 
     mean = h_0 + delta,
     cov = sum d_i d_i' + c sum s_i s_i' + (beta - alpha^2) delta delta'

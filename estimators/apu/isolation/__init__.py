@@ -23,14 +23,12 @@ Two classifiers, and what no classifier can surpass:
 All integrate the sizes out over the very range that they are drawn from, so a pair does not win
 against its members by having more freedom.
 
-================================================= ==============================================
-:mod:`estimators.apu.isolation.problem`     classes, protocol of a window
-:mod:`estimators.apu.isolation.windowmodel`       the gas path with jumps
-:mod:`estimators.apu.isolation.truth`       simulated windows of the governed unit
-:mod:`estimators.apu.isolation.evidence`    sizes integrated out over their ranges
-:mod:`estimators.apu.isolation.classifiers` ``glr`` and ``bank``
-:mod:`estimators.apu.isolation.scores`      confusion matrix, Cohen's kappa
-:mod:`estimators.apu.isolation.limit`       Bayes' rule in the linear problem
-:mod:`scenarios.studies.estimation.isolation`  fresh windows of every class
-================================================= ==============================================
+- :mod:`estimators.apu.isolation.problem`: classes, protocol of a window
+- :mod:`estimators.apu.isolation.windowmodel`: the gas path with jumps
+- :mod:`estimators.apu.isolation.truth`: simulated windows of the governed unit
+- :mod:`estimators.apu.isolation.evidence`: sizes integrated out over their ranges
+- :mod:`estimators.apu.isolation.classifiers`: ``glr`` and ``bank``
+- :mod:`estimators.apu.isolation.scores`: confusion matrix, Cohen's kappa
+- :mod:`estimators.apu.isolation.limit`: Bayes' rule in the linear problem
+- :mod:`scenarios.studies.estimation.isolation`: fresh windows of every class
 """
