@@ -22,16 +22,13 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import interrupts
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError, SimulationError, nearest
 from apu_casadi.core.profiles.profile import Profile, Varying
@@ -43,7 +40,7 @@ from scenarios.extensions import digest
 from scenarios.phases import Phase
 from scenarios.schema import Scenario
 from scenarios.shell.locking import locked
-from scenarios.shell.workers import pool, stoppable
+from scenarios.shell.workers import LOST, each_task, stoppable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -359,56 +356,9 @@ def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
 
 def _records(tasks: Sequence[_Task], workers: int | None) -> Generator[dict[str, Any]]:
     """Yield the records of all tasks, in the order in which they end."""
-    from apu_casadi.core.calling import available_threads
-
-    n = min(available_threads() if workers is None else workers, len(tasks))
-    if n <= 1:
-        for t in tasks:
-            yield _run_one(t)
-        return
-    suspects: list[_Task] = []
-    yield from _pooled(list(tasks), n, suspects)
-    # one of these took its process down: each gets a process of its own, which tells the culprit
-    for t in suspects:
-        again: list[_Task] = []
-        yield from _pooled([t], 1, again)
-        if again:
-            why = "the process ended without an answer (killed, out of memory?)"
-            lost = {"key": t.key, "name": t.table["name"], "status": "crashed", "reason": why}
-            yield lost | {"seconds": math.nan}
-
-
-def _pooled(tasks: list[_Task], workers: int, suspects: list[_Task]) -> Iterator[dict[str, Any]]:
-    """Yield records of tasks run by a pool; those under way when a process died go to suspects."""
-    waiting = tasks[::-1]
-    fruitless = 0
-    while waiting:
-        with pool(workers) as executor:
-            under_way: dict[Future[dict[str, Any]], _Task] = {}
-            broken = False
-            fruitless += 1
-            if fruitless > 3:
-                raise SimulationError("the processes of the campaign end before they have run")
-            while (waiting or under_way) and not broken:
-                # few under way, so that an interrupt is answered within a run or two
-                while waiting and len(under_way) < 2 * workers and not broken:
-                    try:
-                        with interrupts.kept_from_children():  # submitting starts processes
-                            future = executor.submit(_run_one, waiting[-1])
-                        under_way[future] = waiting.pop()
-                    except BrokenProcessPool:
-                        broken = True
-                for f in wait(under_way, return_when=FIRST_COMPLETED).done:
-                    task = under_way.pop(f)
-                    try:
-                        record = f.result()
-                    except BrokenProcessPool:
-                        suspects.append(task)
-                        broken = True
-                    else:
-                        fruitless = 0
-                        yield record
-            suspects.extend(under_way.values())
+    for t, record in each_task(_run_one, tasks, workers):
+        lost = {"key": t.key, "name": t.table["name"], "status": "crashed", "reason": LOST}
+        yield lost | {"seconds": math.nan} if record is None else record
 
 
 # ------------------------------------------------------------------------------ kept on disk

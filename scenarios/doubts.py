@@ -115,7 +115,7 @@ def _of_changes(c: Changing, unit: Apu) -> Iterator[tuple[str, str]]:
     for of in faults:
         fault = getattr(of, "fault", of)
         worst = _course(fault) if isinstance(fault, Varying) else [fault]
-        h = [f.mu / (f.k_rf + 1 - f.mu) for f in worst if isinstance(f, Ttsc)]
+        h = [f.h for f in worst if isinstance(f, Ttsc)]
         if h and max(h) < _SEVERITY:
             yield (
                 "fault.k_rf",

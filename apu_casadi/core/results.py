@@ -287,6 +287,11 @@ def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
     return rows
 
 
+def severity_h(mu: np.ndarray, k_rf: np.ndarray) -> np.ndarray:
+    """Return h = mu/(k_rf + 1 - mu) of arrays; 0 without a fault, where k_rf is NaN."""
+    return np.where(mu > 0, mu / (np.nan_to_num(k_rf) + 1.0 - mu), 0.0)
+
+
 def severity(mu: float, k_rf: float, kappa: float) -> dict[str, float | None]:
     """Return mu, k_rf, kappa and h = mu/(k_rf + 1 - mu) together; None where there is no fault."""
     if not mu > 0:

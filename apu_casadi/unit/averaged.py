@@ -237,6 +237,26 @@ def _groups(
     return grouped(apu, of, gens), "_".join(kinds[k[0] - 1] for k in of)
 
 
+class _Family(NamedTuple):
+    """All units of a structure: their groups, parts, equations (:func:`_joint`), and model."""
+
+    own: tuple[Group, ...]
+    parts: JointFamily
+    equations: ca.Function
+    model: StateSpace
+
+
+def _family(
+    apu: Apu,
+    load_kind: str | tuple[str, ...],
+    free: tuple[str, ...],
+    of: tuple[tuple[int, ...], ...] | None,
+) -> _Family:
+    own, name = _groups(apu, load_kind, of)
+    parts = JointFamily.of(apu, own, free)
+    return _Family(own, parts, *parts.keep((_joint, name), lambda: _joint(parts, name)))
+
+
 @kept
 def joint_equations(
     apu: Apu,
@@ -245,9 +265,7 @@ def joint_equations(
     of: tuple[tuple[int, ...], ...] | None = None,
 ) -> ca.Function:
     """Return the family of :func:`joint_averaged` as Function (x, z, u, theta) -> (ode, alg, y)."""
-    own, kinds = _groups(apu, load_kind, of)
-    parts = JointFamily.of(apu, own, free)
-    equations = parts.keep((_joint, kinds), lambda: _joint(parts, kinds))[0]
+    _, parts, equations, _ = _family(apu, load_kind, free, of)
     if not free:
         return equations
     names = joint_averaged(apu, load_kind, free, of).shared.theta
@@ -288,9 +306,7 @@ def joint_averaged(
     Raises:
         SignalError: unknown parameters, or some on which nothing depends.
     """
-    own, kinds = _groups(apu, load_kind, of)
-    parts = JointFamily.of(apu, own, free)
-    family = parts.keep((_joint, kinds), lambda: _joint(parts, kinds))[1]
+    own, parts, _, family = _family(apu, load_kind, free, of)
     return parts.member(apu, own, family, free)
 
 

@@ -269,11 +269,16 @@ def machine_causes(
         found = causes_of_change(machine, sensors, samples, t)
         if found is None:
             continue
-        doubt = None
-        if said and found.probability[said] < SURELY:
-            text = f"{found.best} ({100 * found.probability[found.best]:.0f} %)"
-            doubt = Doubt("sensor", f"what is reported as a {said} at {t:g} s is rather: {text}")
-        yield found, doubt
+        what = f"what is reported as a {said} at {t:g} s"
+        yield found, _rather(found, said, what) if said else None
+
+
+def _rather(found: Causes, said: str, what: str) -> Doubt | None:
+    """The doubt about a report that its probability raises."""
+    if found.probability[said] >= SURELY:
+        return None
+    text = f"{found.best} ({100 * found.probability[found.best]:.0f} %)"
+    return Doubt("sensor", f"{what} is rather: {text}")
 
 
 # ------------------------------------------------------------------------------ gas path
@@ -338,11 +343,7 @@ def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, 
         filt, tracked: the filter and what it said.
     """
     for found in causes_of_alarms(filt, tracked):
-        doubt = None
-        if found.probability["gas path"] < SURELY:
-            text = f"{found.best} ({100 * found.probability[found.best]:.0f} %)"
-            doubt = Doubt("sensor", f"the change reported at {found.t:g} s is rather: {text}")
-        yield found, doubt
+        yield found, _rather(found, "gas path", f"the change reported at {found.t:g} s")
 
 
 def _hidden(side: ElectricalSide) -> Iterator[Doubt]:

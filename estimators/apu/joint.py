@@ -33,7 +33,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import GENERATOR, dataset, generators_of, of_generator
+from apu_casadi.core.results import (
+    GENERATOR,
+    dataset,
+    generators_of,
+    of_generator,
+    severity_h,
+)
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
@@ -446,8 +452,7 @@ def beside_truth(
         put(name, x.unit, x.doc, mean[at], sigma[at], ds[name].values[rows])
     for number, side in known.items():
         end, view = (f"_{number}" if differ else ""), of_generator(ds, number)
-        m, k_rf = view["mu"].values[rows], view["k_rf"].values[rows]
-        h_true = np.where(m > 0, m / (np.nan_to_num(k_rf) + 1 - m), 0.0)
+        h_true = severity_h(view["mu"].values[rows], view["k_rf"].values[rows])
         true_phase, of = _true_phases(ds, end, t), f" of generator {number}" if differ else ""
         for i, phase in enumerate(PHASES):
             doc = f"severity mu/(k_rf + 1 - mu) of a short circuit in phase {phase}{of}"

@@ -19,12 +19,12 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.resultformats import frames, save_frame
-from apu_casadi.core.results import GENERATOR, generators_of, of_generator, save
+from apu_casadi.core.results import save
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
 from estimators.apu.gaspath import true_readings
-from estimators.apu.joint import electrical_samples, unit_of
+from estimators.apu.joint import electrical_samples, machines_of
 from estimators.apu.sensorchain import Draws, disturbed, sampled_wave
 from estimators.apu.sensorfile import SensorFile, read_sensors
 from estimators.apu.sensors import SensorSet
@@ -75,7 +75,7 @@ def measure_run(
     times = {"gaspath": t}
     if "time_w" in ds and s.electrical.sensors:
         made["electrical"] = {}
-        for number, (ending, one, view) in enumerate(_machines(ds, apu), 1):
+        for number, (ending, one, view) in enumerate(machines_of(ds, apu), 1):
             own, of = _drawn(s.electrical, GAIN_SENSORS, with_gains), Draws(seed, number)
             true = electrical_samples(view, one, None)
             times["electrical"] = t_w = true.pop("t")
@@ -115,16 +115,6 @@ def _drawn(
     drawn = {} if rng is None else table.draw_gains(rng, [n for n in names if n in table])
     means = {s.name: s.gain_mean for s in table.sensors if s.gain_mean}
     return drawn | {n: m + drawn.get(n, 0.0) for n, m in means.items()}
-
-
-def _machines(ds: xr.Dataset, apu: Apu) -> list[tuple[str, Apu, xr.Dataset]]:
-    """Ending of the names, unit with that machine as the first, and the run as it sees it."""
-    numbers = generators_of(ds)
-    if GENERATOR not in ds.dims:
-        return [("", apu, ds)]
-    if len(numbers) != len(apu.machines):
-        raise DataError(f"the run has {len(numbers)} generators, the unit {len(apu.machines)}")
-    return [(f"_{k}", unit_of(apu, k), of_generator(ds, k)) for k in numbers]
 
 
 def _dataset(

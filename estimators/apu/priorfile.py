@@ -12,14 +12,13 @@ What is not named is the filter's own prior.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, nearest
 from apu_casadi.core.signals import Signals
+from apu_casadi.core.tomlnumbers import read_toml
 
 __all__ = ["Prior", "read_prior"]
 
@@ -62,10 +61,7 @@ def read_prior(path: str | Path) -> Prior:
     Raises:
         DataError: no such file, no TOML, an unknown key, no number; it says where.
     """
-    try:
-        data = tomllib.loads(files.read_text(path))
-    except tomllib.TOMLDecodeError as e:
-        raise DataError(f"{path}: no TOML: {e}") from None
+    data = read_toml(path, "")
     found: dict[str, dict[str, float]] = {k: {} for k in KEYS}
     for name, row in data.items():
         if not isinstance(row, dict) or not row:

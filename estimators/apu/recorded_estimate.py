@@ -183,8 +183,7 @@ def estimate(
     """
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
-    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    apu, start = _known(engine, prior)
     lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
@@ -245,8 +244,7 @@ def gas_path_data(
     Raises:
         ParameterError, DataError: as of :func:`estimate`; the recording has no gas path.
     """
-    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    apu, start = _known(engine, prior)
     ready = as_declared(m, *tables(m, sensors, ELECTRICAL))
     if reason := _no_gas_path(ready.m, ready.gas_path):
         raise DataError(f"no gas path: {reason}")
@@ -255,6 +253,12 @@ def gas_path_data(
     path = _GasPath(ready.m, apu, ready.gas_path, *given)
     filt, data, begin = path.alone()
     return filt, data, begin, tuple(dict.fromkeys(notes))
+
+
+def _known(engine: Apu | str | Path | None, prior: Prior | str | Path | None) -> tuple[Apu, Prior]:
+    """Return the unit and the prior, from their files where they are named."""
+    apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
+    return apu, read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
 
 
 def _told(

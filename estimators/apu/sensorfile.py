@@ -27,15 +27,14 @@ sensors that have none.  :func:`sensor_schema` is the JSON schema of such a file
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.register import Key
+from apu_casadi.core.tomlnumbers import read_toml
 from apu_casadi.core.units import UNITS
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from estimators.apu.sensors import ELECTRICAL, KNOWN, WAYS, Sensor, SensorSet, gas_path_table, known
@@ -99,10 +98,7 @@ def read_sensors(path: str | Path | None) -> SensorFile:
     """
     if path is None:
         return SensorFile()
-    try:
-        data = tomllib.loads(files.read_text(path))
-    except tomllib.TOMLDecodeError as e:
-        raise DataError(f"{path}: no TOML: {e}") from None
+    data = read_toml(path, "")
     complete = data.pop("complete", False)
     if not isinstance(complete, bool):
         raise DataError(f"{path}: complete must be true or false, got {complete!r:.40}")

@@ -15,7 +15,6 @@ import argparse
 import dataclasses
 import sys
 import time
-from importlib import resources
 
 from scenarios.shell import jsontext, usage
 from scenarios.shell.progress import bar
@@ -32,7 +31,6 @@ recipe FILE ?              | a recipe; default: the reference one
 --json                     | print JSON
 --quiet                    | no progress bar
 """
-_RECIPE = ""
 _BASELINE = """
 name {chance,thresholds,forest,estimators} | forest needs scikit-learn
 --dataset DIR =results/dataset | the data set (default %(default)s)
@@ -44,18 +42,11 @@ name {chance,thresholds,forest,estimators} | forest needs scikit-learn
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions."""
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    rows = (("make", _make, _MAKE), ("recipe", _recipe, _RECIPE), ("baseline", _base, _BASELINE))
-    for name, call, table in rows:
-        p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
-        p.set_defaults(action=call)
-        usage.declare(p, table)
+    rows = (("make", _make, _MAKE), ("recipe", _recipe, ""), ("baseline", _base, _BASELINE))
+    usage.actions(parser, rows)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Do the action; return 0."""
-    status: int = args.action(args)
-    return status
+run = usage.act
 
 
 def resume(args: argparse.Namespace) -> str:
@@ -91,9 +82,9 @@ def _make(args: argparse.Namespace) -> int:
 
 def _recipe(args: argparse.Namespace) -> int:
     """Print the reference recipe, to be changed."""
-    print(
-        (resources.files("scenarios.datasets") / "data/reference.toml").read_text("utf-8"), end=""
-    )
+    from scenarios.datasets.recipe import reference
+
+    print(reference(), end="")
     return 0
 
 

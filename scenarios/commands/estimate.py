@@ -22,7 +22,7 @@ from scenarios.shell.progress import bar, moving
 from scenarios.studies.estimation import names
 
 if TYPE_CHECKING:
-    from estimators.apu.recordings.measured import Measurements
+    pass
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: recordings, joint run, studies, their page"
@@ -79,17 +79,14 @@ _SENSORS = f"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions."""
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    for name, call, table in (
+    rows = (
         ("data", _data, _DATA),
         ("joint", _joint, _JOINT),
         ("study", _study, _STUDY),
         ("page", _page, _PAGE),
         ("sensors", _sensors, _SENSORS),
-    ):
-        p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
-        p.set_defaults(action=call)
-        usage.declare(p, table)
+    )
+    usage.actions(parser, rows)
 
 
 def resume(args: argparse.Namespace) -> str:
@@ -99,10 +96,7 @@ def resume(args: argparse.Namespace) -> str:
     return f"finished parts of the study are kept in {args.out}; the same command goes on"
 
 
-def run(args: argparse.Namespace) -> int:
-    """Do what was asked for."""
-    status: int = args.action(args)
-    return status
+run = usage.act
 
 
 # ------------------------------------------------------------------------------ data
@@ -113,16 +107,13 @@ def _data(args: argparse.Namespace) -> int:
     from apu_casadi.core import results
     from apu_casadi.core.files import save_figure, write_text
     from estimators.apu.recorded_estimate import estimate
-    from estimators.apu.recordings.measured import read_recording
     from estimators.apu.sensorfile import read_sensors
     from scenarios import registry
     from scenarios.figures.recordedplot import plot_recorded
     from scenarios.shell import progress
 
     apu = given.engine_file(args).unit
-    reading, mapping = readingoptions.reading(args, apu.gas_generator)
-    columns = {n: c if u is None else f"{c}:{u}" for n, (c, u) in mapping.items()}
-    m = read_recording(*args.files, columns=columns, reading=reading)
+    m = readingoptions.recording(args, apu.gas_generator)
     sensors = read_sensors(args.sensors)
     progress.tell(f"estimating from {', '.join(m)}", quiet=args.quiet or args.json)
     e = estimate(
@@ -130,7 +121,7 @@ def _data(args: argparse.Namespace) -> int:
         apu,
         only=args.only,
         sensors=sensors,
-        ambient=_day(args, m),
+        ambient=readingoptions.day(args, m),
         prior=args.prior,
     )
     report = e.report() | {"files": args.files, **given.own(args), **given.assumed(args)}
@@ -149,14 +140,6 @@ def _data(args: argparse.Namespace) -> int:
     if made and not args.quiet:
         given.written(made)
     return 0
-
-
-def _day(args: argparse.Namespace, m: Measurements) -> dict[str, float]:
-    """Ambient conditions of the options, and of run files where no column has them."""
-    from estimators.apu.recordings.runfiles import recorded_ambient
-
-    said = {n: v for f in args.files for n, v in recorded_ambient(f).items() if n not in m}
-    return said | {n: v for n, v in given.ambient_given(args).items() if v is not None}
 
 
 # ------------------------------------------------------------------------------ joint

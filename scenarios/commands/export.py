@@ -53,17 +53,10 @@ model {{gas_generator,generator,apu}} | one engine, one generator, or the whole 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions."""
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    for name, call, table in (("c", _c, _C), ("fmu", _fmu, _FMU)):
-        p = actions.add_parser(name, help=call.__doc__, description=call.__doc__)
-        p.set_defaults(action=call)
-        usage.declare(p, table)
+    usage.actions(parser, (("c", _c, _C), ("fmu", _fmu, _FMU)))
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the action."""
-    status: int = args.action(args)
-    return status
+run = usage.act
 
 
 def _asked(args: argparse.Namespace) -> Asked:

@@ -11,6 +11,7 @@ from scenarios.commands import given
 if TYPE_CHECKING:
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from estimators.apu.recordings.layout import Reading
+    from estimators.apu.recordings.measured import Measurements
 
 OPTIONS = """
 --column NAME=COLUMN[:UNIT] ... | column of another name, or its unit
@@ -56,6 +57,23 @@ def reading(
     how = merged(base, Reading(**own))
     mapping |= parse_mapping(args.column)
     return dataclasses.replace(how, ranges=limits, engine=gg), mapping
+
+
+def recording(args: argparse.Namespace, gg: GasGenerator) -> Measurements:
+    """Read the files of a command as its options say; errors as of the reader."""
+    from estimators.apu.recordings.measured import read_recording
+
+    how, mapping = reading(args, gg)
+    columns = {n: c if u is None else f"{c}:{u}" for n, (c, u) in mapping.items()}
+    return read_recording(*args.files, columns=columns, reading=how)
+
+
+def day(args: argparse.Namespace, m: Measurements) -> dict[str, float]:
+    """Return ambient conditions of the options, and of run files where no column has them."""
+    from estimators.apu.recordings.runfiles import recorded_ambient
+
+    said = {n: v for f in args.files for n, v in recorded_ambient(f).items() if n not in m}
+    return said | {n: v for n, v in given.ambient_given(args).items() if v is not None}
 
 
 def _blanks(text: str | None) -> list[str]:

@@ -45,8 +45,6 @@ def run(args: argparse.Namespace) -> int:
     from apu_casadi.core.files import save_figure, write_text
     from estimators.apu.gaspath import ITERATED, ITERATIONS
     from estimators.apu.recorded_estimate import gas_path_data
-    from estimators.apu.recordings.measured import read_recording
-    from estimators.apu.recordings.runfiles import recorded_ambient
     from estimators.apu.sensorfile import read_sensors
     from estimators.batch.noisefit import fit_noise
     from scenarios import registry
@@ -54,12 +52,8 @@ def run(args: argparse.Namespace) -> int:
     from scenarios.shell import progress
 
     apu = given.engine_file(args).unit
-    reading, mapping = readingoptions.reading(args, apu.gas_generator)
-    columns = {n: c if u is None else f"{c}:{u}" for n, (c, u) in mapping.items()}
-    m = read_recording(*args.files, columns=columns, reading=reading)
-    said = {n: v for f in args.files for n, v in recorded_ambient(f).items() if n not in m}
-    day = said | {n: v for n, v in given.ambient_given(args).items() if v is not None}
-    sensors = read_sensors(args.sensors)
+    m = readingoptions.recording(args, apu.gas_generator)
+    sensors, day = read_sensors(args.sensors), readingoptions.day(args, m)
     how: dict[str, Any] = {"sensors": sensors, "ambient": day, "prior": args.prior}
     filt, data, prior, notes = gas_path_data(m, apu, **how)
     measured = [n for n in filt.model.y.names if n in m]

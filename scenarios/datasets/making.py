@@ -19,16 +19,18 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, wait
+from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from apu_casadi.core import files, interrupts
+from apu_casadi.core import files
 from apu_casadi.core.backend import package_digest
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, SimulationError
+from apu_casadi.core.results import CHANNELS, severity_h
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.measuring import measure_run
@@ -39,7 +41,7 @@ from scenarios.datasets.recipe import Drawn, Recipe, draw
 from scenarios.schema import Scenario
 from scenarios.shell import jsontext
 from scenarios.shell.locking import locked
-from scenarios.shell.workers import pool, stoppable
+from scenarios.shell.workers import LOST, each_task, stoppable
 
 RUNS, LOCK, SUMS = "runs.parquet", "dataset.lock", "checksums.sha256"
 VARIED = tuple(n for n in CONDITIONS if n != "war")  # what a recipe draws of the day
@@ -51,7 +53,6 @@ Progress = Callable[[int, int], None]
 
 def gas_path_columns() -> dict[str, tuple[str, str]]:
     """Return unit and meaning of each column of the gas-path tables, by name."""
-    from apu_casadi.core.results import CHANNELS
 
     found = {"run": ("1", "number of the run"), "time": ("s", "since the start of the run")}
     found |= {f"W.{n}": (CONDITIONS[n].unit, CONDITIONS[n].doc) for n in VARIED}
@@ -107,10 +108,8 @@ def _gas_path(d: Drawn, ds: Any, read: Any) -> dict[str, np.ndarray]:
 
 
 def _severity(ds: Any, k: np.ndarray) -> np.ndarray:
-    mu, k_rf = (ds[n].max("generator") if "generator" in ds[n].dims else ds[n]
-                for n in ("mu", "k_rf"))  # fmt: skip
-    m, q = mu.values[k], k_rf.values[k]
-    return np.where(m > 0, m / (np.nan_to_num(q) + 1.0 - m), 0.0)
+    both = (ds[n].max("generator") if "generator" in ds[n].dims else ds[n] for n in ("mu", "k_rf"))
+    return severity_h(*(v.values[k] for v in both))
 
 
 def _faulty(d: Drawn, name: str, t: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -201,7 +200,7 @@ def make_dataset(
         DataError: the folder belongs to another recipe or version, or cannot be written.
     """
     folder = files.folder(out)
-    table = json.loads(json.dumps({k: getattr(r, k) for k in r.__dataclass_fields__}))
+    table = json.loads(json.dumps(asdict(r)))
     told = {"recipe": table, "program": package_digest()}
     with locked(folder, LOCK), stoppable() as stop:
         _claim(folder, told)
@@ -219,30 +218,13 @@ def make_dataset(
 def _all(
     table: dict[str, Any], left: list[int], workers: int | None, cluster: str | None
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    from apu_casadi.core.calling import available_threads
-
     if cluster is not None:
         yield from _on_cluster(table, left, cluster)
         return
-    n = min(available_threads() if workers is None else workers, max(1, len(left)))
-    if n <= 1:
-        yield from ((u, make_unit(table, u)) for u in left)
-        return
-    waiting, lost = left[::-1], 0
-    with pool(n) as executor:
-        under_way: dict[Any, int] = {}
-        while waiting or under_way:
-            while waiting and len(under_way) < 2 * n:
-                with interrupts.kept_from_children():
-                    under_way[executor.submit(make_unit, table, waiting[-1])] = waiting[-1]
-                waiting.pop()
-            for f in wait(under_way, return_when=FIRST_COMPLETED).done:
-                unit = under_way.pop(f)
-                try:
-                    yield unit, f.result()
-                except OSError as e:
-                    lost += 1
-                    raise SimulationError(f"unit {unit}: its process ended: {e}") from e
+    for unit, made in each_task(partial(make_unit, table), left, workers):
+        if made is None:
+            raise SimulationError(f"unit {unit}: {LOST}; units that are finished are kept")
+        yield unit, made
 
 
 def _on_cluster(
@@ -288,11 +270,15 @@ def _record(folder: Path, unit: int) -> Path:
     return folder / "units" / f"unit_{unit:05d}.json"
 
 
+def _sum(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
 def _whole(folder: Path, unit: int) -> bool:
     """Whether a unit stands whole in the folder, every file as it was written."""
     try:
         kept = json.loads(_record(folder, unit).read_text(encoding="utf-8"))
-        sums = {p: hashlib.sha256((folder / p).read_bytes()).hexdigest() for p in kept["files"]}
+        sums = {p: _sum((folder / p).read_bytes()) for p in kept["files"]}
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return bool(sums == kept["files"])
@@ -304,7 +290,7 @@ def _keep(folder: Path, unit: int, made: Mapping[str, Any]) -> None:
         files.folder((folder / name).parent)
         with files.whole(folder / name) as part:
             part.write_bytes(data)
-    sums = {n: hashlib.sha256(d).hexdigest() for n, d in made["files"].items()}
+    sums = {n: _sum(d) for n, d in made["files"].items()}
     files.folder(folder / "units")
     record = {"files": sums, "rows": made["rows"]}
     files.write_text(_record(folder, unit), json.dumps(record) + "\n")
@@ -315,12 +301,14 @@ def _finish(folder: Path, r: Recipe, told: Mapping[str, Any]) -> dict[str, int]:
     records = [json.loads(files.read_text(_record(folder, u))) for u in range(r.units)]
     rows = [row for record in records for row in record["rows"]]
     labels = {n: np.array([row[n] for row in rows]) for n in rows[0]}
+    table = _parquet([labels])
     with files.whole(folder / RUNS) as part:
-        part.write_bytes(_parquet([labels]))
+        part.write_bytes(table)
     sums = {n: s for record in records for n, s in record["files"].items()}
-    sums[RUNS] = hashlib.sha256((folder / RUNS).read_bytes()).hexdigest()
-    files.write_text(folder / "CARD.md", data_card(r, rows, gas_path_columns(), WAVES, told))
-    meta = croissant(r, sums, rows[0], gas_path_columns(), WAVES)
+    sums[RUNS] = _sum(table)
+    columns = gas_path_columns()
+    files.write_text(folder / "CARD.md", data_card(r, rows, columns, WAVES, told))
+    meta = croissant(r, sums, rows[0], columns, WAVES)
     files.write_text(folder / "croissant.json", jsontext.dumps(meta) + "\n")
     lines = [f"{s}  {n}\n" for n, s in sorted(sums.items())]
     files.write_text(folder / SUMS, "".join(lines))

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import ScenarioError, nearest
 from apu_casadi.core.sharing import once
+from apu_casadi.core.tomlnumbers import read_toml
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.apu import Apu
 from estimators.apu.sensors import GAS_PATH
@@ -152,18 +152,17 @@ def read_recipe(path: str | Path | None = None) -> Recipe:
     """Read a recipe; without a file, the reference one.
 
     Raises:
-        ScenarioError: as of :class:`Recipe`, or no TOML.
-        DataError: the file cannot be read.
+        ScenarioError: as of :class:`Recipe`.
+        DataError: the file cannot be read, or is no TOML.
     """
     if path is None:
-        where = "reference recipe"
-        text = (resources.files("scenarios.datasets") / "data/reference.toml").read_text("utf-8")
-    else:
-        where, text = str(path), files.read_text(path)
-    try:
-        return Recipe.of(tomllib.loads(text), where)
-    except tomllib.TOMLDecodeError as e:
-        raise ScenarioError(f"{where}: no TOML: {e}") from None
+        return Recipe.of(tomllib.loads(reference()), "reference recipe")
+    return Recipe.of(read_toml(path, ""), str(path))
+
+
+def reference() -> str:
+    """Return the text of the reference recipe."""
+    return (resources.files("scenarios.datasets") / "data/reference.toml").read_text("utf-8")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import RPM, of_generator, phases
+from apu_casadi.core.results import RPM, of_generator, phases, severity_h
 from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import scenario_of
 
@@ -36,7 +36,8 @@ def _held(ds: xr.Dataset, row: dict[str, Any]) -> tuple[str, np.ndarray] | None:
         own = of_generator(ds, number or 1)
         if name == "h":
             mu = own["mu"].values
-            return f"Fault $h${of}", np.where(mu > 0, mu / (own["k_rf"].values + 1 - mu), np.nan)
+            h = severity_h(mu, own["k_rf"].values)
+            return f"Fault $h${of}", np.where(mu > 0, h, np.nan)
         return (f"Fault {name}{of}", own[name].values) if name in own else None
     key = name if part != "load" else f"load_{name}" + ("" if number is None else f"_{number}")
     if key not in ds:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import RPM, generators_of, of_generator, phases
+from apu_casadi.core.results import RPM, generators_of, of_generator, phases, severity_h
 from apu_casadi.gaspath.health import HEALTH_FACTORS
 from scenarios.figures import figstyle as fs
 from scenarios.figures.chosen import quietest
@@ -196,7 +196,7 @@ def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) ->
     t, lane = ds["time"].values, []
     stator = np.column_stack([ds[f].values for f in SEVERITY])
     for a, b, i, j in _segments(t, stator, rows):
-        worst = i + int(np.argmax(_h(stator[i : j + 1])))
+        worst = i + int(np.argmax(severity_h(*stator[i : j + 1, :2].T)))
         m, r, c = stator[worst]
         kappa = "κ = µ" if abs(c - m) < 1e-12 else f"κ = {c:g}"
         words = "healthy"
@@ -210,12 +210,6 @@ def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) ->
                 words = f"TTSC{of} changes,\nat most {first}, {second}, {third}"
         lane.append((a, b, words, HURT if m > 0 else HEALTHY))
     return lane
-
-
-def _h(stator: np.ndarray) -> np.ndarray:
-    """Return the severity h = mu/(k_rf + 1 - mu) of rows mu, k_rf, kappa; 0 without a fault."""
-    mu, k_rf, _ = stator.T
-    return np.where(mu > 0, mu / (np.nan_to_num(k_rf) + 1.0 - mu), 0.0)
 
 
 def _write(ax: Axes, x: float, y: float, words: str, ink: str, letters: int) -> bool:

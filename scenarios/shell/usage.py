@@ -104,6 +104,24 @@ def declare(parser: argparse.ArgumentParser, table: str) -> None:
         parser.add_argument(*flags, **options, help=text)
 
 
+def actions(
+    parser: argparse.ArgumentParser,
+    rows: Sequence[tuple[str, Callable[[argparse.Namespace], int], str]],
+) -> None:
+    """Declare the actions of a command: name, function, whose docstring is the help, options."""
+    group = parser.add_subparsers(metavar="ACTION", required=True)
+    for name, call, table in rows:
+        p = group.add_parser(name, help=call.__doc__, description=call.__doc__)
+        p.set_defaults(action=call)
+        declare(p, table)
+
+
+def act(args: argparse.Namespace) -> int:
+    """Do the action that was asked for; return its status."""
+    status: int = args.action(args)
+    return status
+
+
 def part(text: str) -> float | dict[str, Any]:
     """Return a finite number, or a table of ``key = value`` with commas between, as TOML has it."""
     if "=" not in text:

@@ -14,17 +14,23 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 from apu_casadi.core import interrupts
+from apu_casadi.core.errors import SimulationError
 
 _LIBRARIES = "OMP OPENBLAS MKL NUMEXPR"
 THREADS = (*(f"{n}_NUM_THREADS" for n in _LIBRARIES.split()), "VECLIB_MAXIMUM_THREADS")
 _PR_SET_PDEATHSIG = 1
+LOST = "the process ended without an answer (killed, out of memory?)"
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @contextlib.contextmanager
@@ -48,6 +54,73 @@ def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             executor.shutdown(wait=True, cancel_futures=True)
             theirs.close()
             ours.close()
+
+
+def each_task(
+    call: Callable[[T], R], tasks: Sequence[T], workers: int | None = None
+) -> Generator[tuple[T, R | None]]:
+    """Yield every task with what the call returns of it, in the order in which they end.
+
+    Args:
+        call: a function of a module; what it raises is raised.
+        tasks: what it is called with, once each, but after a process has died.
+        workers: processes, by default as many as there are cores; 1 calls in this one.
+
+    Yields:
+        Task and result; None where the task takes its process down (``LOST``).
+
+    Raises:
+        SimulationError: the processes end before they have begun.
+    """
+    from apu_casadi.core.calling import available_threads
+
+    n = min(available_threads() if workers is None else workers, len(tasks))
+    if n <= 1:
+        yield from ((task, call(task)) for task in tasks)
+        return
+    suspects: list[T] = []
+    yield from _pooled(call, list(tasks), n, suspects)
+    # one of these took its process down: each gets a process of its own, which tells the culprit
+    for task in suspects:
+        again: list[T] = []
+        yield from _pooled(call, [task], 1, again)
+        if again:
+            yield task, None
+
+
+def _pooled(
+    call: Callable[[T], R], tasks: list[T], workers: int, suspects: list[T]
+) -> Iterator[tuple[T, R]]:
+    """Yield what a pool returns; tasks under way when a process died go to suspects."""
+    waiting = tasks[::-1]
+    fruitless = 0
+    while waiting:
+        with pool(workers) as executor:
+            under_way: dict[Future[R], T] = {}
+            broken = False
+            fruitless += 1
+            if fruitless > 3:
+                raise SimulationError("the processes end before they have run anything")
+            while (waiting or under_way) and not broken:
+                # few under way, so that an interrupt is answered within a task or two
+                while waiting and len(under_way) < 2 * workers and not broken:
+                    try:
+                        with interrupts.kept_from_children():  # submitting starts processes
+                            future = executor.submit(call, waiting[-1])
+                        under_way[future] = waiting.pop()
+                    except BrokenProcessPool:
+                        broken = True
+                for f in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    task = under_way.pop(f)
+                    try:
+                        result = f.result()
+                    except BrokenProcessPool:
+                        suspects.append(task)
+                        broken = True
+                    else:
+                        fruitless = 0
+                        yield task, result
+            suspects.extend(under_way.values())
 
 
 def begin(line: Connection, parent: int) -> None:

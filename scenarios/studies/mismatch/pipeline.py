@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import ApuError
+from apu_casadi.core.results import severity_h
 from apu_casadi.core.sharing import last
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.health import HEALTH
@@ -102,7 +103,7 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
         found = json.loads(e.gaspath.attrs["alarms"])
         false += sum(not (changed and a > ONSET - SETTLED) for a in found)
     for m in e.machines.values():
-        h_true = float(ds["mu"].values[-1] / (ds["k_rf"].values[-1] + 1 - ds["mu"].values[-1]))
+        h_true = float(severity_h(ds["mu"].values[-1], ds["k_rf"].values[-1]))
         for p in PHASES:
             there = fault == "short circuit" and p == phase
             put(f"h_{p}", m, h_true if there else 0.0)
