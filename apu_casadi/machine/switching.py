@@ -14,10 +14,9 @@ import numpy as np
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.profiles.profile import Profile, Varying, at, later
+from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.machine.faults.fault import Fault
 from apu_casadi.machine.loads.load import Load
-
-SAME_INSTANT = 1e-9  # s; switches closer than this are one
 
 
 class Held(NamedTuple):

@@ -6,7 +6,7 @@ Needed where a generator's part is that of means over a turn, which has no equat
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import casadi as ca
@@ -17,7 +17,7 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.control import Governor
-from apu_casadi.unit.events import who
+from apu_casadi.unit.jointfamily import N_REF, of_group
 from apu_casadi.unit.linearmodel import LinearModel
 
 
@@ -28,10 +28,8 @@ class _Part(NamedTuple):
     numbers: tuple[int, ...]
     model: LinearModel
 
-    def own(self, signals: Signals) -> list[Signal]:
-        of = who(self.numbers)
-        named = ((s, f"{self.prefix}{s.name}", f"{of}: {s.doc}") for s in signals)
-        return [dataclasses.replace(s, name=n, doc=d) if self.prefix else s for s, n, d in named]
+    def own(self, signals: Signals) -> Iterable[Signal]:
+        return of_group(signals, self.prefix, self.numbers)
 
     @property
     def fed(self) -> list[int]:
@@ -52,11 +50,10 @@ def assembled(
     one = len(gens) == 1
     parts = [_Part("" if one else f"generator{k[0]}.", k, m) for k, m in gens.items()]
     law, N_0, Wf_0 = apu.governor, float(point.gas["N"]), float(point.gas["Wf"])
-    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
     day = [gas.u.index(n) for n in AMBIENT]
     X = Signals([*gas.x, *law.X, *(s for p in parts for s in p.own(p.model.x))])
     fed = (s for p in parts for s in p.own(Signals(p.model.u[i] for i in p.fed)))
-    U = Signals([*(gas.u[i] for i in day), N_ref, *fed])
+    U = Signals([*(gas.u[i] for i in day), N_REF, *fed])
     TH = Signals([*gas.theta, *(s for p in parts for s in p.own(p.model.theta))])
     Y = Signals([*gas.y, *(s for p in parts for s in p.own(p.model.y))])
     columns = Signals([*(dataclasses.replace(s, name=f"x.{s.name}") for s in X), *U, *TH])

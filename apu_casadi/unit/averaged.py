@@ -40,7 +40,7 @@ from apu_casadi.machine.generatormodel import DRIVES
 from apu_casadi.machine.park import Abc, abc_to_qd0
 from apu_casadi.unit.apu import Apu, JointPoint, groups
 from apu_casadi.unit.exchange import coupled
-from apu_casadi.unit.jointfamily import Group, JointFamily, grouped
+from apu_casadi.unit.jointfamily import N_REF, Group, JointFamily, grouped
 
 # The angle enters f and g, and their derivatives by h at h = 0, through its first and second
 # harmonics only; six equally spaced angles average all but the multiples of the sixth to zero.
@@ -201,9 +201,8 @@ def _joint(parts: JointFamily, kinds: str) -> tuple[ca.Function, StateSpace]:
     """Return the equations (x, z, u, theta) -> (ode, alg, y) of all units, and their model."""
     gg, own, engines = GasGenerator, parts.groups, parts.engines
     X = Signals([*gg.X, *parts.governor.X, *(s for g in own for s in g.own(g.gen.x))])
-    N_ref = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
     fed = [s for g in own for s in g.own(s for s in g.gen.u if s.name != "w_r")]
-    U = Signals([*(gg.U[n] for n in AMBIENT), N_ref, *fed])
+    U = Signals([*(gg.U[n] for n in AMBIENT), N_REF, *fed])
     TH, Y = parts.theta, Signals([*gg.Y, *(s for g in own for s in g.own(g.gen.y))])
     names = ["x", "z", "u", "theta"]
     x, z, u, theta = (ca.MX.sym(n, len(s)) for n, s in zip(names, (X, parts.z, U, TH), strict=True))

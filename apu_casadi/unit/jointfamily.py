@@ -34,6 +34,18 @@ T = TypeVar("T")
 _HEALTH = GasGenerator.THETA
 
 
+N_REF = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
+"""The governor's input of models that have it."""
+
+
+def of_group(signals: Iterable[Signal], prefix: str, numbers: tuple[int, ...]) -> Iterable[Signal]:
+    """Return signals of one generator as a unit has them; without a prefix there is one group."""
+    if not prefix:
+        return signals
+    of = who(numbers)
+    return [dataclasses.replace(s, name=prefix + s.name, doc=f"{of}: {s.doc}") for s in signals]
+
+
 class Group(NamedTuple):
     """Equal generators.
 
@@ -56,12 +68,7 @@ class Group(NamedTuple):
 
     def own(self, signals: Iterable[Signal]) -> Signals:
         """Return signals of one generator under the names that they have in the unit."""
-        if self.alone:
-            return Signals(signals)
-        of = who(self.numbers)
-        return Signals(
-            dataclasses.replace(s, name=self.prefix + s.name, doc=f"{of}: {s.doc}") for s in signals
-        )
+        return Signals(of_group(signals, self.prefix, self.numbers))
 
     def named(self, values: Mapping[str, T]) -> dict[str, T]:
         """Return values of one generator by the names that they have in the unit."""

@@ -37,7 +37,7 @@ from apu_casadi.unit.departures import departures
 from apu_casadi.unit.events import Event, Holding, Jump, SpeedChange, in_order, jumps
 from apu_casadi.unit.exchange import coupled
 from apu_casadi.unit.integrators import WAVEFORMS
-from apu_casadi.unit.jointfamily import Group, JointFamily, grouped
+from apu_casadi.unit.jointfamily import N_REF, Group, JointFamily, grouped
 from apu_casadi.unit.machines import Of, kinds, means_of
 from apu_casadi.unit.multirate import exchange_grid, load_notes, settled_start, start_of
 from apu_casadi.unit.noise import Noise
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from apu_casadi.unit.events import Ambient
     from apu_casadi.unit.multirate import AFault, ALoad
 
-_N_REF = Signal("N_ref", "rad/s", "governed rotor speed", nominal=3775.0)
 _NO_WAVES = np.empty((len(WAVEFORMS), 0))
 
 
@@ -121,7 +120,7 @@ def _all_units(parts: JointFamily, integrals: Sequence[Any], moving: bool) -> St
         [*gg.X, *parts.governor.X, *(s for g in own for s in g.own(g.gen.x)), *clock, *sums]
     )
     fed = [s for g in own for s in g.own(s for s in g.gen.u if s.name != "w_r")]
-    inputs = Signals([*(gg.U[n] for n in AMBIENT), *([_N_REF] if moving else []), *fed])
+    inputs = Signals([*(gg.U[n] for n in AMBIENT), *([N_REF] if moving else []), *fed])
     TH, Y = parts.theta, Signals([*gg.Y, *(s for g in own for s in g.own(g.gen.y))])
     ends = [_end(s) for s in (*inputs, *TH[: parts.own])] if moving else []
     U = Signals([*inputs, *length, *ends])
