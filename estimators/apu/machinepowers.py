@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.unit.apu import Apu
-from estimators.apu.electrical.electricalside import ElectricalSide, View
+from estimators.apu.electrical.electricalside import Beliefs, ElectricalSide, View
 
 __all__ = ["Course", "on_common_windows", "shaft_courses"]
 
@@ -83,11 +84,18 @@ def _at(side: ElectricalSide, t: np.ndarray) -> ElectricalSide:
     views = []
     for v in side.views:
         energy = np.append(0.0, np.cumsum(v.P * np.diff(side.t)))
-        P = np.diff(np.interp(t, side.t, energy)) / np.diff(t)
         # known when the windows that it came from were
         start = int(np.searchsorted(t, side.t[v.start] - 1e-9)) if v.start else 0
-        noise, loss = (np.interp(amid, there, x) for x in (v.noise, v.loss))
-        views.append(View(min(start, t.size - 2), P, noise, loss))
+        P = np.diff(np.interp(t, side.t, energy)) / np.diff(t)
+        variances = [f.name for f in dataclasses.fields(v) if f.name not in ("start", "P")]
+        made = {n: np.interp(amid, there, getattr(v, n)) for n in variances}
+        views.append(View(min(start, t.size - 2), P, **made))
     rows = np.searchsorted(side.t, t + 1e-9, side="right") - 1
-    own = {n: getattr(side, n)[..., rows] for n in ("severities", "probability", "phase", "misfit")}
-    return dataclasses.replace(side, t=t, views=tuple(views), **own)
+    own: dict[str, Any] = {"t": t, "views": tuple(views)}
+    for n in ("severities", "probability", "phase", "misfit"):
+        own[n] = getattr(side, n)[..., rows]
+    if side.beliefs is not None:
+        names, mean, cov = side.beliefs
+        ended = np.maximum(rows[1:] - 1, 0)
+        own["beliefs"] = Beliefs(names, mean[ended], cov[ended])
+    return dataclasses.replace(side, **own)

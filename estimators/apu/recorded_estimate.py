@@ -60,6 +60,7 @@ from estimators.apu.joint import (
     unit_of,
 )
 from estimators.apu.machinepowers import on_common_windows
+from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
     gas_dataset,
@@ -111,6 +112,7 @@ class RecordedEstimate:
         path: the gas-path filter and its result with the jumps that it found.
         sides: what the electrical filters say, by machine.
         causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
+        compared: what a comparison of the machines says (:mod:`estimators.apu.peers`).
     """
 
     gaspath: xr.Dataset | None
@@ -124,6 +126,7 @@ class RecordedEstimate:
     path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
     sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
     causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
+    compared: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -141,6 +144,8 @@ class RecordedEstimate:
         if self.gaspath is not None:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
+        if self.compared:
+            out["compared"] = dict(self.compared)
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
         out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
         return out | {"lacking": dict(self.lacking), "notes": list(self.notes)}
@@ -218,6 +223,8 @@ def estimate(
         doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
+    compared, alike = compared_sides(sides)[1:]
+    doubts += alike
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
@@ -232,7 +239,7 @@ def estimate(
         )
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    end: Any = found_by and found_by[1].result, found_by, sides, causes
+    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
     return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
 
 
