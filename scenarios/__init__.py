@@ -21,7 +21,7 @@ def _is_command() -> bool:
     return name in ("apu", "apu.exe") or (name == "-m" and "scenarios.cli" in sys.orig_argv)
 
 
-# here, since these are the first lines of the package that run; what follows may take long to import
+# here, since the first lines of the package run at once; what follows may take long to import
 if _is_command():
     # small matrices: threads of the linear algebra only wait for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
