@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from apu_casadi.unit.apu import Apu
+    from scenarios.figures.drawnas import DrawnAs
 
 __all__ = [
     "assumed",
@@ -274,7 +275,7 @@ def write(
     ds: xr.Dataset,
     out: str | os.PathLike[str],
     *,
-    figures: bool = True,
+    figures: bool | DrawnAs = True,
     name: str | None = None,
     formats: Sequence[str] = ("nc",),
 ) -> list[Path]:
@@ -283,7 +284,7 @@ def write(
     Args:
         ds: what a run gave.
         out: the folder.
-        figures: whether they are drawn.
+        figures: whether they are drawn, or how.
         name: of the data, without ending; that of the scenario by default.
         formats: of the data (:data:`apu_casadi.core.resultformats.FORMATS`).
 
@@ -301,5 +302,5 @@ def write(
     if figures:
         from scenarios.figures import plotting
 
-        made += plotting.save_figures(ds, folder)
+        made += plotting.save_figures(ds, folder, None if figures is True else figures)
     return made

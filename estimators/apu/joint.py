@@ -17,7 +17,7 @@ What passes between them is what couples the models, eqs. (1) and (2):
   weighted mean of both.
 
 Of generators that differ in the run each has filters and gain errors of its own, and which one is
-faulty is found; the gas path gets the mean of their powers.  :func:`estimate_joint` can leave h out
+faulty is found; the gas path gets the sum of their powers.  :func:`estimate_joint` can leave h out
 (``ttsc=False``), to show what is mistaken then.
 """
 
@@ -46,7 +46,6 @@ from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalside import (
     GAIN_SHARE,
-    SETTLED,
     ElectricalSide,
     View,
     electrical_side,
@@ -63,6 +62,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, spliced, track_jumps
+from estimators.apu.machinepowers import shaft_courses
 from estimators.apu.priorfile import Prior
 from estimators.apu.sensorchain import interpolated
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
@@ -342,7 +342,8 @@ def fused(
 
     Args:
         apu: the unit as the filters know it.
-        sides: of one machine, which stands for both, or of the two, on the same instants.
+        sides: of each machine in their order, or, of equal ones, of some, which stand for all; on
+            the same instants.
         readings: ``{name: (t, values)}`` by gas-path sensor.
         sensors: 1-sigma table of the gas path.
         speed: instants and samples of a generator's speed pick-up.
@@ -358,7 +359,7 @@ def fused(
     share = max(math.hypot(s.eta, s.share) for s in sides)
     gas = _gas_filter(apu, sensors, power, gain_errors, share, J)
     t = sides[0].t
-    courses = _courses(apu, sides)
+    courses = shaft_courses(apu, sides)
     streams: dict[str, Any] = {"readings": readings, "max_dt": max_dt}
     tracked: Tracked | None = None
     if spread is not None:
@@ -380,29 +381,6 @@ def fused(
         tracked = now if tracked is None else spliced(tracked, now, k)
     assert tracked is not None
     return gas, tracked
-
-
-def _courses(
-    apu: Apu, sides: Sequence[ElectricalSide]
-) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-    """Shaft power as the gas path is told: from which window on, mean, noise, coherent error, W."""
-    n, eta = len(sides), apu.coupling.eta_gtSg
-    out = []
-    for first in sorted({v.start for s in sides for v in s.views}):
-        views = [[v for v in s.views if v.start <= first][-1] for s in sides]
-        common = [_common(v.loss) for v in views]
-        pairs = zip(views, common, strict=True)
-        noise = sum(v.noise + np.maximum(v.loss - c, 0.0) for v, c in pairs)
-        mean = apu.PW(sum(v.P for v in views) / n)
-        out.append((first, mean, np.sqrt(noise) / n / eta, np.sqrt(sum(common)) / n / eta))
-    return out
-
-
-def _common(loss: np.ndarray) -> np.ndarray:
-    """What of the variance is the same error in all windows: what it is once it has settled."""
-    k = min(SETTLED, loss.size - 1)
-    later: np.ndarray = np.maximum.accumulate(loss[k:])
-    return np.append(np.full(k, later[0]), later)
 
 
 def _opening(loss: np.ndarray) -> np.ndarray:

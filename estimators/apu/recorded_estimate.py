@@ -27,6 +27,7 @@ from apu_casadi.core.errors import DataError, EstimationError, ParameterError, n
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
+from apu_casadi.unit.events import who
 from estimators.apu.believable import (
     Doubt,
     channel_doubts,
@@ -57,6 +58,7 @@ from estimators.apu.joint import (
     fused,
     unit_of,
 )
+from estimators.apu.machinepowers import on_common_windows
 from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
     gas_dataset,
@@ -223,8 +225,14 @@ def estimate(
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
     if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
-        some = ", ".join(map(str, sides))
-        notes.append(f"only machine {some} is estimated; power is that of {n} equal ones")
+        told, rest = (
+            who(ks).replace("generator", "machine")
+            for ks in (tuple(sides), [k for k in range(1, n + 1) if k not in sides])
+        )
+        notes.append(
+            f"only {told} {'is' if len(sides) == 1 else 'are'} estimated, not {rest}; power is "
+            f"that of {n} equal ones"
+        )
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
     end: Any = found_by and found_by[1].result, found_by, sides, causes
@@ -277,24 +285,31 @@ def _told(
 def _fusable(
     m: Measurements, apu: Apu, sides: Mapping[int, ElectricalSide], notes: list[str]
 ) -> dict[int, ElectricalSide]:
-    """Return the machines whose powers make the shaft power."""
+    """Return the machines whose powers make the shaft power, on common windows."""
     if not sides:
         return {}
-    if not apu.alike:
-        notes.append("the generators differ: the gas path has no shaft power from the waveforms")
+    others = [k for k in range(1, len(apu.machines) + 1) if k not in sides]
+    if others and not apu.alike:
+        notes.append(
+            f"the generators differ, and {who(others)} {'is' if len(others) == 1 else 'are'} not "
+            "estimated: the gas path has no shaft power from the waveforms"
+        )
         return {}
-    t, fuel = next(iter(sides.values())).t, m.streams("Wf")["Wf"][0]
+    common = on_common_windows([*sides.values()])
+    if common is None:
+        notes.append(
+            "the generators were sampled at different times: the gas path has no shaft power from "
+            "the waveforms"
+        )
+        return {}
+    t, fuel = common[0].t, m.streams("Wf")["Wf"][0]
     if min(t[-1], fuel[-1]) - max(t[0], fuel[0]) < 0.5 * (fuel[-1] - fuel[0]):
         notes.append(
             f"the waveforms, {t[0]:g} to {t[-1]:g} s, cover less than half of the gas path's time: "
             "the two are estimated apart; give that part of the gas path alone to have both"
         )
         return {}
-    alike = {k: s for k, s in sides.items() if s.t.shape == t.shape}
-    alike = {k: s for k, s in alike.items() if np.abs(s.t - t).max() <= 1e-9}
-    if len(alike) < len(sides):
-        notes.append("the generators were sampled at other instants: power is that of the first")
-    return alike
+    return dict(zip(sides, common, strict=True))
 
 
 def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
@@ -438,9 +453,12 @@ class _GasPath:
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
         if sides:
-            own = self.m.machine(next(iter(of))).streams("w_r")["w_r"]
+            first = next(iter(of))
+            own = self.m.machine(first).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
-            own = own[0][inside], own[1][inside]
+            # as the first machine's would be
+            ratio = self.apu.w_r(1.0) / unit_of(self.apu, first).w_r(1.0)
+            own = own[0][inside], ratio * own[1][inside]
             return fused(
                 self.apu,
                 sides,
