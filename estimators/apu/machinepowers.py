@@ -13,11 +13,10 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.unit.apu import Apu
-from estimators.apu.electrical.electricalside import ElectricalSide, View
+from estimators.apu.electrical.electricalside import SETTLED, ElectricalSide, View
 
 __all__ = ["Course", "on_common_windows", "shaft_courses"]
 
-SETTLED = 5  # windows after which the electrical filters have settled
 Course = tuple[int, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -86,8 +85,8 @@ def _at(side: ElectricalSide, t: np.ndarray) -> ElectricalSide:
         P = np.diff(np.interp(t, side.t, energy)) / np.diff(t)
         # known when the windows that it came from were
         start = int(np.searchsorted(t, side.t[v.start] - 1e-9)) if v.start else 0
-        noise, loss = (np.interp(amid, there, x) for x in (v.noise, v.loss))
-        views.append(View(min(start, t.size - 2), P, noise, loss))
+        spread = (np.interp(amid, there, x) for x in (v.variance, v.noise, v.loss))
+        views.append(View(min(start, t.size - 2), P, *spread))
     rows = np.searchsorted(side.t, t + 1e-9, side="right") - 1
     own = {n: getattr(side, n)[..., rows] for n in ("severities", "probability", "phase", "misfit")}
     return dataclasses.replace(side, t=t, views=tuple(views), **own)

@@ -53,7 +53,6 @@ from estimators.apu.gaspath import (
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.joint import (
-    ETA_SIGMA,
     ElectricalSide,
     electrical_side,
     fused,
@@ -72,6 +71,7 @@ from estimators.apu.recorded_report import (
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.unknowns import EFFICIENCY
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
@@ -173,7 +173,8 @@ def estimate(
         electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
-        prior: means and standard deviations of states of the gas-path filter, or their file.
+        prior: means and standard deviations of states of the gas-path filter, of parameters of
+            the generators and of a short circuit, or their file.
         efficiency_error: actual relative error of the generators' efficiency, where the shaft power
             comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
@@ -186,6 +187,8 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu, start = _known(engine, prior)
+    how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
+    how |= {"efficiency_error": efficiency_error, "backend": backend}
     lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
@@ -200,7 +203,7 @@ def estimate(
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     for k in _machines(m) if only != "gaspath" and m.electrical else ():
-        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
+        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, how)
         found |= waves.sequences(lacking)
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
@@ -210,7 +213,7 @@ def estimate(
     found_by, e = None, None
     fusable = _fusable(m, apu, sides, notes) if gas else {}
     if gas:
-        given = ambient or {}, notes, doubts, backend, start, efficiency_error
+        given = ambient or {}, notes, doubts, backend, start
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
@@ -257,7 +260,7 @@ def gas_path_data(
     if reason := _no_gas_path(ready.m, ready.gas_path):
         raise DataError(f"no gas path: {reason}")
     notes = [*m.notes, *ready.notes, *ready.doubts]
-    given = ambient or {}, notes, notes, None, start, 0.0
+    given = ambient or {}, notes, notes, None, start
     path = _GasPath(ready.m, apu, ready.gas_path, *given)
     filt, data, begin = path.alone()
     return filt, data, begin, tuple(dict.fromkeys(notes))
@@ -266,7 +269,9 @@ def gas_path_data(
 def _known(engine: Apu | str | Path | None, prior: Prior | str | Path | None) -> tuple[Apu, Prior]:
     """Return the unit and the prior, from their files where they are named."""
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    return apu, read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    values = start.values()
+    return apu.change(values) if values else apu, start
 
 
 def _told(
@@ -335,7 +340,7 @@ class _Waves:
     number: int
     apu: Apu
     sensors: SensorSet
-    backend: str | None
+    how: Mapping[str, Any]
 
     def sequences(self, lacking: dict[str, str]) -> dict[str, Sequences]:
         """Symmetrical components of currents and voltages."""
@@ -401,7 +406,7 @@ class _Waves:
             a = self._tame(a, notes)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
-            side = electrical_side(self.apu, self.sensors, a, t, judged=True, backend=self.backend)
+            side = electrical_side(self.apu, self.sensors, a, t, judged=True, **self.how)
         except (DataError, EstimationError) as e:
             lacking[what] = str(e)
             return None
@@ -437,7 +442,6 @@ class _GasPath:
     doubts: list[str]
     backend: str | None
     prior: Prior
-    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
@@ -462,9 +466,9 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors) | dict(self.prior.mean),
-                spread=self.prior,
-                efficiency_error=self.efficiency_error,
+                prior=self._start(readings, sensors) | dict(self.prior.of_gas_path().mean),
+                spread=self.prior.of_gas_path(),
+                unknowns=self.prior.unknowns(),
                 inputs=inputs,
                 step=ROBUST,
                 test=JUMPS,
@@ -496,17 +500,20 @@ class _GasPath:
     ) -> tuple[GasPathFilter, Recording, Belief]:
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
+        unknowns, known = self.prior.unknowns(), self.prior.of_gas_path()
         filt = gas_path_filter(
             self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
-            eta=ETA_SIGMA if power else None,
+            inertia=unknowns["J"].sigma or None,
+            consider_inertia=unknowns["J"].how == "considered",
+            eta=unknowns[EFFICIENCY].sigma or None if power else None,
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x)
-        means = self._start(readings, sensors) | dict(self.prior.mean)
-        return filt, data, filt.prior(self.prior.sigma, **means)
+        self.prior.check(filt.model.x, generators=False)
+        means = self._start(readings, sensors) | dict(known.mean)
+        return filt, data, filt.prior(known.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""
