@@ -14,6 +14,7 @@ believed.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -50,7 +51,7 @@ from estimators.apu.gaspath import (
     GasPathFilter,
     gas_path_filter,
 )
-from estimators.apu.gaspathmodel import DT
+from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.joint import (
     ElectricalSide,
@@ -203,7 +204,8 @@ def estimate(
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     for k in _machines(m) if only != "gaspath" and m.electrical else ():
-        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, how)
+        own = electrical_sensors.machine(k)
+        waves = _Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
@@ -454,11 +456,15 @@ class _GasPath:
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
         if sides:
             first = next(iter(of))
+            electrical = electrical.machine(first)
             own = self.m.machine(first).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
             # as the first machine's would be
             ratio = self.apu.w_r(1.0) / unit_of(self.apu, first).w_r(1.0)
             own = own[0][inside], ratio * own[1][inside]
+            if "PW" in sensors:  # of which the sensor is not used
+                plain = dataclasses.replace(sensors["PW"], tau=0.0)
+                sensors = SensorSet(tuple(plain if s.name == "PW" else s for s in sensors.sensors))
             return fused(
                 self.apu,
                 sides,
@@ -541,15 +547,18 @@ class _GasPath:
         streams = self.m.streams(*(n for n in sensors.names if n in self.m))
         for n in [n for n, (t, _) in streams.items() if not t.size]:
             del streams[n]
-        held = ["Wf", "PW"] if known_power else ["Wf"]
-        for n in held:
+        inputs_of = ["Wf", "PW"] if known_power else ["Wf"]
+        for n in inputs_of:
             if n not in streams:
                 raise DataError(f"{n} has no reading")
+        held = [n for n in inputs_of if not sensors[n].tau]
+        for n in held:
             self._check_gaps(n, streams[n][0])
         stamps = [v[0] for v in inputs.values() if isinstance(v, tuple)]
-        begin = max(span[0], *(streams[n][0][0] for n in held), *(t[0] for t in stamps))
-        last = {n: streams[n][0] for n in held}
-        end = min(span[1], *(t[-1] + float(np.median(np.diff(t))) for t in last.values()))
+        firsts = [*(streams[n][0][0] for n in held), *(t[0] for t in stamps)]
+        begin = max([span[0], *firsts])
+        lasts = (streams[n][0] for n in held)
+        end = min([span[1], *(t[-1] + float(np.median(np.diff(t))) for t in lasts)])
         out = {}
         for n, (t, v) in streams.items():
             inside = (t <= end + 1e-9) & ((t >= begin - 1e-9) | (n in held))
@@ -584,7 +593,8 @@ class _GasPath:
 
     def _start(self, readings: Streams, sensors: SensorSet) -> dict[str, float]:
         """Means of the start from the first readings, where the usual ones are far off."""
-        out = {s.name: float(readings[s.name][1][0]) for s in sensors.sensors if s.tau}
+        slow = [s for s in sensors.sensors if s.tau and s.name in readings]
+        out = {n: float(readings[s.name][1][0]) for s in slow for n in {s.name, lag_of(s)}}
         if "N" in readings:
             t, v = readings["N"]
             N, governed = float(v[t < t[0] + 0.2].mean()), self.apu.gas_generator.parameters.N
