@@ -16,10 +16,12 @@ T = np.arange(0.0, 0.41, 0.02)
 def side(P, *more, t=T, noise=100.0, loss=300.0) -> ElectricalSide:
     """A side of constant variances whose power is that of a course, or of several."""
     K = t.size
-    own = {n: np.full(K - 1, v) for n, v in (("noise", noise**2), ("loss", loss**2))}
-    views = tuple(View(start, np.broadcast_to(p, K - 1), **own) for start, p in ((0, P), *more))
+    views = tuple(
+        View(start, *(np.full(K - 1, v) for v in (p, noise**2 + loss**2, noise**2, loss**2)))
+        for start, p in ((0, P), *more)
+    )
     none = np.zeros((2, 3, K)), np.zeros(K), np.zeros(K, int), np.zeros(K)
-    return ElectricalSide(t, views, 0.0, *none, (), None)
+    return ElectricalSide(t, views, 0.0, 0.0, *none, (), None)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

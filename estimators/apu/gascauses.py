@@ -17,6 +17,7 @@ import numpy as np
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.electrical.causes import Causes, probabilities
 from estimators.apu.gaspath import JUMP, GasPathFilter
+from estimators.apu.gaspathmodel import LAGGING
 from estimators.apu.healthjumps import Tracked
 from estimators.detection.glr import glr
 from estimators.detection.signatures import Jump, linearised
@@ -36,7 +37,7 @@ def _jumps(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str], 
     """Jumps that may be, and by hypothesis the names and standard deviations of its own."""
     jumps = [Jump("state", n) for n in HEALTH]
     of = {"gas path": (list(HEALTH), [JUMP] * len(HEALTH))}
-    for n in filt.model.y.names:
+    for n in (n for n in filt.model.y.names if n not in LAGGING):
         if f"gain_{n}" in filt.model.x:
             jumps.append(Jump("state", f"gain_{n}"))
             of[f"sensor {n}"] = ([f"gain_{n}"], [SIZE])

@@ -14,6 +14,7 @@ believed.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -50,16 +51,15 @@ from estimators.apu.gaspath import (
     GasPathFilter,
     gas_path_filter,
 )
-from estimators.apu.gaspathmodel import DT
+from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.joint import (
-    ETA_SIGMA,
     ElectricalSide,
     electrical_side,
     fused,
     unit_of,
 )
-from estimators.apu.machinepowers import on_common_windows
+from estimators.apu.machinepowers import fusable
 from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
@@ -73,6 +73,7 @@ from estimators.apu.recorded_report import (
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.unknowns import EFFICIENCY
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
@@ -178,7 +179,8 @@ def estimate(
         electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
-        prior: means and standard deviations of states of the gas-path filter, or their file.
+        prior: means and standard deviations of states of the gas-path filter, of parameters of
+            the generators and of a short circuit, or their file.
         efficiency_error: actual relative error of the generators' efficiency, where the shaft power
             comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
@@ -191,6 +193,8 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu, start = _known(engine, prior)
+    how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
+    how |= {"efficiency_error": efficiency_error, "backend": backend}
     lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
@@ -205,7 +209,8 @@ def estimate(
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     for k in _machines(m) if only != "gaspath" and m.electrical else ():
-        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
+        own = electrical_sensors.machine(k)
+        waves = _Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
@@ -213,10 +218,10 @@ def estimate(
     if only == "electrical" and not m.electrical:
         lacking["generators"] = "nothing of them was measured"
     found_by, e = None, None
-    fusable = _fusable(m, apu, sides, notes) if gas else {}
+    fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
-        given = ambient or {}, notes, doubts, backend, start, efficiency_error
-        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
+        given = ambient or {}, notes, doubts, backend, start
+        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
         causes["gas path"], odd = _told(gas_causes(filt, tracked))
@@ -240,7 +245,7 @@ def estimate(
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
     end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
+    return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
 
 
 def gas_path_data(
@@ -264,7 +269,7 @@ def gas_path_data(
     if reason := _no_gas_path(ready.m, ready.gas_path):
         raise DataError(f"no gas path: {reason}")
     notes = [*m.notes, *ready.notes, *ready.doubts]
-    given = ambient or {}, notes, notes, None, start, 0.0
+    given = ambient or {}, notes, notes, None, start
     path = _GasPath(ready.m, apu, ready.gas_path, *given)
     filt, data, begin = path.alone()
     return filt, data, begin, tuple(dict.fromkeys(notes))
@@ -273,7 +278,9 @@ def gas_path_data(
 def _known(engine: Apu | str | Path | None, prior: Prior | str | Path | None) -> tuple[Apu, Prior]:
     """Return the unit and the prior, from their files where they are named."""
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    return apu, read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    values = start.values()
+    return apu.change(values) if values else apu, start
 
 
 def _told(
@@ -282,36 +289,6 @@ def _told(
     """Part causes from the doubts that they raise."""
     both = list(found)
     return tuple(c for c, _ in both), [d for _, d in both if d is not None]
-
-
-def _fusable(
-    m: Measurements, apu: Apu, sides: Mapping[int, ElectricalSide], notes: list[str]
-) -> dict[int, ElectricalSide]:
-    """Return the machines whose powers make the shaft power, on common windows."""
-    if not sides:
-        return {}
-    others = [k for k in range(1, len(apu.machines) + 1) if k not in sides]
-    if others and not apu.alike:
-        notes.append(
-            f"the generators differ, and {who(others)} {'is' if len(others) == 1 else 'are'} not "
-            "estimated: the gas path has no shaft power from the waveforms"
-        )
-        return {}
-    common = on_common_windows([*sides.values()])
-    if common is None:
-        notes.append(
-            "the generators were sampled at different times: the gas path has no shaft power from "
-            "the waveforms"
-        )
-        return {}
-    t, fuel = common[0].t, m.streams("Wf")["Wf"][0]
-    if min(t[-1], fuel[-1]) - max(t[0], fuel[0]) < 0.5 * (fuel[-1] - fuel[0]):
-        notes.append(
-            f"the waveforms, {t[0]:g} to {t[-1]:g} s, cover less than half of the gas path's time: "
-            "the two are estimated apart; give that part of the gas path alone to have both"
-        )
-        return {}
-    return dict(zip(sides, common, strict=True))
 
 
 def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
@@ -342,7 +319,7 @@ class _Waves:
     number: int
     apu: Apu
     sensors: SensorSet
-    backend: str | None
+    how: Mapping[str, Any]
 
     def sequences(self, lacking: dict[str, str]) -> dict[str, Sequences]:
         """Symmetrical components of currents and voltages."""
@@ -408,7 +385,7 @@ class _Waves:
             a = self._tame(a, notes)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
-            side = electrical_side(self.apu, self.sensors, a, t, judged=True, backend=self.backend)
+            side = electrical_side(self.apu, self.sensors, a, t, judged=True, **self.how)
         except (DataError, EstimationError) as e:
             lacking[what] = str(e)
             return None
@@ -444,7 +421,6 @@ class _GasPath:
     doubts: list[str]
     backend: str | None
     prior: Prior
-    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
@@ -457,11 +433,15 @@ class _GasPath:
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
         if sides:
             first = next(iter(of))
+            electrical = electrical.machine(first)
             own = self.m.machine(first).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
             # as the first machine's would be
             ratio = self.apu.w_r(1.0) / unit_of(self.apu, first).w_r(1.0)
             own = own[0][inside], ratio * own[1][inside]
+            if "PW" in sensors:  # of which the sensor is not used
+                plain = dataclasses.replace(sensors["PW"], tau=0.0)
+                sensors = SensorSet(tuple(plain if s.name == "PW" else s for s in sensors.sensors))
             return fused(
                 self.apu,
                 sides,
@@ -469,9 +449,9 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors) | dict(self.prior.mean),
-                spread=self.prior,
-                efficiency_error=self.efficiency_error,
+                prior=self._start(readings, sensors) | dict(self.prior.of_gas_path().mean),
+                spread=self.prior.of_gas_path(),
+                unknowns=self.prior.unknowns(),
                 inputs=inputs,
                 step=ROBUST,
                 test=JUMPS,
@@ -503,17 +483,20 @@ class _GasPath:
     ) -> tuple[GasPathFilter, Recording, Belief]:
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
+        unknowns, known = self.prior.unknowns(), self.prior.of_gas_path()
         filt = gas_path_filter(
             self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
-            eta=ETA_SIGMA if power else None,
+            inertia=unknowns["J"].sigma or None,
+            consider_inertia=unknowns["J"].how == "considered",
+            eta=unknowns[EFFICIENCY].sigma or None if power else None,
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x)
-        means = self._start(readings, sensors) | dict(self.prior.mean)
-        return filt, data, filt.prior(self.prior.sigma, **means)
+        self.prior.check(filt.model.x, generators=False)
+        means = self._start(readings, sensors) | dict(known.mean)
+        return filt, data, filt.prior(known.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""
@@ -541,15 +524,18 @@ class _GasPath:
         streams = self.m.streams(*(n for n in sensors.names if n in self.m))
         for n in [n for n, (t, _) in streams.items() if not t.size]:
             del streams[n]
-        held = ["Wf", "PW"] if known_power else ["Wf"]
-        for n in held:
+        inputs_of = ["Wf", "PW"] if known_power else ["Wf"]
+        for n in inputs_of:
             if n not in streams:
                 raise DataError(f"{n} has no reading")
+        held = [n for n in inputs_of if not sensors[n].tau]
+        for n in held:
             self._check_gaps(n, streams[n][0])
         stamps = [v[0] for v in inputs.values() if isinstance(v, tuple)]
-        begin = max(span[0], *(streams[n][0][0] for n in held), *(t[0] for t in stamps))
-        last = {n: streams[n][0] for n in held}
-        end = min(span[1], *(t[-1] + float(np.median(np.diff(t))) for t in last.values()))
+        firsts = [*(streams[n][0][0] for n in held), *(t[0] for t in stamps)]
+        begin = max([span[0], *firsts])
+        lasts = (streams[n][0] for n in held)
+        end = min([span[1], *(t[-1] + float(np.median(np.diff(t))) for t in lasts)])
         out = {}
         for n, (t, v) in streams.items():
             inside = (t <= end + 1e-9) & ((t >= begin - 1e-9) | (n in held))
@@ -584,7 +570,8 @@ class _GasPath:
 
     def _start(self, readings: Streams, sensors: SensorSet) -> dict[str, float]:
         """Means of the start from the first readings, where the usual ones are far off."""
-        out = {s.name: float(readings[s.name][1][0]) for s in sensors.sensors if s.tau}
+        slow = [s for s in sensors.sensors if s.tau and s.name in readings]
+        out = {n: float(readings[s.name][1][0]) for s in slow for n in {s.name, lag_of(s)}}
         if "N" in readings:
             t, v = readings["N"]
             N, governed = float(v[t < t[0] + 0.2].mean()), self.apu.gas_generator.parameters.N
