@@ -60,10 +60,9 @@ def run(args: argparse.Namespace) -> int:
     sensors = read_sensors(args.sensors)
     waves = args.only == "electrical" or (args.only is None and not m.gaspath)
     how: dict[str, Any] = {}
-    found_by: tuple[Any, Any, Any, tuple[str, ...]]
+    filt: Any
     if waves:
-        found_by = electrical_data(m, apu, machine=args.machine, sensors=sensors)
-        filt, data, prior, notes = found_by
+        filt, data, prior, notes = electrical_data(m, apu, machine=args.machine, sensors=sensors)
         measured = list(filt.model.y.names)
         # compiling takes longer than all iterations of a recording of a second
         how = {"backend": "vm"} if data.size <= SHORT else {}
