@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,26 +24,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.errors import DataError, EstimationError, ParameterError, nearest
+from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
 from apu_casadi.unit.events import who
-from estimators.apu.believable import (
-    Doubt,
-    channel_doubts,
-    gas_causes,
-    gas_doubts,
-    machine_causes,
-    machine_doubts,
-)
+from estimators.apu.believable import channel_doubts, gas_causes, gas_doubts
 from estimators.apu.declared import as_declared, tables
+from estimators.apu.diagnosis import Diagnosis, diagnoses
 from estimators.apu.electrical.causes import Causes
-from estimators.apu.electrical.electricalfilter import window_starts
-from estimators.apu.electrical.gaps import evened, usable
-from estimators.apu.electrical.sequences import Sequences, sequences
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES_V, VOLTAGES
-from estimators.apu.electrical.wild import wild_samples
+from estimators.apu.electrical.electricalfilter import ElectricalFilter
+from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import (
     ITERATED,
     ITERATIONS,
@@ -53,12 +44,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
-from estimators.apu.joint import (
-    ElectricalSide,
-    electrical_side,
-    fused,
-    unit_of,
-)
+from estimators.apu.joint import ElectricalSide, fused, unit_of
 from estimators.apu.machinepowers import fusable
 from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior, read_prior
@@ -70,6 +56,7 @@ from estimators.apu.recorded_report import (
     side_dataset,
     words,
 )
+from estimators.apu.recordedwaves import Waves, machines_in, told
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
@@ -82,12 +69,10 @@ from estimators.models.recording import Recording
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["PARTS", "RecordedEstimate", "estimate", "gas_path_data"]
+__all__ = ["PARTS", "RecordedEstimate", "electrical_data", "estimate", "gas_path_data"]
 
 PARTS = ("gaspath", "electrical")
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
-NEEDED = ("w_r", *VOLTAGES, *MEASURED)
-PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
@@ -134,6 +119,11 @@ class RecordedEstimate:
         """Whether nothing speaks against the estimates."""
         return not self.doubts
 
+    @property
+    def diagnoses(self) -> list[Diagnosis]:
+        """One answer for each change, by all that saw it."""
+        return diagnoses(self.causes)
+
     def datasets(self) -> dict[str, xr.Dataset]:
         """Return the estimates over time by what they are of."""
         out = {} if self.gaspath is None else {"gaspath": self.gaspath}
@@ -149,6 +139,7 @@ class RecordedEstimate:
             out["compared"] = dict(self.compared)
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
         out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
+        out["changes"] = [asdict(d) for d in self.diagnoses]
         return out | {"lacking": dict(self.lacking), "notes": list(self.notes)}
 
     def summary(self) -> str:
@@ -208,9 +199,9 @@ def estimate(
     if only != "electrical" and reason is not None and (m.gaspath or only):
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
-    for k in _machines(m) if only != "gaspath" and m.electrical else ():
+    for k in machines_in(m) if only != "gaspath" and m.electrical else ():
         own = electrical_sensors.machine(k)
-        waves = _Waves(m.machine(k), k, unit_of(apu, k), own, how)
+        waves = Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
@@ -224,7 +215,7 @@ def estimate(
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
-        causes["gas path"], odd = _told(gas_causes(filt, tracked))
+        causes["gas path"], odd = told(gas_causes(filt, tracked))
         doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
@@ -234,12 +225,12 @@ def estimate(
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
     if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
-        told, rest = (
+        some, rest = (
             who(ks).replace("generator", "machine")
             for ks in (tuple(sides), [k for k in range(1, n + 1) if k not in sides])
         )
         notes.append(
-            f"only {told} {'is' if len(sides) == 1 else 'are'} estimated, not {rest}; power is "
+            f"only {some} {'is' if len(sides) == 1 else 'are'} estimated, not {rest}; power is "
             f"that of {n} equal ones"
         )
     machines = {k: side_dataset(s) for k, s in sides.items()}
@@ -275,20 +266,39 @@ def gas_path_data(
     return filt, data, begin, tuple(dict.fromkeys(notes))
 
 
+def electrical_data(
+    m: Measurements,
+    engine: Apu | str | Path | None = None,
+    *,
+    machine: int | None = None,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
+) -> tuple[ElectricalFilter, Recording, Belief, tuple[str, ...]]:
+    """Return one generator's filter for a recording, its data, its prior, and notes.
+
+    Args:
+        m, engine, sensors: as of :func:`estimate`.
+        machine: number of the generator; None: the first that was measured.
+
+    Raises:
+        DataError: as of :func:`estimate`; the recording has not what the filter needs.
+    """
+    apu, _ = _known(engine, None)
+    ready = as_declared(m, *tables(m, sensors, ELECTRICAL))
+    there = machines_in(ready.m)
+    k = there[0] if machine is None else machine
+    if k not in there:
+        raise DataError(f"generator {k} was not measured, but {', '.join(map(str, there))}")
+    notes = [*m.notes, *ready.notes, *ready.doubts, f"generator {k}"]
+    waves = Waves(ready.m.machine(k), k, unit_of(apu, k), ready.electrical.machine(k), {})
+    return *waves.filtered(notes), tuple(dict.fromkeys(notes))
+
+
 def _known(engine: Apu | str | Path | None, prior: Prior | str | Path | None) -> tuple[Apu, Prior]:
     """Return the unit and the prior, from their files where they are named."""
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
     start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
     values = start.values()
     return apu.change(values) if values else apu, start
-
-
-def _told(
-    found: Iterable[tuple[Causes, Doubt | None]],
-) -> tuple[tuple[Causes, ...], list[Doubt]]:
-    """Part causes from the doubts that they raise."""
-    both = list(found)
-    return tuple(c for c, _ in both), [d for _, d in both if d is not None]
 
 
 def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
@@ -300,110 +310,6 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     if not [n for n in table.outputs if n in m and n != "N"]:
         return f"none of {', '.join(n for n in table.outputs if n != 'N')} was measured"
     return None
-
-
-def _machines(m: Measurements) -> list[int]:
-    """Numbers of the machines that were measured; 1 where the names have none."""
-    ends = {n.rpartition("_")[2] for n in m.electrical} & set("1234")
-    return sorted(map(int, ends)) or [1]
-
-
-# ------------------------------------------------------------------------------ generators
-
-
-@dataclass(frozen=True, eq=False)
-class _Waves:
-    """One machine's waveforms and what they suffice for."""
-
-    m: Measurements
-    number: int
-    apu: Apu
-    sensors: SensorSet
-    how: Mapping[str, Any]
-
-    def sequences(self, lacking: dict[str, str]) -> dict[str, Sequences]:
-        """Symmetrical components of currents and voltages."""
-        out = {}
-        for kind, names in (("i", PHASES_I), ("v", PHASES_V)):
-            there = [n for n in names if n in self.m]
-            what = f"{kind} of machine {self.number}"
-            for n in there:
-                self._check_rate(n)
-            if 0 < len(there) < 3:
-                no = ", ".join(self.m.lacking(names))
-                lacking[f"symmetrical components, {what}"] = f"{no} was not measured"
-            elif there:
-                a = self.m.samples(*names)
-                try:
-                    out[what] = sequences(a["t"], np.array([a[n] for n in names]))
-                except DataError as e:
-                    lacking[f"symmetrical components, {what}"] = str(e)
-        return out
-
-    def _check_rate(self, name: str) -> None:
-        rate, f = self.m[name].rate, self.apu.generator.machine.f_rated
-        if rate < 2 * f * (1 - 1e-6):
-            raise DataError(
-                f"{self.m[name].source}: {rate:g} samples a second show nothing of {f:g} Hz: "
-                f"{2 * f:g} are needed at least, {PER_PERIOD * f:g} for the electrical filter; "
-                "give the engine if the machine has another frequency"
-            )
-
-    def side(
-        self,
-        begin: float,
-        lacking: dict[str, str],
-        doubts: list[str],
-        notes: list[str],
-        causes: dict[str, tuple[Causes, ...]],
-    ) -> ElectricalSide | None:
-        """Run the electrical filter from an instant on; None where it cannot."""
-        what = f"severity, machine {self.number}"
-        no = [n for n in NEEDED if n not in self.m or n not in self.sensors]
-        if no:
-            lacking[what] = f"the electrical filter needs {', '.join(no)} too"
-            return None
-        rate, f = self.m["v_a"].rate, self.apu.generator.machine.f_rated
-        if rate < PER_PERIOD * f * (1 - 1e-6):
-            lacking[what] = (
-                f"{rate:g} samples a second; the electrical filter needs {PER_PERIOD * f:g}, "
-                f"{PER_PERIOD} a period"
-            )
-            return None
-        waves = self.m.samples(*NEEDED[1:])
-        w = self.m.streams("w_r")["w_r"]
-        if self.m["w_r"].t is not self.m["v_a"].t:
-            inside = (waves["t"] >= w[0][0]) & (waves["t"] <= w[0][-1])
-            waves["w_r"] = np.where(inside, np.interp(waves["t"], *w), np.nan)
-        else:
-            waves |= self.m.samples("w_r")
-        try:
-            a = usable({n: waves[n] for n in ("t", *NEEDED)}, ("w_r", *VOLTAGES))
-            a = {n: v[a["t"] >= begin - 1e-9] for n, v in a.items()}
-            if a["t"].size < 2 or a["t"][-1] - a["t"][0] < DT:
-                raise DataError(f"the waveforms hold no window of {DT * 1e3:g} ms")
-            a = self._tame(a, notes)
-            even = evened(a)["t"]
-            t = even[window_starts(even, DT, None)]
-            side = electrical_side(self.apu, self.sensors, a, t, judged=True, **self.how)
-        except (DataError, EstimationError) as e:
-            lacking[what] = str(e)
-            return None
-        how, name = (side, self.apu.generator.machine, self.sensors, a), f"machine {self.number}"
-        causes[name], odd = _told(machine_causes(*how))
-        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
-        return side
-
-    def _tame(self, a: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
-        """Take single wild samples of the waveforms for missing."""
-        names = (*PHASES_V, *PHASES_I)
-        sigma = {n: self.sensors.sigma(n, 0.0) for n in names}
-        w = float(np.nanmedian(a["w_r"]))
-        wild = wild_samples(a["t"], {n: a[n] for n in names}, w, sigma)
-        told = ", ".join(f"{int(v.sum())} of {n}" for n, v in wild.items() if v.any())
-        if told:
-            notes.append(f"machine {self.number}: single wild samples are taken for gaps: {told}")
-        return a | {n: np.where(v, np.nan, a[n]) for n, v in wild.items() if v.any()}
 
 
 # ------------------------------------------------------------------------------ gas path
