@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import files, netcdf3, netcdf4
+from apu_casadi.core import files, netcdf3, netcdf4, tablefiles
 from apu_casadi.core.errors import DataError, SignalError, nearest
 from apu_casadi.core.filearrays import is_lazy
 
@@ -210,6 +210,9 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
 def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
     """Read a dataset that :func:`save` wrote, or another one in netCDF 3 or 4.
 
+    CSV, Parquet and MAT files of results are read by their ending, the table of waveforms beside
+    that of a run with it; what each generator has of its own is then a variable for each.
+
     Args:
         path: of the file.
         lazy: read values when they are asked for, each time anew, so that a file larger than memory
@@ -219,6 +222,8 @@ def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
         DataError: the file is missing, is no netCDF file, or is damaged; netCDF 4 without h5netcdf.
     """
     path = Path(path)
+    if path.suffix.lower() in tablefiles.ENDINGS:
+        return tablefiles.read(path)
     start, size = files.beginning(path, 8)
     if start.startswith(netcdf4.MARK):
         return netcdf4.read(path)
