@@ -42,6 +42,7 @@ class Asked:
         grid: exchange instants, s.
         phasors, noise, seed, hook: as there.
         settled: whether loads and faults have been there for long.
+        strict: whether each block is judged before the next one.
     """
 
     start: Holding
@@ -51,6 +52,7 @@ class Asked:
     seed: int | None
     hook: Callable[[int, np.ndarray], np.ndarray] | None
     settled: bool = False
+    strict: bool = False
 
 
 class Columns:
@@ -177,7 +179,7 @@ class JointRun:
             free = int(np.searchsorted(grid, until + SAME_INSTANT, side="right")) - 1
             free = min(free, int(self._odd[np.searchsorted(self._odd, k)])) - k
             waves = self.settings.waveform_dt is not None
-            most = BLOCK if waves or asking() else LONG
+            most = BLOCK if waves or self.asked.strict or asking() else LONG
             sizes = dict.fromkeys((min(free, most) // BLOCK * BLOCK, BLOCK))
             ways[:0] = [partial(self._blocks, steps=n) for n in sizes if 0 < n <= free]
         return first_able(ways, k)

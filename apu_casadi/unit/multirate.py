@@ -189,7 +189,7 @@ def joint_course(apu: Apu, **how: Any) -> Course[xr.Dataset]:
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
     grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(how["start_from"])
     seed, strict = how["seed"], how["strict"]
-    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled)
+    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled, strict)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
     limits = how["limits"]
     judged = (limits or Limits()) if strict else None
