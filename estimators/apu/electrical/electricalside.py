@@ -46,7 +46,15 @@ from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, StepMaker, run
 from estimators.models.recording import Recording
 
-__all__ = ["GAIN_SHARE", "SETTLED", "ElectricalSide", "View", "electrical_side", "loosened"]
+__all__ = [
+    "GAIN_SHARE",
+    "SETTLED",
+    "Beliefs",
+    "ElectricalSide",
+    "View",
+    "electrical_side",
+    "loosened",
+]
 
 PEAK = {"v": 325.0, "i": 461.0, "V_fd": 40.0, "i_fd": 590.0}  # at rated load, V and A
 FIELD = 0.04  # s, over which field voltage and current give the field resistance
@@ -98,6 +106,7 @@ class ElectricalSide:
         resets: instants, s, at which the machine changed.
         result: of the filter with the three h, at every sample; without them, of the healthy
             machine's; see ``judged`` of :func:`electrical_side`.
+        beliefs: of the filter with the three h at the ends of the windows; None without it.
     """
 
     t: np.ndarray
@@ -110,6 +119,7 @@ class ElectricalSide:
     misfit: np.ndarray
     resets: tuple[float, ...]
     result: FilterResult
+    beliefs: Beliefs | None = None
 
     def _causal(self, name: str) -> np.ndarray:
         out = np.array(getattr(self.views[0], name))
@@ -147,13 +157,31 @@ def loosened(sensors: SensorSet) -> SensorSet:
     return sensors.change(**noise)
 
 
+class Beliefs(NamedTuple):
+    """Joint beliefs at the ends of n windows.
+
+    Args:
+        names: severities ``h_a``, mean power ``P``, W, and errors that the filter considers.
+        mean, cov: of these, (n, m) and (n, m, m).
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    cov: np.ndarray
+
+
 class _Windows(NamedTuple):
-    """Ends of windows: beliefs of the severities and the mean power there."""
+    """Ends of windows: beliefs of severities, mean power and considered errors there."""
 
     mean: np.ndarray
     cov: np.ndarray
     result: FilterResult
     resets: list[float]
+    names: tuple[str, ...]
+
+    @property
+    def beliefs(self) -> Beliefs:
+        return Beliefs(self.names, self.mean, self.cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,13 +299,16 @@ class _Filters:
             cov_at=starts[1:],
         )
         self.checked(data.t[starts[1:]], begin, end)
-        rows = [r.x.index(n) for n in (*(f"h_{k}" for k in phases), "energy")]
+        names = (*(f"h_{k}" for k in phases), "energy", *of.model.consider)
+        rows = [r.x.index(n) for n in names]
         # the energy of a window is that of the first instant of the next
         length = np.diff(data.t[starts])[:, None]
-        scale = np.hstack([np.ones((length.size, len(phases))), 1 / length])
+        scale = np.ones((length.size, len(rows)))
+        scale[:, [len(phases)]] = 1 / length
         assert r.some_cov is not None
         cov = r.some_cov[:, rows][:, :, rows] * scale[:, :, None] * scale[:, None, :]
-        return _Windows(r.mean[rows][:, starts[1:]].T * scale, cov, r, resets)
+        told = tuple("P" if n == "energy" else n for n in names)
+        return _Windows(r.mean[rows][:, starts[1:]].T * scale, cov, r, resets, told)
 
 
 def electrical_side(
@@ -358,7 +389,7 @@ def electrical_side(
     # severities far from zero are not linear by a share of a few per cent
     misfit = np.append(0.0, may.misfit / (1 + 1e-3 * may.statistic.max(0)))
     result = filters.plain(base) if judged and gain_errors else w.result
-    told = severities, probability, phase, misfit, tuple(w.resets), result
+    told = severities, probability, phase, misfit, tuple(w.resets), result, w.beliefs
     return ElectricalSide(t, tuple(courses), share, eta, *told)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,17 @@ from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, FilterStep, StepMaker, run
 from estimators.models.recording import Recording
 
-__all__ = ["track", "window_power"]
+__all__ = ["LostError", "track", "window_power"]
 
 CHUNK = 80 * RESET_WINDOW  # samples that are filtered before they are judged
+
+
+class LostError(EstimationError):
+    """The model does not fit the data; ``resets``: where the filter began anew, s."""
+
+    def __init__(self, resets: Sequence[float], text: str) -> None:
+        super().__init__(text)
+        self.resets = tuple(resets)
 
 
 def track(
@@ -86,11 +95,12 @@ def track(
             prior, at = ahead, stop
             continue
         if len(resets) == max_resets:
-            raise EstimationError(
+            raise LostError(
+                resets,
                 f"{model.name}: {max_resets} resets up to t = {resets[-1]:.6g} s and still "
                 f"the innovations are {share[bad[0]]:.3g} times what they should be: the model "
                 "does not fit these data: a fault branch with leakage of its own, which "
-                "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults"
+                "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults",
             )
         cut = at + (int(bad[0]) - judged) * RESET_WINDOW
         if cut > at:
