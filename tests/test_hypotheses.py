@@ -7,7 +7,14 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
 from apu_casadi.core.errors import ParameterError
-from estimators.apu.electrical.hypotheses import FAULTY, H_SCALE, Hypotheses, SeverityPrior
+from estimators.apu.electrical.hypotheses import (
+    COMMON,
+    FAULTY,
+    H_SCALE,
+    Hypotheses,
+    SeverityPrior,
+    loose_in_common,
+)
 from estimators.apu.unknowns import COPPER, Knowledge, filter_unknowns
 
 TRUE_P, SLOPE = 200e3, 2e7
@@ -129,3 +136,17 @@ def test_what_is_known_of_parameters():
 def test_wrong_knowledge_is_refused(make, words):
     with pytest.raises(ParameterError, match=words):
         make()
+
+
+def test_what_severities_have_in_common_counts_for_little():
+    """Shifted along their regression on it, severities and power say the same as before."""
+    mean, C = belief((2e-4, 0, 0))
+    more = np.block([[C, np.zeros((4, 2))], [np.zeros((2, 4)), np.eye(2)]])
+    loose = loose_in_common(np.array([more]))
+    e = np.repeat([1 / 3, 0], [3, 3])
+    assert_allclose(e @ loose[0] @ e, e @ more @ e + COMMON**2)
+    of = loose[:, :4, :4]
+    g = of[0] @ e[:4] / (e[:4] @ of[0] @ e[:4])
+    before, after = (Hypotheses.of(m[None], of) for m in (mean, mean - 1e-4 * g))
+    tight = [Hypotheses.of(m[None], C[None]).misfit[0] for m in (mean, mean - 1e-4 * g)]
+    assert abs(after.misfit[0] - before.misfit[0]) < 0.3 * abs(tight[1] - tight[0])

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import DataError, ParameterError
+from estimators.apu.electrical.hypotheses import SeverityPrior
 from estimators.apu.priorfile import read_prior
 from estimators.apu.recordings.measured import read_recording
 from estimators.apu.sensorfile import KEYS, TABLED, SensorFile, read_sensors, sensor_schema, to_toml
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, KNOWN, Sensor, SensorSet, unregister
+from estimators.apu.unknowns import UNKNOWNS
 from scenarios import cli
 
 OWN = """
@@ -172,6 +174,34 @@ def test_a_prior_file(tmp_path):
         path.write_text(text)
         with pytest.raises(DataError, match=words):
             read_prior(path)
+
+
+def test_a_prior_file_of_generators(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text(
+        "[machine.r_s]\nmean = 0.005\nsigma = 0.02\n[machine.eta_sg]\nsigma = 0\n"
+        "[delay_i]\nsigma = 2e-6\n[h]\nprobability = 0.01\n[h_b]\nmean = 3e-4\nsigma = 1e-4\n"
+    )
+    p = read_prior(path)
+    known = p.unknowns()
+    assert p.values() == {"machine.r_s": 0.005}
+    assert known["machine.r_s"].sigma == 0.02 and known["machine.eta_sg"].how == "known"
+    assert known["delay_i"].sigma == 2e-6 and known["machine.r_fd"] == UNKNOWNS["machine.r_fd"]
+    usual = SeverityPrior()
+    s = p.severity()
+    assert s.probability == 0.01 and s.mean == (0.0, 3e-4, 0.0)
+    assert s.scale == (usual.scale[0], 1e-4, usual.scale[2])
+    assert (p.of_gas_path().mean, p.of_gas_path().sigma) == ({}, {})
+    for text, words in (
+        ("[h]\nprobability = 1.0", "probability = 1.0; a probability in"),
+        ("[h_a]\nprobability = 0.1", "h_a: unknown key 'probability'"),
+        ("[machine.r_s]\nsigma = -1", "sigma must be a number > 0, got -1"),
+        ("[delay_i]\nmean = 1e-6", "declare it in the file of sensors"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=words):
+            wrong = read_prior(path)
+            (wrong.severity(), wrong.values())
 
 
 def test_commands(tmp_path, capsys):

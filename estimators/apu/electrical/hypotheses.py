@@ -25,7 +25,7 @@ import numpy as np
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError
 
-__all__ = ["FAULTY", "H_SCALE", "Hypotheses", "SeverityPrior", "loose_in_common"]
+__all__ = ["COMMON", "FAULTY", "H_SCALE", "Hypotheses", "SeverityPrior", "loose_in_common"]
 
 FAULTY = 0.1  # probability that a machine has a short circuit when a recording begins
 H_SCALE = 3e-3  # scale of the severity of one
@@ -157,11 +157,11 @@ def _without(mean: np.ndarray, cov: np.ndarray, zero: list[int]) -> tuple[np.nda
 
 
 def loose_in_common(cov: np.ndarray) -> np.ndarray:
-    """Return covariances of three severities and power, (n, 4, 4), with ``COMMON`` added.
+    """Return covariances of three severities, power and more, (n, m, m), with ``COMMON`` added.
 
-    Power goes with it as it does in the filter.
+    The others go with it as they do in the filter.
     """
-    e = np.array([1.0, 1.0, 1.0, 0.0]) / 3
+    e = np.repeat([1 / 3, 0.0], [3, cov.shape[1] - 3])
     g = cov @ e / np.einsum("i,nij,j->n", e, cov, e)[:, None]
     out: np.ndarray = cov + COMMON**2 * g[:, :, None] * g[:, None, :]
     return out
