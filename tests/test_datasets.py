@@ -70,6 +70,7 @@ def test_classes_and_splits_are_as_the_recipe_says():
         ({"spread": {"machine.rs": 0.1}}, r"machine.rs.*machine.r_s"),
         ({"spread": {"machine.r_s": 0.5}}, "outside"),
         ({"range": 3}, "range must be a table"),
+        ({"exchange": "papre"}, r"exchange = 'papre' \(did you mean 'paper'"),
     ],
 )
 def test_a_wrong_recipe_is_told(changed, words):
@@ -133,6 +134,16 @@ def test_an_interrupted_one_goes_on_with_the_same_bits(small, made, tmp_path):
     (tmp_path / "full" / "thesis.tex").write_text("")
     with pytest.raises(DataError, match="holds other files"):
         making.make_dataset(small, tmp_path / "full")
+
+
+def test_a_recipe_of_before_runs_as_before_and_what_grows_is_integrated():
+    old = {k: v for k, v in table().items() if k != "exchange"}
+    assert draw(Recipe.of(old), 3, 0).scenario["exchange"] == "predicted"
+    assert draw(REFERENCE, 3, 0).scenario["exchange"] == "paper"
+    for d in (draw(REFERENCE, u, 0) for u in range(66)):
+        electrical = d.labels["class"] in ("ttsc", "field", "combined")
+        cvodes = making._solver(d).get("solver") == "cvodes"
+        assert cvodes == (electrical and d.labels["over"] > 0)
 
 
 def test_a_refused_run_keeps_its_reason(small):

@@ -28,6 +28,7 @@ from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
+from apu_casadi.unit.events import who
 from estimators.apu.believable import channel_doubts, gas_causes, gas_doubts
 from estimators.apu.declared import as_declared, tables
 from estimators.apu.diagnosis import Diagnosis, diagnoses
@@ -43,7 +44,9 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
-from estimators.apu.joint import ETA_SIGMA, ElectricalSide, fused, unit_of
+from estimators.apu.joint import ElectricalSide, fused, unit_of
+from estimators.apu.machinepowers import fusable
+from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
     gas_dataset,
@@ -57,6 +60,7 @@ from estimators.apu.recordedwaves import Waves, machines_in, told
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.unknowns import EFFICIENCY
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
@@ -94,6 +98,7 @@ class RecordedEstimate:
         path: the gas-path filter and its result with the jumps that it found.
         sides: what the electrical filters say, by machine.
         causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
+        compared: what a comparison of the machines says (:mod:`estimators.apu.peers`).
     """
 
     gaspath: xr.Dataset | None
@@ -107,6 +112,7 @@ class RecordedEstimate:
     path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
     sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
     causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
+    compared: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
@@ -129,6 +135,8 @@ class RecordedEstimate:
         if self.gaspath is not None:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
+        if self.compared:
+            out["compared"] = dict(self.compared)
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
         out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
         out["changes"] = [asdict(d) for d in self.diagnoses]
@@ -162,7 +170,8 @@ def estimate(
         electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
-        prior: means and standard deviations of states of the gas-path filter, or their file.
+        prior: means and standard deviations of states of the gas-path filter, of parameters of
+            the generators and of a short circuit, or their file.
         efficiency_error: actual relative error of the generators' efficiency, where the shaft power
             comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
@@ -175,6 +184,8 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu, start = _known(engine, prior)
+    how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
+    how |= {"efficiency_error": efficiency_error, "backend": backend}
     lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
@@ -190,7 +201,7 @@ def estimate(
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     for k in machines_in(m) if only != "gaspath" and m.electrical else ():
         own = electrical_sensors.machine(k)
-        waves = Waves(m.machine(k), k, unit_of(apu, k), own, backend)
+        waves = Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
@@ -198,26 +209,34 @@ def estimate(
     if only == "electrical" and not m.electrical:
         lacking["generators"] = "nothing of them was measured"
     found_by, e = None, None
-    fusable = _fusable(m, apu, sides, notes) if gas else {}
+    fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
-        given = ambient or {}, notes, doubts, backend, start, efficiency_error
-        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
+        given = ambient or {}, notes, doubts, backend, start
+        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
         causes["gas path"], odd = told(gas_causes(filt, tracked))
         doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
+    compared, alike = compared_sides(sides)[1:]
+    doubts += alike
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
     if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
-        some = ", ".join(map(str, sides))
-        notes.append(f"only machine {some} is estimated; power is that of {n} equal ones")
+        some, rest = (
+            who(ks).replace("generator", "machine")
+            for ks in (tuple(sides), [k for k in range(1, n + 1) if k not in sides])
+        )
+        notes.append(
+            f"only {some} {'is' if len(sides) == 1 else 'are'} estimated, not {rest}; power is "
+            f"that of {n} equal ones"
+        )
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    end: Any = found_by and found_by[1].result, found_by, sides, causes
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
+    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
+    return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
 
 
 def gas_path_data(
@@ -241,7 +260,7 @@ def gas_path_data(
     if reason := _no_gas_path(ready.m, ready.gas_path):
         raise DataError(f"no gas path: {reason}")
     notes = [*m.notes, *ready.notes, *ready.doubts]
-    given = ambient or {}, notes, notes, None, start, 0.0
+    given = ambient or {}, notes, notes, None, start
     path = _GasPath(ready.m, apu, ready.gas_path, *given)
     filt, data, begin = path.alone()
     return filt, data, begin, tuple(dict.fromkeys(notes))
@@ -270,37 +289,16 @@ def electrical_data(
     if k not in there:
         raise DataError(f"generator {k} was not measured, but {', '.join(map(str, there))}")
     notes = [*m.notes, *ready.notes, *ready.doubts, f"generator {k}"]
-    waves = Waves(ready.m.machine(k), k, unit_of(apu, k), ready.electrical.machine(k), None)
+    waves = Waves(ready.m.machine(k), k, unit_of(apu, k), ready.electrical.machine(k), {})
     return *waves.filtered(notes), tuple(dict.fromkeys(notes))
 
 
 def _known(engine: Apu | str | Path | None, prior: Prior | str | Path | None) -> tuple[Apu, Prior]:
     """Return the unit and the prior, from their files where they are named."""
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    return apu, read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
-
-
-def _fusable(
-    m: Measurements, apu: Apu, sides: Mapping[int, ElectricalSide], notes: list[str]
-) -> dict[int, ElectricalSide]:
-    """Return the machines whose powers make the shaft power."""
-    if not sides:
-        return {}
-    if not apu.alike:
-        notes.append("the generators differ: the gas path has no shaft power from the waveforms")
-        return {}
-    t, fuel = next(iter(sides.values())).t, m.streams("Wf")["Wf"][0]
-    if min(t[-1], fuel[-1]) - max(t[0], fuel[0]) < 0.5 * (fuel[-1] - fuel[0]):
-        notes.append(
-            f"the waveforms, {t[0]:g} to {t[-1]:g} s, cover less than half of the gas path's time: "
-            "the two are estimated apart; give that part of the gas path alone to have both"
-        )
-        return {}
-    alike = {k: s for k, s in sides.items() if s.t.shape == t.shape}
-    alike = {k: s for k, s in alike.items() if np.abs(s.t - t).max() <= 1e-9}
-    if len(alike) < len(sides):
-        notes.append("the generators were sampled at other instants: power is that of the first")
-    return alike
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    values = start.values()
+    return apu.change(values) if values else apu, start
 
 
 def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
@@ -329,7 +327,6 @@ class _GasPath:
     doubts: list[str]
     backend: str | None
     prior: Prior
-    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
@@ -345,7 +342,9 @@ class _GasPath:
             electrical = electrical.machine(first)
             own = self.m.machine(first).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
-            own = own[0][inside], own[1][inside]
+            # as the first machine's would be
+            ratio = self.apu.w_r(1.0) / unit_of(self.apu, first).w_r(1.0)
+            own = own[0][inside], ratio * own[1][inside]
             if "PW" in sensors:  # of which the sensor is not used
                 plain = dataclasses.replace(sensors["PW"], tau=0.0)
                 sensors = SensorSet(tuple(plain if s.name == "PW" else s for s in sensors.sensors))
@@ -356,9 +355,9 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors) | dict(self.prior.mean),
-                spread=self.prior,
-                efficiency_error=self.efficiency_error,
+                prior=self._start(readings, sensors) | dict(self.prior.of_gas_path().mean),
+                spread=self.prior.of_gas_path(),
+                unknowns=self.prior.unknowns(),
                 inputs=inputs,
                 step=ROBUST,
                 test=JUMPS,
@@ -390,17 +389,20 @@ class _GasPath:
     ) -> tuple[GasPathFilter, Recording, Belief]:
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
+        unknowns, known = self.prior.unknowns(), self.prior.of_gas_path()
         filt = gas_path_filter(
             self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
-            eta=ETA_SIGMA if power else None,
+            inertia=unknowns["J"].sigma or None,
+            consider_inertia=unknowns["J"].how == "considered",
+            eta=unknowns[EFFICIENCY].sigma or None if power else None,
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x)
-        means = self._start(readings, sensors) | dict(self.prior.mean)
-        return filt, data, filt.prior(self.prior.sigma, **means)
+        self.prior.check(filt.model.x, generators=False)
+        means = self._start(readings, sensors) | dict(known.mean)
+        return filt, data, filt.prior(known.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""

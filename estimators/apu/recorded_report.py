@@ -155,6 +155,11 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
             yield f"  short circuit in phase {a['phase']}, reported at {a['t']:g} s"
         if not e["alarms"]:
             yield "  no short circuit reported; one within the bands above may be there"
+    for k, of in r.get("compared", {"machines": {}})["machines"].items():
+        yield (
+            f"compared with the others, generator {k} has a short circuit with a probability of "
+            f"{of['probability']:.3f}, likeliest in phase {of['likeliest_phase']}"
+        )
     for n, s in r["sequences"].items():
         yield (
             f"{n}: {s['frequency']:.2f} Hz, positive sequence {s['positive']:.4g}, negative over "

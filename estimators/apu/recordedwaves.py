@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -57,13 +58,13 @@ def machines_in(m: Measurements) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """One machine's waveforms and what they suffice for."""
+    """One machine's waveforms and what they suffice for; ``how``: as of the filters."""
 
     m: Measurements
     number: int
     apu: Apu
     sensors: SensorSet
-    backend: str | None
+    how: Mapping[str, Any]
 
     def sequences(self, lacking: dict[str, str]) -> dict[str, Sequences]:
         """Symmetrical components of currents and voltages."""
@@ -107,7 +108,7 @@ class Waves:
             a = self.samples(notes, begin)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
-            side = electrical_side(self.apu, self.sensors, a, t, judged=True, backend=self.backend)
+            side = electrical_side(self.apu, self.sensors, a, t, judged=True, **self.how)
         except LostError as e:
             lacking[what] = str(e)
             given = self.apu.generator.machine, self.sensors, a, e.resets[0]

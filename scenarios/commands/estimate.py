@@ -47,7 +47,7 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 {readingoptions.OPTIONS.strip()}
 --only {{gaspath,electrical}} | one of the two
 --sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
---prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
+--prior FILE   | what is known before (TOML): mean, sigma by state, machine.r_s, delay_i, h
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep estimates, JSON and figure there
 --figures =on  | draw estimates and bands into it (default)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from apu_casadi.machine.machinedata import MachineParameters
     from apu_casadi.unit.apu import Apu
     from apu_casadi.unit.enginefile import Engine
+    from scenarios.figures.drawnas import DrawnAs
     from scenarios.schema import Scenario
 
 TABLES = ("gas_generator", "compressor_map", "turbine_map")
@@ -372,3 +373,15 @@ def formats(text: str) -> tuple[str, ...]:
         if name not in FORMATS:
             raise ParameterError(f"--format: unknown format {name!r} {nearest(name, FORMATS)}")
     return names
+
+
+def drawn(args: Namespace) -> DrawnAs | bool:
+    """Return how figures are to be written, before anything is computed; False for no figures.
+
+    Raises:
+        ParameterError: an unknown format, or a resolution out of range.
+    """
+    from scenarios.figures.drawnas import DrawnAs
+
+    formats = tuple(dict.fromkeys(names(args.figures)))
+    return not args.no_figures and DrawnAs(formats, args.dpi, args.style)

@@ -25,6 +25,9 @@ scenario SCENARIO      | a name, a .toml or a .py file
 --format NAMES =nc     | of the data, one or several with commas between: nc (netCDF 3), nc4
                        | (compressed; waveforms in single precision), csv, parquet, mat
 --json                 | print the summary as JSON only
+--figures NAMES =png   | formats of the figures, one or several with commas between: png, svg, pdf
+--dpi float =160       | dots per inch of PNG; figures are 10 in wide
+--style {{colour,grey}} =colour | of the figures; grey, for print, tells curves apart by line styles
 --no-figures           | draw no figures
 --no-waveforms         | keep no waveforms: a small file, rms figures
 --phasors              | keep the fundamental phasors of voltages and currents of every exchange
@@ -52,13 +55,13 @@ def run(args: argparse.Namespace) -> int:
         s = s.change(exchange=args.exchange)
     if args.start_from is not None:
         s = s.change(start_from=args.start_from)
-    formats = given.formats(args.format)
+    formats, drawn = given.formats(args.format), given.drawn(args)
     folder = registry.prepare(args.out or f"results/{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(s.name, s.duration, show=show) as progress:
         how = {"solver": args.solver, "phasors": args.phasors, "strict": args.strict}
         ds = registry.run(s, progress=progress, **how)
-    made = registry.write(ds, folder, figures=not args.no_figures, name=s.name, formats=formats)
+    made = registry.write(ds, folder, figures=drawn, name=s.name, formats=formats)
     report = registry.summary(ds)
     notices.tell(report["warnings"])
     if args.json:

@@ -27,26 +27,33 @@ Lane = list[tuple[float, float, str, tuple[str, str]]]
 
 
 def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str]]) -> Figure:
-    """Draw quantities (name, label, scale, colour) over time, each with an enlargement."""
+    """Draw quantities (name, label, scale, colour) over time, each with an enlargement.
+
+    What noisy sensors read of them stands behind as dots.
+    """
     fs.need(ds, [c[0] for c in curves])
     rows = phases(ds)
     t = ds["time"].values
     with fs.drawing():
         fig = fs.new_figure(6.3)
         data = [ds[name].values * scale for name, _, scale, _ in curves]
+        read = [ds[n].values * c[2] if (n := f"{c[0]}_meas") in ds else None for c in curves]
         enlarged = [quietest(ds, rows, y) for y in data]
         two = any(k is not None for k in enlarged)
         widths = [3.1, 1.0] if two else [1.0]
         place = {"left": 0.085, "right": 0.985, "hspace": 0.27, "wspace": 0.2}
         place |= fs.margins(fig, top=0.55, bottom=0.9)
         grid = fig.add_gridspec(len(curves), len(widths), width_ratios=widths, **place)
-        for r, (y, k, (_, label, _, colour)) in enumerate(zip(data, enlarged, curves, strict=True)):
+        for r, (y, m, k, (_, label, _, colour)) in enumerate(
+            zip(data, read, enlarged, curves, strict=True)
+        ):
             last = r == len(curves) - 1
             ax = fig.add_subplot(grid[r, 0])
             fs.bands(ax, rows, names=r == 0)
+            fs.measured(ax, t, m)
             ax.plot(t, y, color=colour, lw=1.7, solid_joinstyle="round")
             ax.set_ylabel(label)
-            fs.roomy(ax, y, 0.08)
+            fs.roomy(ax, y if m is None else np.concatenate([y, m]), 0.08)
             ax.tick_params(labelbottom=last)
             if last:
                 ax.set_xlabel("Time [s]")
@@ -58,6 +65,7 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
             inside = (t >= lo) & (t <= hi)
             fs.change(side, lo, p["start"], hi, k - 1)
             fs.few_ticks(side, hi, 4)
+            fs.measured(side, t[inside], None if m is None else m[inside])
             side.plot(t[inside], y[inside], color=colour, lw=1.7)
             side.set_xlim(lo, hi)
             fs.roomy(side, y[inside], 0.1)
@@ -65,7 +73,7 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
             if last:
                 side.set_xlabel("Time [s]")
         fig.align_ylabels(fig.axes[:: len(widths)])
-        caption_of(fig, ds, key)
+        caption_of(fig, ds, key, "" if all(m is None for m in read) else fs.MEASURED)
     return fig
 
 

@@ -128,7 +128,7 @@ def caption_of(
     """
     name = scenario_of(ds).get("name", "")
     title = FIGURES[key] if number is None else f"{FIGURES[key]} {number}"
-    number_of_it = f"Figure {key[3:5]}. " if name in ("", PAPER) else ""
+    number_of_it = f"Figure {key[3:5]}. " if name == PAPER else ""
     words = [f"{number_of_it}{title}.", f"Scenario “{name}”." if name else ""]
     words += [severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
     caption(fig, " ".join(w for w in words if w))

@@ -29,6 +29,7 @@ from estimators.apu.electrical.machinemodel import electrical_model
 from estimators.apu.electrical.sequences import fitted
 from estimators.apu.electrical.terminalsignals import (
     ADMITTANCE,
+    DELAY,
     GAIN_SENSORS,
     JUMP_SIZES,
     MEASURED,
@@ -38,6 +39,7 @@ from estimators.apu.electrical.terminalsignals import (
 )
 from estimators.apu.electrical.tuning import (
     ANGLE_WALK_CONSIDERED,
+    DELAY_SIGMA,
     FLUX_WALK,
     FREE_SIGMA,
     H_BALANCED,
@@ -218,6 +220,7 @@ class ElectricalFilter(Parametric):
         spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
         spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
         spread |= {f"gain_{n}": self.sensors[n].gain for n in GAIN_SENSORS}
+        spread[DELAY.name] = DELAY_SIGMA
         own = self.machine.held("machine")
         means |= {n: v for n, v in own.items() if n in means}
         spread |= {n: FREE_SIGMA * abs(v) for n, v in own.items()}
@@ -237,6 +240,8 @@ class ElectricalFilter(Parametric):
         moved |= {"g_shunt": self._start(first, Y=Y_START + e)}
         moved |= {"b_shunt": self._start(first, Y=Y_START - 1j * e)}
         moved |= {f"gain_{n}": self._start(first, {n: -e}) for n in GAIN_SENSORS}
+        moved[DELAY.name] = self._start(first, delay=e * DELAY.nominal)
+        size[DELAY.name] = DELAY.nominal
         for n in own.keys() & means.keys():
             more = self.machine.symbolic(**{n.partition(".")[2]: own[n] + e * size[n]})
             moved[n] = dataclasses.replace(self, machine=more)._start(first)
@@ -257,13 +262,14 @@ class ElectricalFilter(Parametric):
         *,
         h: float = 0.0,
         Y: complex = Y_START,
+        delay: float = 0.0,
     ) -> dict[str, float]:
-        """Return the start with some readings taken for more by a share of them, a fault."""
+        """Return the start with some readings taken for more by a share, a fault, late currents."""
         p, turn = self.machine, TURN
         by = [1 + (share or {}).get(n, 0.0) for n in (*PHASES_V, *PHASES_I, "i_fd")]
         v, i = (complex(x * k @ turn) / 3 for x, k in ((first.v, by[:3]), (first.i, by[3:6])))
         i_0 = float((first.i * by[3:6]).sum().real) / 3
-        i += h * v / (3 * p.r_s)
+        i = i * np.exp(1j * first.w * delay) + h * v / (3 * p.r_s)
         i_shunt = 0.0
         if self.kappa is not None:
             k = PHASES.index(str(self.phase))
@@ -380,7 +386,9 @@ def electrical_filter(
             :func:`~.faults.leaky_fault` gives mu and k_rf.
         phase: the faulty phase, with ``kappa`` only.
         free: parameters of the machine that are states, by name (``machine.r_s``); their prior
-            means are those of ``machine``, their standard deviations ``FREE_SIGMA`` of them.
+            means are those of ``machine``, their standard deviations ``FREE_SIGMA`` of them. With
+            gains also ``delay_i``, by which currents are read later than voltages
+            (``DELAY_SIGMA``).
 
     Raises:
         ParameterError: unknown choice, kappa without phase or the other way round.

@@ -170,8 +170,7 @@ def estimated(cell: Cell, seed: int, **options: Any) -> dict[str, Any]:
         healthy machine, or in another phase.
     """
     ds, case = _truth(cell), joint_case(seed, machines=2 if cell.machine else 1)
-    gains: dict[str, Any] = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
-    e = estimate_joint(ds, seed, **gains, **options)
+    e = estimate_joint(ds, seed, **{"apu": case.unit(Apu()), **case.errors(), **options})
     t = e["time"].values
 
     def score(n: str) -> float:
