@@ -58,13 +58,13 @@ def machines_in(m: Measurements) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """One machine's waveforms and what they suffice for; ``how``: as of the filters."""
+    """One machine's waveforms and what they suffice for."""
 
     m: Measurements
     number: int
     apu: Apu
     sensors: SensorSet
-    how: Mapping[str, Any]
+    how: Mapping[str, Any]  # the electrical side's unknowns, prior, backend
 
     def sequences(self, lacking: dict[str, str]) -> dict[str, Sequences]:
         """Symmetrical components of currents and voltages."""

@@ -76,7 +76,7 @@ def make_run(r: Recipe, unit: int, run: int) -> tuple[dict[str, Any], dict[str, 
         scenario = Scenario.from_dict(d.scenario)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ApuWarning)
-            ds = simulate_joint(**registry.joint_arguments(scenario), **_solver(d))
+            ds = simulate_joint(**registry.joint_arguments(scenario), **solver_of(d))
             read = measure_run(ds, registry.unit_for(scenario), d.seed)
     except ApuError as e:
         why = " ".join(str(e).split())
@@ -85,7 +85,7 @@ def make_run(r: Recipe, unit: int, run: int) -> tuple[dict[str, Any], dict[str, 
     return {**d.labels, "status": "done", "reason": ""}, gas, _waves(r, d, read.get("electrical"))
 
 
-def _solver(d: Drawn) -> dict[str, Any]:
+def solver_of(d: Drawn) -> dict[str, Any]:
     """Return how a run is integrated: an electrical fault that grows, by CVODES.
 
     Exact propagation needs tables all along its way, for which CVODES takes a fourth of the time;
@@ -263,6 +263,10 @@ def _on_cluster(
 def _claim(folder: Path, told: Mapping[str, Any]) -> None:
     """Make sure that the folder is this recipe's, by this program."""
     path = folder / "recipe.json"
+    for part in (
+        p for p in folder.rglob(".[0-9]*-[0-9]*.part") if path.exists() or p.parent == folder
+    ):
+        part.unlink(missing_ok=True)  # a kill left it half written; the lock is ours
     if not path.exists():
         if any(p.name != LOCK for p in folder.iterdir()):
             raise DataError(f"{folder} holds other files: give a folder of its own")

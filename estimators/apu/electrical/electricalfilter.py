@@ -12,7 +12,7 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, last, of_family, remade
-from apu_casadi.machine.machinedata import MachineParameters, require_linear
+from apu_casadi.machine.machinedata import MACHINE, MachineParameters, require_linear
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
@@ -43,6 +43,7 @@ from estimators.apu.electrical.tuning import (
     FLUX_WALK,
     FREE_SIGMA,
     H_BALANCED,
+    H_BALANCED_CONSIDERED,
     H_SIGMA,
     H_WALK,
     H_WALK_GAINS,
@@ -61,7 +62,14 @@ from estimators.filters.belief import Belief
 from estimators.models.filtermodel import FilterModel, Unknown, augment
 from estimators.models.recording import SAME_TIME, Recording, plain_numbers
 
-__all__ = ["GAINS", "ElectricalFilter", "electrical_filter", "jump_floor", "window_starts"]
+__all__ = [
+    "GAINS",
+    "ElectricalFilter",
+    "considering",
+    "electrical_filter",
+    "jump_floor",
+    "window_starts",
+]
 
 #: Harmonics that each channel consists of, for what is missing of it.
 HARMONICS_OF: dict[str, tuple[int, ...]] = dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3))
@@ -232,7 +240,8 @@ class ElectricalFilter(Parametric):
         if set(SHUNTS.names) <= set(means) and not set(SHUNTS.names) & set(sigma or {}):
             # that all three are faulty looks like another rotor angle
             rows = np.ix_(*[self.model.x.indices(SHUNTS.names)] * 2)
-            prior.cov[rows] -= (H_SIGMA**2 - H_BALANCED**2) / 3
+            common = H_BALANCED_CONSIDERED if self.gains == "consider" else H_BALANCED
+            prior.cov[rows] -= (H_SIGMA**2 - common**2) / 3
         e = 1e-6
         # of a parameter the same share of it
         size = dict.fromkeys(means, 1.0) | {n: abs(v) for n, v in own.items() if n in means}
@@ -377,8 +386,9 @@ def electrical_filter(
             Estimated, they make h drift by a standard deviation in a second (the angle's error is
             in the derivatives and in the innovations alike) and suit recordings of that length; a
             second pass, :func:`estimators.batch.relinearised.relinearised_filter`, halves that, and
-            errors are then what is claimed. Considered, nothing drifts, and the NIS, which then
-            holds constant offsets, is no test; the angle then walks by ``ANGLE_WALK_CONSIDERED``.
+            errors are then what is claimed. From a reset on :func:`~.tracking.track` considers
+            them. Considered, nothing drifts, and the NIS, which then holds constant offsets, is no
+            test; the angle then walks by ``ANGLE_WALK_CONSIDERED``.
         power: add the state ``energy``, for :func:`~.tracking.window_power`.
         phases: phases with an h; none of them makes the healthy machine's filter.
         kappa: leakage partition; None is full coupling (kappa = mu).  With a number the states are
@@ -413,6 +423,17 @@ def electrical_filter(
     return _filter(
         machine, sensors, h_walk, flux_walk, gains, power, phases, kappa, phase, unknowns
     )
+
+
+def considering(filt: ElectricalFilter) -> ElectricalFilter:
+    """Return a filter of the same states that considers the gains instead of estimating them."""
+    m = filt.model
+    free = {n: Unknown(consider=n in m.consider) for n in m.x.names if n in MACHINE.names}
+    if DELAY.name in m.x.names:
+        free[DELAY.name] = Unknown(consider=DELAY.name in m.consider)
+    phases = tuple(k for k in PHASES if f"h_{k}" in m.x.names)
+    how: dict[str, Any] = {"sensors": filt.sensors, "power": filt.power, "phases": phases}
+    return electrical_filter(filt.machine, gains="consider", free=free, **how)
 
 
 @remade

@@ -30,10 +30,15 @@ from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.hypotheses import Hypotheses, SeverityPrior
+from estimators.apu.electrical.hypotheses import Hypotheses, SeverityPrior, loose_in_common
 from estimators.apu.electrical.terminalsignals import DELAY, PHASES_I, PHASES_V
 from estimators.apu.electrical.tracking import track, window_power
-from estimators.apu.electrical.tuning import FAULT_LEVEL, H_SIGMA, RELEASE_LEVEL
+from estimators.apu.electrical.tuning import (
+    FAULT_LEVEL,
+    H_SIGMA,
+    H_WALK_CONSIDERED,
+    RELEASE_LEVEL,
+)
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.sensors import SensorSet
 from estimators.apu.unknowns import EFFICIENCY, Knowledge, filter_unknowns, of_parameter, usual
@@ -203,12 +208,14 @@ class _Filters:
         A ``plain`` one takes gain errors for noise, as the healthy machine's does.
         """
         healthy = self.gain_errors and (plain or not phases)
+        three = phases == PHASES and self.gain_errors and not plain
         free = {n: how for n, (how, _) in filter_unknowns(self.unknowns).items()}
         if plain:  # a model without gains has no delay
             free.pop(DELAY.name, None)
         return electrical_filter(
             self.machine,
             sensors=loosened(self.sensors) if healthy else self.sensors,
+            h_walk=H_WALK_CONSIDERED if three else None,
             gains="consider" if self.gain_errors and not healthy else "none",
             power=True,
             phases=phases,
@@ -353,7 +360,7 @@ def electrical_side(
         none = np.zeros((2, 3, K)), np.zeros(K), np.zeros(K, dtype=int), np.zeros(K)
         return ElectricalSide(t, views, share, eta, *none, (), healthy)
     w = filters.windows(PHASES, base, begin)
-    may = Hypotheses.of(w.mean, w.cov, prior)
+    may = Hypotheses.of(w.mean, loose_in_common(w.cov) if gain_errors else w.cov, prior)
     share, noise = filters.split(may)
     courses = [View.of(0, *may.power(), noise, share)]
     start = np.array([np.zeros((3, 1)), np.full((3, 1), H_SIGMA)])
