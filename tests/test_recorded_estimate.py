@@ -470,3 +470,32 @@ def test_noise_of_a_generator_is_tuned(run, tmp_path, capsys):
     assert cli.main([*args[:2], "--machine", "2"]) != 0
     assert "generator 2 was not measured" in capsys.readouterr().err
     assert cli.main([*args[:2], "--only", "gaspath"]) != 0
+
+
+@pytest.mark.ci  # four estimates
+def test_late_stamps_and_rows_in_disorder_from_the_command_line(readings, tmp_path, capsys):
+    """T5 comes two samples late, as declared: the same as in time, but for the last two, which are
+    not there yet. Rows in disorder are refused, and the same when they are sorted."""
+    ds = readings["gaspath"]
+    table = ds[["N", "P3", "T3", "T5", "Wf", "PW"]].to_dataframe().reset_index()
+
+    def said(frame, *more):
+        path = tmp_path / "run.csv"
+        frame.to_csv(path, index=False)
+        assert cli.main(["estimate", "data", str(path), "--json", *more]) == 0
+        return json.loads(capsys.readouterr().out)["gaspath"]["values"]
+
+    late, known = table.copy(), table.copy()
+    late["T5"] = table["T5"].shift(2)
+    known.loc[known.index[-2:], "T5"] = np.nan
+    sensors = tmp_path / "late.toml"
+    sensors.write_text("[T5]\ndelay = 0.04\n")
+    one, other = said(late, "--sensors", str(sensors)), said(known)
+    disorder = known.sample(frac=1.0, random_state=1)
+    again = said(disorder, "--sort")
+    for n in ("N", *HEALTH):
+        for key in ("estimate", "half_width"):
+            assert_allclose(one[n][key], other[n][key], rtol=1e-9, err_msg=n)
+            assert_allclose(again[n][key], other[n][key], rtol=1e-9, err_msg=n)
+    assert cli.main(["estimate", "data", str(tmp_path / "run.csv")]) != 0
+    assert "--sort" in capsys.readouterr().err

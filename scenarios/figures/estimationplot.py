@@ -118,6 +118,8 @@ def plot_alarms(groups: Mapping[str, Sequence[Mapping[str, Any]]], note: str) ->
             for ax in (rate, late):
                 ax.set_xscale("log")
             values = sorted({x["value"] for x in rows})
+            late.set_xlim(0.75 * values[0], 1.33 * values[-1])
+            rate.set_xlim(late.get_xlim())
             rate.set_xticks(values, [""] * len(values))
             late.set_xticks(values, [f"{v:g}" for v in values])
             for ax in (rate, late):
@@ -133,4 +135,4 @@ def plot_alarms(groups: Mapping[str, Sequence[Mapping[str, Any]]], note: str) ->
 
 
 def _unit(rows: Sequence[Mapping[str, Any]]) -> str:
-    return "share; i_a: A" if any(x["value"] >= 1 for x in rows) else "-"
+    return "A" if any(x["value"] >= 1 for x in rows) else "-"

@@ -192,7 +192,8 @@ def figures(r: Results) -> Pictures:
     groups = {
         "Health, reduced by": [x for x in rows if _true(x["kind"]) == "gas path"],
         "Short circuit, h": [x for x in rows if x["kind"] == "short circuit"],
-        "Sensor, step of": [x for x in rows if x["kind"].startswith("sensor")],
+        "Sensor, step of": [x for x in rows if x["kind"].startswith("sensor") and x["value"] < 1],
+        "Current, step of": [x for x in rows if x["value"] >= 1],
     }
     fig = partial(plot_alarms, {k: v for k, v in groups.items() if v}, note)
     return {"True alarms and latency at one false alarm in 1000 flights": ("flights.png", fig)}
