@@ -75,7 +75,7 @@ const M j=i&(M){EXP_MASK};const V T=OF16(exp_hi,j),Tl=OF16(exp_lo,j);
 V s=C(1.0/40320);s=FMA(s,t,C(1.0/5040));s=FMA(s,t,C(1.0/720));s=FMA(s,t,C(1.0/120));
 s=FMA(s,t,C(1.0/24));s=FMA(s,t,C(1.0/6));s=FMA(s,t,C(0.5));
 s=FMA(s,t*t,rest);s=FMA(rest,t,s);
-const V u=T*t,ul=FMA(T,t,-u),hi=T+u,lo=((T-hi)+u)+(ul+FMA(T,s,Tl));
+const V u=T*t,ul=FMA(T,t,-u),hi=T+u,lo=((T-hi)+u)+(ul+FMA(T,s,FMA(Tl,t,Tl)));
 const V y=rounded(hi,lo,share,ok);
 return (V)((M)y+((i-j)<<(52-4)));}
 /* log x = *hi + *lo of normal positive numbers */
@@ -90,7 +90,7 @@ const V f=FMA(FMA(r,r,-r),pl,pl);
 const V l=FMA(s,rr*r,(e1+e2)+(FMA(rl,C(-0.5),f)+B));
 *hi=g+l;*lo=(g-*hi)+l;}
 NI V v_exp(V x){M ok;const M in=(x>C(-708.0))&(x<C(709.0));
-const V y=exp_of(v_sel(in,x,C(0.0)),C(0.0),1.0245,&ok);ok&=in;
+const V y=exp_of(v_sel(in,x,C(0.0)),C(0.0),1.025,&ok);ok&=in;
 const unsigned no=v_bits(~ok);return no?slow_exp(y,x,no):y;}
 NI V v_log(V x){V h,l;M ok;const M in=(x>=C(0x1p-1022))&(x<C(INFINITY));
 log_of(v_sel(in,x,C(1.0)),&h,&l);
