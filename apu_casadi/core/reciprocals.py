@@ -37,7 +37,9 @@ def by_reciprocals(fun: ca.Function) -> ca.Function:
     before = ca.GlobalOptions.getSimplificationOnTheFly()
     ca.GlobalOptions.setSimplificationOnTheFly(False)
     try:
-        made = _rebuilt(fun, given, steps, {k: b for k, b in divisor.items() if divides[b] >= LEAST})
+        made = _rebuilt(
+            fun, given, steps, {k: b for k, b in divisor.items() if divides[b] >= LEAST}
+        )
     finally:
         ca.GlobalOptions.setSimplificationOnTheFly(before)
     how = {"is_diff_in": fun.is_diff_in()}

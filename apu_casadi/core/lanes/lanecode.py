@@ -226,7 +226,9 @@ class Writer:
             kind, body = key.split(" ", 1)
             tables.append(f"static const {kind} {name}{body}")
         unused = [f"__attribute__((unused)) {c}" for c in calls]
-        return "\n".join([prelude, vector_math(self.lanes), *unused, *single, *tables, *self._text, ""])
+        return "\n".join(
+            [prelude, vector_math(self.lanes), *unused, *single, *tables, *self._text, ""]
+        )
 
 
 def number(value: float) -> str:

@@ -14,6 +14,7 @@ Other C libraries, and processors without fused multiply-add, are asked for ever
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
 
@@ -59,7 +60,8 @@ _CODE = r"""
 #define NI static __attribute__((noinline,unused))
 /* asks the C library for the lanes whose bits are set */
 #define SLOW_1(f) NI V slow_##f(V y,V a,unsigned bits){\
-for(;bits;bits&=bits-1){const int l=__builtin_ctz(bits);((double*)&y)[l]=f(((double*)&a)[l]);}return y;}
+for(;bits;bits&=bits-1){const int l=__builtin_ctz(bits);\
+((double*)&y)[l]=f(((double*)&a)[l]);}return y;}
 #define SLOW_2(f) NI V slow_##f(V y,V a,V b,unsigned bits){\
 for(;bits;bits&=bits-1){const int l=__builtin_ctz(bits);\
 ((double*)&y)[l]=f(((double*)&a)[l],((double*)&b)[l]);}return y;}
@@ -104,7 +106,8 @@ const unsigned no=v_bits(~ok);return no?slow_pow(y,x,b,no):y;}
 /* S cos r + C sin r, where x = j 2 pi/64 + r */
 IN V sin_of(V x,int more,M*ok){
 const M in=v_fabs(x)<C(5e4);
-const V d=v_sel(in,x,C(1.0)),z=FMA(d,C(SIN_INV),ROUND),n=z-ROUND;const M j=((M)z+more)&(M){TURN_MASK};
+const V d=v_sel(in,x,C(1.0)),z=FMA(d,C(SIN_INV),ROUND),n=z-ROUND;
+const M j=((M)z+more)&(M){TURN_MASK};
 const V a=FMA(n,C(-SIN_L1),d),b=n*C(-SIN_L2),th=a+b,bb=th-a,tl=(a-(th-bb))+(b-bb);
 const V w=FMA(n,C(-SIN_L3),tl),r=th+w,rl=(th-r)+w;
 const V S=OF64(sin_hi,j),Sl=OF64(sin_lo,j),K=OF64(cos_hi,j),Kl=OF64(cos_lo,j),q=r*r;
@@ -117,13 +120,16 @@ const V l=e+(ul+(FMA(Kl,r,Sl)+FMA(K,s,S*c)));
 const V y=rounded(h,l,1.125,ok);
 *ok&=in&((n==C(0.0))|(v_fabs(r)>C(0x1p-20)));
 return y;}
-NI V v_sin(V x){M ok;V y=sin_of(x,0,&ok);ok&=x!=C(0.0);const unsigned no=v_bits(~ok);return no?slow_sin(y,x,no):y;}
-NI V v_cos(V x){M ok;V y=sin_of(x,TURN/4,&ok);const unsigned no=v_bits(~ok);return no?slow_cos(y,x,no):y;}
+NI V v_sin(V x){M ok;V y=sin_of(x,0,&ok);ok&=x!=C(0.0);
+const unsigned no=v_bits(~ok);return no?slow_sin(y,x,no):y;}
+NI V v_cos(V x){M ok;V y=sin_of(x,TURN/4,&ok);
+const unsigned no=v_bits(~ok);return no?slow_cos(y,x,no):y;}
 #undef C
 #else
 #define EACH_1(f) __attribute__((unused)) EACH(f)
 EACH_1(exp) EACH_1(log) EACH_1(sin) EACH_1(cos)
-__attribute__((unused)) static V v_pow(V a,V b){V r;for(int l=0;l<L;l++)r[l]=pow(a[l],b[l]);return r;}
+__attribute__((unused)) static V v_pow(V a,V b){
+V r;for(int l=0;l<L;l++)r[l]=pow(a[l],b[l]);return r;}
 #endif
 """
 
@@ -212,7 +218,7 @@ def _inverse(j: int) -> float:
 def _double(bits: int) -> float:
     """Return the double of a pattern of bits."""
     exponent, mantissa = (bits >> 52) - 1023, bits & ((1 << 52) - 1)
-    return (1 + mantissa / 2**52) * 2.0**exponent
+    return math.ldexp(1 + mantissa / 2**52, exponent)
 
 
 def _sine(x: Decimal) -> Decimal:
