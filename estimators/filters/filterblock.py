@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.sharing import kept
+from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
-
-if TYPE_CHECKING:
-    from estimators.filters.filtering import FilterStep
 
 __all__ = ["BLOCK", "CHAIN", "PADDED", "ROOT_OUT", "block_function", "block_of", "padded"]
 
@@ -27,6 +25,19 @@ ROOT_OUT = ["Y", "Z", "Lf"]
 """What a step in square-root form may give beside: roots for the smoother, see
 :mod:`estimators.filters.rootfilter`."""
 PADDED = -2.0  # variance of what is not measured in a sample that fills a block up
+
+
+class Step(Protocol):
+    """What a block is made of; see :class:`estimators.filters.filtering.FilterStep`."""
+
+    @property
+    def model(self) -> FilterModel: ...
+
+    @property
+    def function(self) -> ca.Function: ...
+
+    @property
+    def gives_roots(self) -> bool: ...
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
@@ -75,7 +86,7 @@ def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) 
 
 @kept
 def block_function(
-    step: FilterStep, full: bool, short: bool, backend: str | None, _in_use: str
+    step: Step, full: bool, short: bool, backend: str | None, _in_use: str
 ) -> tuple[ca.Function, ca.Function]:
     """``BLOCK`` steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
 

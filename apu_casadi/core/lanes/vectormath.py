@@ -204,15 +204,13 @@ def _array(name: str, values: Sequence[float]) -> str:
 
 def _cut(value: Decimal, bits: int) -> float:
     """Return the value rounded to a multiple of 2^-bits."""
-    return float(round(value * 2**bits)) / 2**bits
+    return math.ldexp(round(value * 2**bits), -bits)
 
 
 def _inverse(j: int) -> float:
     """Return 1/c, in few bits, of the middle c of an interval of the logarithm; 1 where 1 is."""
-    ends = [_double(LOG_FIRST + ((j + k) << 48)) for k in (0, 1)]
-    if ends[0] < 1 < ends[1]:
-        return 1.0
-    return round(512 / sum(ends)) / 256
+    first, last = (_double(LOG_FIRST + ((j + k) << 48)) for k in (0, 1))
+    return 1.0 if first < 1 < last else round(512 / (first + last)) / 256
 
 
 def _double(bits: int) -> float:
