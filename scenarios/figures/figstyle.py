@@ -44,6 +44,9 @@ PATCH: dict[str, str | float] = {"fc": "white", "ec": "none", "pad": 0.8}
 OF_AXES = ("data", "axes fraction")
 """Coordinates ``xycoords`` of a point whose height is a fraction of the axes."""
 
+MEASURED = "Dots: what noisy sensors read."
+"""Of a caption, where :func:`measured` draws something."""
+
 STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
@@ -102,9 +105,9 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
 
 def caption(fig: Figure, text: str) -> None:
     """Write a caption along the lower edge; one of many lines in small letters."""
-    lines, size, y = textwrap.fill(text, 165), 8.2, 0.10 / fig.get_figheight()
+    lines, size, y = textwrap.fill(text, 156), 8.2, 0.10 / fig.get_figheight()
     if lines.count("\n") > 1:
-        lines, size = textwrap.fill(text, 205), 6.6
+        lines, size = textwrap.fill(text, 190), 6.6
     fig.text(0.012, y, lines, fontsize=size, color=MUTED, va="bottom")
 
 
@@ -179,6 +182,13 @@ def roomy(ax: Axes, y: np.ndarray, margin: float) -> None:
     least = 1e-4 * max(abs(lo), abs(hi), 1e-12)
     room = margin * (hi - lo) + max(0.0, (least - (hi - lo)) / 2)
     ax.set_ylim(lo - room, hi + room)
+
+
+def measured(ax: Axes, t: np.ndarray, y: np.ndarray | None) -> None:
+    """Draw readings as dots behind the curves; None draws nothing."""
+    if y is not None:
+        look = {"ms": 3.0, "mew": 0, "alpha": 0.6, "zorder": 1.8, "rasterized": t.size > 5000}
+        ax.plot(t, y, ".", color=MUTED, **look)
 
 
 def legend(ax: Axes, where: str, handles: Sequence[Any] | None = None, **more: Any) -> None:

@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apu_casadi.core import files
 from apu_casadi.core.results import generators_of
-from scenarios.figures.figstyle import DPI
+from scenarios.figures.drawnas import DrawnAs
 from scenarios.figures.profileplots import figure_profiles, given_profiles
 from scenarios.figures.runplots import figure_20, figure_21, figure_22, figure_23
 from scenarios.figures.runwords import FIGURES
@@ -37,16 +36,24 @@ DRAW: dict[str, Callable[..., Figure]] = dict(zip(FIGURES, _CALLS, strict=True))
 """What draws each figure, by the name of its file."""
 
 
-def save_figures(ds: xr.Dataset, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write Figures 20 to 25 as PNG, 1600 px wide, into an existing folder; return the paths.
+def save_figures(
+    ds: xr.Dataset, folder: str | os.PathLike[str], drawn: DrawnAs | None = None
+) -> list[Path]:
+    """Write Figures 20 to 25 into an existing folder; return the paths.
 
     And ``profiles.png``, where the run followed profiles.
 
     Where generators differ, 24 and 25 are drawn for each: ``fig24_currents_generator2.png``.
 
+    Args:
+        ds: the run.
+        folder: where they go.
+        drawn: formats, resolution, style; by default PNG, 1600 px wide, in colour.
+
     Raises:
         DataError: a variable is missing, or a file cannot be written.
     """
+    drawn = DrawnAs() if drawn is None else drawn
     numbers = generators_of(ds)
     made = []
     for key, draw in DRAW.items():
@@ -54,9 +61,7 @@ def save_figures(ds: xr.Dataset, folder: str | os.PathLike[str]) -> list[Path]:
         if draw in (figure_24, figure_25) and len(numbers) > 1:
             figures = {f"{key}_generator{k}": partial(draw, generator=k) for k in numbers}
         for name, one in figures.items():
-            path = Path(folder) / f"{name}.png"
-            made.append(files.save_figure(one(ds), path, dpi=DPI))
+            made += drawn.save(one(ds), Path(folder) / name)
     if given_profiles(ds):
-        path = Path(folder) / "profiles.png"
-        made.append(files.save_figure(figure_profiles(ds), path, dpi=DPI))
+        made += drawn.save(figure_profiles(ds), Path(folder) / "profiles")
     return made

@@ -27,26 +27,33 @@ Lane = list[tuple[float, float, str, tuple[str, str]]]
 
 
 def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str]]) -> Figure:
-    """Draw quantities (name, label, scale, colour) over time, each with an enlargement."""
+    """Draw quantities (name, label, scale, colour) over time, each with an enlargement.
+
+    What noisy sensors read of them stands behind as dots.
+    """
     fs.need(ds, [c[0] for c in curves])
     rows = phases(ds)
     t = ds["time"].values
     with fs.drawing():
         fig = fs.new_figure(6.3)
         data = [ds[name].values * scale for name, _, scale, _ in curves]
+        read = [ds[n].values * c[2] if (n := f"{c[0]}_meas") in ds else None for c in curves]
         enlarged = [quietest(ds, rows, y) for y in data]
         two = any(k is not None for k in enlarged)
         widths = [3.1, 1.0] if two else [1.0]
         place = {"left": 0.085, "right": 0.985, "hspace": 0.27, "wspace": 0.2}
         place |= fs.margins(fig, top=0.55, bottom=0.9)
         grid = fig.add_gridspec(len(curves), len(widths), width_ratios=widths, **place)
-        for r, (y, k, (_, label, _, colour)) in enumerate(zip(data, enlarged, curves, strict=True)):
+        for r, (y, m, k, (_, label, _, colour)) in enumerate(
+            zip(data, read, enlarged, curves, strict=True)
+        ):
             last = r == len(curves) - 1
             ax = fig.add_subplot(grid[r, 0])
             fs.bands(ax, rows, names=r == 0)
+            fs.measured(ax, t, m)
             ax.plot(t, y, color=colour, lw=1.7, solid_joinstyle="round")
             ax.set_ylabel(label)
-            fs.roomy(ax, y, 0.08)
+            fs.roomy(ax, y if m is None else np.concatenate([y, m]), 0.08)
             ax.tick_params(labelbottom=last)
             if last:
                 ax.set_xlabel("Time [s]")
@@ -58,6 +65,7 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
             inside = (t >= lo) & (t <= hi)
             fs.change(side, lo, p["start"], hi, k - 1)
             fs.few_ticks(side, hi, 4)
+            fs.measured(side, t[inside], None if m is None else m[inside])
             side.plot(t[inside], y[inside], color=colour, lw=1.7)
             side.set_xlim(lo, hi)
             fs.roomy(side, y[inside], 0.1)
@@ -65,7 +73,7 @@ def _trend(ds: xr.Dataset, key: str, curves: Sequence[tuple[str, str, float, str
             if last:
                 side.set_xlabel("Time [s]")
         fig.align_ylabels(fig.axes[:: len(widths)])
-        caption_of(fig, ds, key)
+        caption_of(fig, ds, key, "" if all(m is None for m in read) else fs.MEASURED)
     return fig
 
 
@@ -112,7 +120,9 @@ def _segments(
 
     def instant(i: int) -> float:
         near = starts[int(np.argmin(np.abs(starts - t[i])))]
-        return float(near if abs(near - t[i]) <= slack else t[i])
+        # what a sample tells holds since the one before
+        there = t[i] if i in (0, t.size - 1) else t[i - 1]
+        return float(near if abs(near - t[i]) <= slack else there)
 
     return [
         (instant(a), instant(b), a, max(b - 1, a) if b < t.size - 1 else b)
@@ -161,15 +171,20 @@ def _load_words(x: dict[str, Any], n: int) -> str:
         "series": "series R-L",
         "constant_power": "constant power",
         "open": "open circuit",
+        "open_phase": f"phase {x.get('phase', 'a')} open",
     }.get(kind, str(kind))
     if x.get("unbalance") and len(set(x["unbalance"])) > 1:
         words += ", unbalanced"
     if any(isinstance(v, dict) for v in x.values()):
         words += ", changes"
-    if not isinstance(x.get("power_kW"), int | float):
+    power, times = x.get("power_kW"), f"{n}\u00a0×\u00a0" if n > 1 else ""
+    if isinstance(power, int | float):
+        return f"{times}{power:g}\u00a0kW\n{words}"
+    given = power if isinstance(power, dict) else {}
+    ends = [given[k] for k in ("from", "to", "on", "off") if k in given] or given.get("values", [])
+    if len(ends) < 2:
         return words
-    times = f"{n}\u00a0×\u00a0" if n > 1 else ""
-    return f"{times}{x['power_kW']:g}\u00a0kW\n{words}"
+    return f"{times}{min(ends):g} to {max(ends):g}\u00a0kW\n{words}"
 
 
 def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
@@ -191,7 +206,7 @@ def _change(first: float, last: float) -> str:
     return ends[0] if first == last else " → ".join(ends)
 
 
-def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) -> Lane:
+def stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) -> Lane:
     """Return the stretches of the stator fault of a generator."""
     t, lane = ds["time"].values, []
     stator = np.column_stack([ds[f].values for f in SEVERITY])
@@ -246,7 +261,7 @@ def figure_20(ds: xr.Dataset) -> Figure:
         loads[f"Load{of}" if several else "Electrical load"] = [
             (a, b, w, LOADS[i % 2]) for i, (a, b, w) in steps
         ]
-        stators[f"Stator{of}"] = _stator_lane(own, rows, k)
+        stators[f"Stator{of}"] = stator_lane(own, rows, k)
     lanes: dict[str, Lane] = {**loads, "Gas path": _gas_lane(ds, rows), **stators}
     n = int(ds.attrs.get("generators", 2))
     with fs.drawing():

@@ -57,6 +57,9 @@ def _waves(
     tw = ds["time_w"].values
     a, b = np.searchsorted(tw, (lo - 1e-9, hi + 1e-9))
     for name in names:
+        if f"{name}_meas" in ds:
+            x, y = (tw[a:b] - origin) * 1e3, ds[f"{name}_meas"].values[a:b]
+            ax.plot(x, y, ".", color=fs.ABC[name[-1]], ms=2.6, mew=0, alpha=0.5, zorder=2.5)
         ax.plot(
             (tw[a:b] - origin) * 1e3,
             ds[name].values[a:b],
@@ -126,7 +129,9 @@ def _three_phase(
         told = "Envelope: extremes of all samples. Enlarged rms: of each exchange step."
         names_of = ", ".join(f"“{rows[k]['name']}”" for k in events)
         few = f"Enlarged of {len(rows)} phases: {names_of}." if len(rows) > 4 else ""
-        caption_of(fig, run, key, f"{told if waves else ''} {few}".strip(), number)
+        dots = fs.MEASURED if f"{names[0]}_meas" in ds else ""
+        more = [told, few, dots] if waves else [few]
+        caption_of(fig, run, key, " ".join(w for w in more if w), number)
     return fig
 
 
