@@ -9,7 +9,8 @@ other double is that near, its result must be hi, whatever its algorithm is (Ziv
 elsewhere, three lanes in a hundred of ``exp`` and eleven of ``sin``, and for arguments that are out
 of range or not numbers, the C library is asked for that lane.
 
-Other C libraries, and processors without fused multiply-add, are asked for every lane.
+Other C libraries are asked for every lane, and so is this one where there are fewer than eight
+lanes: without instructions that look up a table in registers that is as fast.
 """
 
 from __future__ import annotations
@@ -36,25 +37,10 @@ _CODE = r"""
 #define OF64(t,i) ((V)_mm512_i64gather_pd((__m512i)(i),t,8))
 #define SHIFT_52(i) ((M)_mm512_srai_epi64((__m512i)(i),52))
 #define NUMBER(i) ((V)_mm512_cvtepi64_pd((__m512i)(i)))
-#elif L==4 && defined(__AVX2__) && defined(__FMA__)
-#define VECTOR_MATH
-#define FMA(a,b,c) ((V)_mm256_fmadd_pd((__m256d)(a),(__m256d)(b),(__m256d)(c)))
-#define OF16(t,i) ((V)_mm256_i64gather_pd(t,(__m256i)(i),8))
-#define OF64(t,i) ((V)_mm256_i64gather_pd(t,(__m256i)(i),8))
-#elif L==2 && defined(__aarch64__)
-#define VECTOR_MATH
-#define FMA(a,b,c) ((V)vfmaq_f64((float64x2_t)(c),(float64x2_t)(a),(float64x2_t)(b)))
-#define OF16(t,i) ((V){t[(i)[0]],t[(i)[1]]})
-#define OF64(t,i) OF16(t,i)
 #endif
 #endif
 #endif
 #ifdef VECTOR_MATH
-#ifndef SHIFT_52
-#define SHIFT_52(i) ((i)>>52)
-/* small integers: their sum with 1.5 * 2^52 has their bits at its end */
-#define NUMBER(i) ((V)((i)+(M)ROUND)-ROUND)
-#endif
 #define C(x) v_all(x)
 #define ROUND C(0x1.8p52)
 #define NI static __attribute__((noinline,unused))
@@ -105,7 +91,7 @@ const V y=exp_of(v_sel(in,p,C(0.0)),v_sel(in,t,C(0.0)),1.08,&ok);ok&=in;
 const unsigned no=v_bits(~ok);return no?slow_pow(y,x,b,no):y;}
 /* S cos r + C sin r, where x = j 2 pi/64 + r */
 IN V sin_of(V x,int more,M*ok){
-const M in=v_fabs(x)<C(5e4);
+const M in=v_fabs(x)<C(4e5);
 const V d=v_sel(in,x,C(1.0)),z=FMA(d,C(SIN_INV),ROUND),n=z-ROUND;
 const M j=((M)z+more)&(M){TURN_MASK};
 const V a=FMA(n,C(-SIN_L1),d),b=n*C(-SIN_L2),th=a+b,bb=th-a,tl=(a-(th-bb))+(b-bb);
