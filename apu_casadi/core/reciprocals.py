@@ -33,6 +33,26 @@ def by_reciprocals(fun: ca.Function) -> ca.Function:
         if op != ca.OP_OUTPUT:
             holds[o[0]] = k
     given = fun.sx_in()
+    # CasADi would make a (1/b) a/b again
+    before = ca.GlobalOptions.getSimplificationOnTheFly()
+    ca.GlobalOptions.setSimplificationOnTheFly(False)
+    try:
+        made = _rebuilt(
+            fun, given, steps, {k: b for k, b in divisor.items() if divides[b] >= LEAST}
+        )
+    finally:
+        ca.GlobalOptions.setSimplificationOnTheFly(before)
+    how = {"is_diff_in": fun.is_diff_in()}
+    return ca.Function(fun.name(), given, made, fun.name_in(), fun.name_out(), how)
+
+
+def _rebuilt(
+    fun: ca.Function,
+    given: list[ca.SX],
+    steps: list[tuple[int, list[int], list[int]]],
+    divisor: dict[int, int],
+) -> list[ca.SX]:
+    """Return the outputs of a function made anew; divisors by number of their quotients."""
     parts = [x.nonzeros() for x in given]
     results = [[ca.SX(0)] * fun.nnz_out(j) for j in range(fun.n_out())]
     work, inverse = dict[int, ca.SX](), dict[int, ca.SX]()
@@ -43,18 +63,16 @@ def by_reciprocals(fun: ca.Function) -> ca.Function:
             work[o[0]] = ca.SX(parts[i[0]][i[1]])
         elif op == ca.OP_OUTPUT:
             results[o[0]][o[1]] = work[i[0]]
-        elif divides[divisor.get(k, -1)] >= LEAST:
+        elif k in divisor:
             b = divisor[k]
             if b not in inverse:
-                inverse[b] = 1 / work[i[1]]
+                inverse[b] = ca.SX.binary(ca.OP_DIV, 1.0, work[i[1]])
             work[o[0]] = work[i[0]] * inverse[b]
         elif len(i) == 1:
             work[o[0]] = ca.SX.unary(op, work[i[0]])
         else:
             work[o[0]] = ca.SX.binary(op, work[i[0]], work[i[1]])
-    made = [
+    return [
         ca.SX(fun.sparsity_out(j), ca.vertcat(*r)) if r else ca.SX(fun.sparsity_out(j))
         for j, r in enumerate(results)
     ]
-    how = {"is_diff_in": fun.is_diff_in()}
-    return ca.Function(fun.name(), given, made, fun.name_in(), fun.name_out(), how)

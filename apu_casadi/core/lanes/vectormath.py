@@ -9,11 +9,13 @@ other double is that near, its result must be hi, whatever its algorithm is (Ziv
 elsewhere, three lanes in a hundred of ``exp`` and eleven of ``sin``, and for arguments that are out
 of range or not numbers, the C library is asked for that lane.
 
-Other C libraries, and processors without fused multiply-add, are asked for every lane.
+Other C libraries are asked for every lane, and so is this one where there are fewer than eight
+lanes: without instructions that look up a table in registers that is as fast.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
 
@@ -35,31 +37,17 @@ _CODE = r"""
 #define OF64(t,i) ((V)_mm512_i64gather_pd((__m512i)(i),t,8))
 #define SHIFT_52(i) ((M)_mm512_srai_epi64((__m512i)(i),52))
 #define NUMBER(i) ((V)_mm512_cvtepi64_pd((__m512i)(i)))
-#elif L==4 && defined(__AVX2__) && defined(__FMA__)
-#define VECTOR_MATH
-#define FMA(a,b,c) ((V)_mm256_fmadd_pd((__m256d)(a),(__m256d)(b),(__m256d)(c)))
-#define OF16(t,i) ((V)_mm256_i64gather_pd(t,(__m256i)(i),8))
-#define OF64(t,i) ((V)_mm256_i64gather_pd(t,(__m256i)(i),8))
-#elif L==2 && defined(__aarch64__)
-#define VECTOR_MATH
-#define FMA(a,b,c) ((V)vfmaq_f64((float64x2_t)(c),(float64x2_t)(a),(float64x2_t)(b)))
-#define OF16(t,i) ((V){t[(i)[0]],t[(i)[1]]})
-#define OF64(t,i) OF16(t,i)
 #endif
 #endif
 #endif
 #ifdef VECTOR_MATH
-#ifndef SHIFT_52
-#define SHIFT_52(i) ((i)>>52)
-/* small integers: their sum with 1.5 * 2^52 has their bits at its end */
-#define NUMBER(i) ((V)((i)+(M)ROUND)-ROUND)
-#endif
 #define C(x) v_all(x)
 #define ROUND C(0x1.8p52)
 #define NI static __attribute__((noinline,unused))
 /* asks the C library for the lanes whose bits are set */
 #define SLOW_1(f) NI V slow_##f(V y,V a,unsigned bits){\
-for(;bits;bits&=bits-1){const int l=__builtin_ctz(bits);((double*)&y)[l]=f(((double*)&a)[l]);}return y;}
+for(;bits;bits&=bits-1){const int l=__builtin_ctz(bits);\
+((double*)&y)[l]=f(((double*)&a)[l]);}return y;}
 #define SLOW_2(f) NI V slow_##f(V y,V a,V b,unsigned bits){\
 for(;bits;bits&=bits-1){const int l=__builtin_ctz(bits);\
 ((double*)&y)[l]=f(((double*)&a)[l],((double*)&b)[l]);}return y;}
@@ -75,7 +63,7 @@ const M j=i&(M){EXP_MASK};const V T=OF16(exp_hi,j),Tl=OF16(exp_lo,j);
 V s=C(1.0/40320);s=FMA(s,t,C(1.0/5040));s=FMA(s,t,C(1.0/720));s=FMA(s,t,C(1.0/120));
 s=FMA(s,t,C(1.0/24));s=FMA(s,t,C(1.0/6));s=FMA(s,t,C(0.5));
 s=FMA(s,t*t,rest);s=FMA(rest,t,s);
-const V u=T*t,ul=FMA(T,t,-u),hi=T+u,lo=((T-hi)+u)+(ul+FMA(T,s,Tl));
+const V u=T*t,ul=FMA(T,t,-u),hi=T+u,lo=((T-hi)+u)+(ul+FMA(T,s,FMA(Tl,t,Tl)));
 const V y=rounded(hi,lo,share,ok);
 return (V)((M)y+((i-j)<<(52-4)));}
 /* log x = *hi + *lo of normal positive numbers */
@@ -90,7 +78,7 @@ const V f=FMA(FMA(r,r,-r),pl,pl);
 const V l=FMA(s,rr*r,(e1+e2)+(FMA(rl,C(-0.5),f)+B));
 *hi=g+l;*lo=(g-*hi)+l;}
 NI V v_exp(V x){M ok;const M in=(x>C(-708.0))&(x<C(709.0));
-const V y=exp_of(v_sel(in,x,C(0.0)),C(0.0),1.0245,&ok);ok&=in;
+const V y=exp_of(v_sel(in,x,C(0.0)),C(0.0),1.025,&ok);ok&=in;
 const unsigned no=v_bits(~ok);return no?slow_exp(y,x,no):y;}
 NI V v_log(V x){V h,l;M ok;const M in=(x>=C(0x1p-1022))&(x<C(INFINITY));
 log_of(v_sel(in,x,C(1.0)),&h,&l);
@@ -103,8 +91,9 @@ const V y=exp_of(v_sel(in,p,C(0.0)),v_sel(in,t,C(0.0)),1.08,&ok);ok&=in;
 const unsigned no=v_bits(~ok);return no?slow_pow(y,x,b,no):y;}
 /* S cos r + C sin r, where x = j 2 pi/64 + r */
 IN V sin_of(V x,int more,M*ok){
-const M in=v_fabs(x)<C(5e4);
-const V d=v_sel(in,x,C(1.0)),z=FMA(d,C(SIN_INV),ROUND),n=z-ROUND;const M j=((M)z+more)&(M){TURN_MASK};
+const M in=v_fabs(x)<C(4e5);
+const V d=v_sel(in,x,C(1.0)),z=FMA(d,C(SIN_INV),ROUND),n=z-ROUND;
+const M j=((M)z+more)&(M){TURN_MASK};
 const V a=FMA(n,C(-SIN_L1),d),b=n*C(-SIN_L2),th=a+b,bb=th-a,tl=(a-(th-bb))+(b-bb);
 const V w=FMA(n,C(-SIN_L3),tl),r=th+w,rl=(th-r)+w;
 const V S=OF64(sin_hi,j),Sl=OF64(sin_lo,j),K=OF64(cos_hi,j),Kl=OF64(cos_lo,j),q=r*r;
@@ -117,13 +106,16 @@ const V l=e+(ul+(FMA(Kl,r,Sl)+FMA(K,s,S*c)));
 const V y=rounded(h,l,1.125,ok);
 *ok&=in&((n==C(0.0))|(v_fabs(r)>C(0x1p-20)));
 return y;}
-NI V v_sin(V x){M ok;V y=sin_of(x,0,&ok);ok&=x!=C(0.0);const unsigned no=v_bits(~ok);return no?slow_sin(y,x,no):y;}
-NI V v_cos(V x){M ok;V y=sin_of(x,TURN/4,&ok);const unsigned no=v_bits(~ok);return no?slow_cos(y,x,no):y;}
+NI V v_sin(V x){M ok;V y=sin_of(x,0,&ok);ok&=x!=C(0.0);
+const unsigned no=v_bits(~ok);return no?slow_sin(y,x,no):y;}
+NI V v_cos(V x){M ok;V y=sin_of(x,TURN/4,&ok);
+const unsigned no=v_bits(~ok);return no?slow_cos(y,x,no):y;}
 #undef C
 #else
 #define EACH_1(f) __attribute__((unused)) EACH(f)
 EACH_1(exp) EACH_1(log) EACH_1(sin) EACH_1(cos)
-__attribute__((unused)) static V v_pow(V a,V b){V r;for(int l=0;l<L;l++)r[l]=pow(a[l],b[l]);return r;}
+__attribute__((unused)) static V v_pow(V a,V b){
+V r;for(int l=0;l<L;l++)r[l]=pow(a[l],b[l]);return r;}
 #endif
 """
 
@@ -198,21 +190,19 @@ def _array(name: str, values: Sequence[float]) -> str:
 
 def _cut(value: Decimal, bits: int) -> float:
     """Return the value rounded to a multiple of 2^-bits."""
-    return float(round(value * 2**bits)) / 2**bits
+    return math.ldexp(round(value * 2**bits), -bits)
 
 
 def _inverse(j: int) -> float:
     """Return 1/c, in few bits, of the middle c of an interval of the logarithm; 1 where 1 is."""
-    ends = [_double(LOG_FIRST + ((j + k) << 48)) for k in (0, 1)]
-    if ends[0] < 1 < ends[1]:
-        return 1.0
-    return round(512 / sum(ends)) / 256
+    first, last = (_double(LOG_FIRST + ((j + k) << 48)) for k in (0, 1))
+    return 1.0 if first < 1 < last else round(512 / (first + last)) / 256
 
 
 def _double(bits: int) -> float:
     """Return the double of a pattern of bits."""
     exponent, mantissa = (bits >> 52) - 1023, bits & ((1 << 52) - 1)
-    return (1 + mantissa / 2**52) * 2.0**exponent
+    return math.ldexp(1 + mantissa / 2**52, exponent)
 
 
 def _sine(x: Decimal) -> Decimal:
