@@ -21,16 +21,8 @@ if TYPE_CHECKING:
 def parser() -> ArgumentParser:
     """Return the parser of the command with all its subcommands."""
     from scenarios import commands
-    from scenarios.shell.usage import Parser, ShowVersion
 
-    p = Parser(
-        prog="apu",
-        description="Joint simulation of an all-electric APU: gas path and stator faults.",
-        epilog="Try: apu run joint",
-    )
-    p.add_argument("--version", action=ShowVersion, nargs=0, help="print the version")
-    commands.register(p.add_subparsers(metavar="COMMAND", required=True))
-    return p
+    return commands.parser()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

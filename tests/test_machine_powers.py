@@ -17,11 +17,11 @@ def side(P, *more, t=T, noise=100.0, loss=300.0) -> ElectricalSide:
     """A side of constant variances whose power is that of a course, or of several."""
     K = t.size
     views = tuple(
-        View(start, np.broadcast_to(p, K - 1), np.full(K - 1, noise**2), np.full(K - 1, loss**2))
+        View(start, *(np.full(K - 1, v) for v in (p, noise**2 + loss**2, noise**2, loss**2)))
         for start, p in ((0, P), *more)
     )
     none = np.zeros((2, 3, K)), np.zeros(K), np.zeros(K, int), np.zeros(K)
-    return ElectricalSide(t, views, 0.0, *none, (), None)
+    return ElectricalSide(t, views, 0.0, 0.0, *none, (), None)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

@@ -453,3 +453,20 @@ def test_noise_is_tuned_from_a_recording(files, tmp_path, capsys):
     assert (tmp_path / "tune.png").stat().st_size > 10_000
     assert cli.main(["tune", gas, "--noise", "T9", "--walk", ""]) == 2
     assert "noise of output 'T9'" in capsys.readouterr().err
+
+
+@pytest.mark.ci  # derivatives of the electrical filter
+def test_noise_of_a_generator_is_tuned(run, tmp_path, capsys):
+    """0.1 s without a fault: the noise that was drawn is in the band, of reading and input."""
+    made = measure_run(run.sel(time_w=slice(None, 0.09)), APU, SEED)["electrical"]
+    write_recording({"electrical": made}, tmp_path / "waves.csv")
+    args = ["tune", str(tmp_path / "waves.csv"), "--noise", "i_a", "--inputs", "v_a", "--json"]
+    assert cli.main(args) == 0
+    report = json.loads(capsys.readouterr().out)
+    volt, ampere = report["estimates"]
+    assert (volt["name"], ampere["name"]) == ("w_v_a", "i_a")
+    for row in (volt, ampere):
+        assert row["low"] < 1.1 and row["high"] > 0.9 and row["high"] / row["low"] < 1.5
+    assert cli.main([*args[:2], "--machine", "2"]) != 0
+    assert "generator 2 was not measured" in capsys.readouterr().err
+    assert cli.main([*args[:2], "--only", "gaspath"]) != 0

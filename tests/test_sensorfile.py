@@ -192,3 +192,30 @@ def test_identify_takes_a_file(tmp_path, capsys):
     assert cli.main(["identify", "--sensors", str(path), "--gain-errors", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert "EGT" in found["sensors"] and "PW" not in found["sensors"]
+
+
+def test_one_generator_has_sensors_of_its_own(tmp_path):
+    """What is said of i_a_2 holds for that one; the file of the set reads the same again."""
+    path = tmp_path / "two.toml"
+    path.write_text(
+        "[i_a_2]\ngain = 0.02\n[i_a]\nnoise = 2.0\n[v_b_1]\nclock = 'adc'\njitter = 1e-6\n"
+    )
+    made = read_sensors(path)
+    e = made.electrical
+    assert e.numbered == (1, 2) and e["i_a_2"].noise == 2.0
+    one, two = e.machine(1), e.machine(2)
+    assert one.names == two.names == ELECTRICAL.names
+    assert (one["i_a"].gain, two["i_a"].gain) == (0.005, 0.02)
+    assert (one["v_b"].clock, two["v_b"].clock) == ("adc", "")
+    assert e.of_channel("i_a_2") is e["i_a_2"] and e.of_channel("i_a_3") is e["i_a"]
+    assert e.of_channel("v_b") is e["v_b_1"] and e.of_channel("x") is None
+    assert ELECTRICAL.machine(2) is ELECTRICAL
+    path.write_text(to_toml(made))
+    again = read_sensors(path).electrical.machine(2)
+    assert [(s.name, s.noise, s.gain) for s in again.sensors] == [
+        (s.name, s.noise, s.gain) for s in two.sensors
+    ]
+    path.write_text("[i_d_2]\nnoise = 1")
+    with pytest.raises(DataError, match="unknown sensor 'i_d_2'"):
+        read_sensors(path)
+    assert sensor_schema()["patternProperties"]

@@ -365,6 +365,7 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
     its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
     (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
+    the same of the ``worst`` fault in it, None without one;
     and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
     Where generators differ, all that is of a generator is in ``generators`` instead: a list with
     one table for each, which has its number as ``generator``.
@@ -404,7 +405,10 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         end = int(np.flatnonzero(tail)[-1])
         row.update({v: float(col[v][end]) for v in _HEALTH})
         of_each = [
-            _of_one(each[k], tail, end) | _held(ds, each[k], end, p["end"], k) for k in numbers
+            _of_one(each[k], tail, end)
+            | _held(ds, each[k], end, p["end"], k)
+            | _worst(ds, each[k], whole, p["end"], k)
+            for k in numbers
         ]
         if GENERATOR in ds.coords:
             row["generators"] = [
@@ -424,6 +428,19 @@ def _of_one(col: _Columns, tail: np.ndarray, end: int) -> dict[str, Any]:
     more = [v for v in _UNBALANCE if v in col.ds]  # files of before lack them
     means = {v: float(np.mean(col[v][tail])) for v in (*_MEANS_OF_EACH, *more)}
     return means | severity(*(float(col[v][end]) for v in _SEVERITY))
+
+
+def _worst(
+    ds: xr.Dataset, col: _Columns, whole: np.ndarray, t: float, number: int
+) -> dict[str, Any]:
+    """Return the severity of a generator's worst fault in a phase, which may be over at its end."""
+    rows = np.flatnonzero(whole & (col["mu"] > 0))
+    if not rows.size:
+        return {"worst": None}
+    h = severity_h(*(np.asarray(col[v])[rows] for v in ("mu", "k_rf")))
+    k = int(rows[int(np.argmax(h))])
+    phase = _holding(ds, "faults", "phase", t, number)
+    return {"worst": severity(*(float(col[v][k]) for v in _SEVERITY)) | {"fault_phase": phase}}
 
 
 def _held(ds: xr.Dataset, col: _Columns, end: int, t: float, number: int) -> dict[str, Any]:

@@ -313,7 +313,12 @@ def gas_doubts(
             usual = 3 * s / math.sqrt(float(np.median(r.innovation_variance[k])))
             z[k] -= np.clip(np.nanmean(np.where(quiet, z[k], np.nan)), -usual, usual)
     each = {n: np.where(quiet, row, np.nan) for n, row in zip(r.y.names, z, strict=True)}
-    for f in least(findings(each, margin=MARGIN), LEVEL):
+    found = findings(each, margin=MARGIN)
+    if {"Wf", "PW"} & {
+        *r.x.names
+    }:  # freer than a load moves: innovations alternate, sigma is large
+        found = [f for f in found if f.test != "colour" or f.value > 0]
+    for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
     if len(tracked.alarms) >= MOST_JUMPS:
@@ -382,6 +387,7 @@ def _map_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     """Operating points beyond the tables of the maps, at the end."""
     r, gg = tracked.result, filt.gg
     u = dict(zip(filt.model.u.names, tracked.data.u[:, -1], strict=True))
+    u |= {n: float(r[n][0][-1]) for n in ("Wf", "PW") if n in r.x}
     given = gg.U.pack({n: float(u.get(n, 0.0)) for n in gg.U.names})
     theta = gg.THETA.pack({n: float(r[n][0][-1]) for n in HEALTH})
     N = np.array([float(r["N"][0][-1])])

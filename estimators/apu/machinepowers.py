@@ -7,17 +7,18 @@ and number of pairs.  Where all machines are alike, some of them may stand for t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.unit.apu import Apu
-from estimators.apu.electrical.electricalside import ElectricalSide, View
+from apu_casadi.unit.events import who
+from estimators.apu.electrical.electricalside import SETTLED, Beliefs, ElectricalSide, View
 
-__all__ = ["Course", "on_common_windows", "shaft_courses"]
+__all__ = ["Course", "fusable", "on_common_windows", "shaft_courses"]
 
-SETTLED = 5  # windows after which the electrical filters have settled
 Course = tuple[int, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -83,11 +84,54 @@ def _at(side: ElectricalSide, t: np.ndarray) -> ElectricalSide:
     views = []
     for v in side.views:
         energy = np.append(0.0, np.cumsum(v.P * np.diff(side.t)))
-        P = np.diff(np.interp(t, side.t, energy)) / np.diff(t)
         # known when the windows that it came from were
         start = int(np.searchsorted(t, side.t[v.start] - 1e-9)) if v.start else 0
-        noise, loss = (np.interp(amid, there, x) for x in (v.noise, v.loss))
-        views.append(View(min(start, t.size - 2), P, noise, loss))
+        P = np.diff(np.interp(t, side.t, energy)) / np.diff(t)
+        spread = (np.interp(amid, there, x) for x in (v.variance, v.noise, v.loss))
+        views.append(View(min(start, t.size - 2), P, *spread))
     rows = np.searchsorted(side.t, t + 1e-9, side="right") - 1
-    own = {n: getattr(side, n)[..., rows] for n in ("severities", "probability", "phase", "misfit")}
-    return dataclasses.replace(side, t=t, views=tuple(views), **own)
+    own: dict[str, Any] = {"t": t, "views": tuple(views)}
+    for n in ("severities", "probability", "phase", "misfit"):
+        own[n] = getattr(side, n)[..., rows]
+    if side.beliefs is not None:
+        names, mean, cov = side.beliefs
+        ended = np.maximum(rows[1:] - 1, 0)
+        own["beliefs"] = Beliefs(names, mean[ended], cov[ended])
+    return dataclasses.replace(side, **own)
+
+
+def fusable(
+    apu: Apu, sides: Mapping[int, ElectricalSide], fuel: np.ndarray, notes: list[str]
+) -> dict[int, ElectricalSide]:
+    """Return the machines whose powers make the shaft power, on common windows.
+
+    Args:
+        apu: the unit.
+        sides: by number of the machine.
+        fuel: instants of the gas path, s.
+        notes: which take why there are none.
+    """
+    if not sides:
+        return {}
+    others = [k for k in range(1, len(apu.machines) + 1) if k not in sides]
+    if others and not apu.alike:
+        notes.append(
+            f"the generators differ, and {who(others)} {'is' if len(others) == 1 else 'are'} not "
+            "estimated: the gas path has no shaft power from the waveforms"
+        )
+        return {}
+    common = on_common_windows([*sides.values()])
+    if common is None:
+        notes.append(
+            "the generators were sampled at different times: the gas path has no shaft power from "
+            "the waveforms"
+        )
+        return {}
+    t = common[0].t
+    if min(t[-1], fuel[-1]) - max(t[0], fuel[0]) < 0.5 * (fuel[-1] - fuel[0]):
+        notes.append(
+            f"the waveforms, {t[0]:g} to {t[-1]:g} s, cover less than half of the gas path's time: "
+            "the two are estimated apart; give that part of the gas path alone to have both"
+        )
+        return {}
+    return dict(zip(sides, common, strict=True))

@@ -17,11 +17,23 @@ from typing import Any
 from scenarios.shell import usage
 
 _NAMES = """
-bench calibrate campaign dataset linearise compile deck errata estimate export fit identify list
-maps measure multirate run score study trim tune validate
+bench calibrate campaign dataset linearise compile completion deck errata estimate export fit
+identify list maps measure multirate run score study trim tune validate
 """
 MODULES = tuple(f"scenarios.commands.{name}" for name in _NAMES.split())
 """The modules of the subcommands, in the order of the help text; add new ones here."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command with all its subcommands."""
+    p = usage.Parser(
+        prog="apu",
+        description="Joint simulation of an all-electric APU: gas path and stator faults.",
+        epilog="Try: apu run joint",
+    )
+    p.add_argument("--version", action=usage.ShowVersion, nargs=0, help="print the version")
+    register(p.add_subparsers(metavar="COMMAND", required=True))
+    return p
 
 
 def register(

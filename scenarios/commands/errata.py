@@ -13,6 +13,7 @@ NAME = "errata"
 HELP = "what the paper leaves open, what was chosen, and what it changes"
 OPTIONS = """
 --write FILE | write the page, docs/ERRATA.md
+--markdown   | print it as it would be written
 --json       | print JSON
 """
 
@@ -23,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
 
     from apu_casadi.core import files
     from scenarios.pages import errata_page
-    from scenarios.shell import markdown
+    from scenarios.shell import markdown, terminal
 
     progress.tell("computing the effects, about a minute", quiet=args.json)
     if args.write is not None:
@@ -34,5 +35,6 @@ def run(args: argparse.Namespace) -> int:
     elif args.write is not None:
         print(f"written: {path}")
     else:
-        print(errata_page.page(), end="")
+        page = errata_page.page()
+        print(page if args.markdown else terminal.plain(page, terminal.columns()), end="")
     return 0

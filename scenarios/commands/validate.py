@@ -13,7 +13,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from scenarios.commands import given
-from scenarios.shell import jsontext
+from scenarios.shell import jsontext, terminal
 
 if TYPE_CHECKING:
     from scenarios.validation.comparison import Row
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         report[name] = rows
         if not args.json:
             print(f"\n{name}: {known[name][0]}")
-            print(table(rows), flush=True)
+            print(table(rows, terminal.columns() if terminal.folds() else None), flush=True)
     total = sum(len(r) for r in report.values())
     if args.json:
         out = {
@@ -87,14 +87,32 @@ _HEAD = "quantity|unit|reference|ours|error|tolerance|kind||why this tolerance"
 HEAD = _HEAD.split("|")
 
 
-def table(rows: list[Row]) -> str:
-    """Return the rows as a text table; numbers stand to the right."""
+def table(rows: list[Row], width: int | None = None) -> str:
+    """Return the rows as a text table; numbers stand to the right.
+
+    Args:
+        rows: what was compared.
+        width: letters a line; the last column is broken to it. None breaks nothing.
+    """
     body = [HEAD, *(_cells(r) for r in rows)]
-    widths = [max(len(row[k]) for row in body) for k in range(len(HEAD))]
-    right = [">" if 2 <= k <= 5 else "<" for k in range(len(HEAD))]
-    return "\n".join(
-        ("  " + "  ".join(map("{:{}{}}".format, row, right, widths))).rstrip() for row in body
-    )
+    widths = [max(len(row[k]) for row in body) for k in range(len(HEAD) - 1)]
+    right = [">" if 2 <= k <= 5 else "<" for k in range(len(HEAD) - 1)]
+    made = []
+    for *cells, why in body:
+        line = "  " + "  ".join(map("{:{}{}}".format, cells, right, widths)) + "  "
+        room = None if width is None else width - len(line)
+        if room is not None and room < len(why) and room < _ROOM:  # below, where there is room
+            made += [line.rstrip(), terminal.filled(why, width or 0, first=_BELOW, then=_BELOW)]
+        elif room is not None and why:
+            made.append(terminal.filled(why, width or 0, first=line, then=" " * len(line)))
+        else:
+            made.append((line + why).rstrip())
+    return "\n".join(made)
+
+
+_BELOW = " " * 6
+_ROOM = 40
+"""Letters that the reason of a tolerance needs beside its row."""
 
 
 def _cells(r: Row) -> list[str]:

@@ -31,13 +31,20 @@ class Parser(argparse.ArgumentParser):
             # argparse takes the two dashes away and then misses the value
             if re.fullmatch(r"--[^=]+=--", text):
                 self.error(f"argument {text[:-3]}: a value is expected, got '--'")
+        first = next(iter(sys.argv[1:] if args is None else args), "")
+        if self._subparsers and first.startswith("--") and first not in self._option_string_actions:
+            self._unknown([first])  # before a command is missed
         found, rest = super().parse_known_args(args, namespace)
         unknown = [text for text in rest if text.startswith("-") and text != "--"]
         if unknown:
-            option = unknown[0].partition("=")[0]
-            known = [o for o in self._option_string_actions if o.startswith("--")]
-            self.error(f"unrecognized arguments: {' '.join(unknown)} {nearest(option, known)}")
+            self._unknown(unknown)
         return found, rest
+
+    def _unknown(self, arguments: Sequence[str]) -> NoReturn:
+        """End with status 2: options that there are not, and the nearest one there is."""
+        known = [o for o in self._option_string_actions if o.startswith("--")]
+        near = nearest(arguments[0].partition("=")[0], known)
+        self.error(f"unrecognized arguments: {' '.join(arguments)} {near}")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse what is none of an argument's choices; the nearest one is named."""

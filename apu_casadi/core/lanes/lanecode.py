@@ -21,6 +21,7 @@ from typing import NamedTuple, TypeAlias
 import casadi as ca
 
 from apu_casadi.core.errors import BackendError
+from apu_casadi.core.lanes.vectormath import VECTOR, vector_math
 
 # {p} is the width's prefix, {a} and {b} are the operands
 _UNARY = """
@@ -78,10 +79,22 @@ typedef double V __attribute__((vector_size(8*L)));
 typedef int64_t M __attribute__((vector_size(8*L)));
 typedef double S;
 #define IN static inline __attribute__((always_inline,unused))
-IN V v_all(double a){V r;for(int l=0;l<L;l++)r[l]=a;return r;}
-IN V v_sel(M m,V a,V b){return (V)((m&(M)a)|(~m&(M)b));}
+/* written out: a loop over lanes is compiled to one insertion for each */
+IN V v_all(double a){return (V){ALL_LANES};}
 IN V v_num(M m){return (V)(m&(M)v_all(1.0));}
-IN int v_any(M m){int64_t r=0;for(int l=0;l<L;l++)r|=m[l];return r!=0;}
+/* a mask as bits, one for each lane; choice by a mask */
+#if L==8 && defined(__AVX512DQ__)
+IN unsigned v_bits(M m){return _mm512_movepi64_mask((__m512i)m);}
+IN V v_sel(M m,V a,V b){
+return (V)_mm512_mask_blend_pd(_mm512_movepi64_mask((__m512i)m),(__m512d)b,(__m512d)a);}
+#elif L==4 && defined(__AVX__)
+IN unsigned v_bits(M m){return _mm256_movemask_pd((__m256d)m);}
+IN V v_sel(M m,V a,V b){return (V)_mm256_blendv_pd((__m256d)b,(__m256d)a,(__m256d)m);}
+#else
+IN unsigned v_bits(M m){unsigned r=0;for(int l=0;l<L;l++)r|=(unsigned)(m[l]&1)<<l;return r;}
+IN V v_sel(M m,V a,V b){return (V)((m&(M)a)|(~m&(M)b));}
+#endif
+IN int v_any(M m){return v_bits(m)!=0;}
 IN S s_all(double a){return a;}
 IN S s_sel(int m,S a,S b){return m?a:b;}
 IN S s_num(int m){return m;}
@@ -201,10 +214,11 @@ class Writer:
 
     def source(self) -> str:
         """Return all that was written."""
-        prelude = _PRELUDE.replace("LANES", str(self.lanes))
-        calls = [f"EACH({n})" for n in _CALLS_1]
+        prelude = _PRELUDE.replace("ALL_LANES", ",".join("a" * self.lanes))
+        prelude = prelude.replace("LANES", str(self.lanes))
+        calls = [f"EACH({n})" for n in _CALLS_1 if n not in VECTOR]
         two = "static V v_{0}(V a,V b){{V r;for(int l=0;l<L;l++)r[l]={0}(a[l],b[l]);return r;}}"
-        calls += [two.format(n) for n in _CALLS_2]
+        calls += [two.format(n) for n in _CALLS_2 if n not in VECTOR]
         single = [f"IN S s_{n}(S a){{return {n}(a);}}" for n in _CALLS_1]
         single += [f"IN S s_{n}(S a,S b){{return {n}(a,b);}}" for n in _CALLS_2]
         tables = []
@@ -212,7 +226,7 @@ class Writer:
             kind, body = key.split(" ", 1)
             tables.append(f"static const {kind} {name}{body}")
         unused = [f"__attribute__((unused)) {c}" for c in calls]
-        return "\n".join([prelude, *unused, *single, *tables, *self._text, ""])
+        return "\n".join([prelude, vector_math(self.lanes), *unused, *single, *tables, *self._text, ""])
 
 
 def number(value: float) -> str:

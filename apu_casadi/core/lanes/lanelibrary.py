@@ -44,8 +44,8 @@ __all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "single", "source", 
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
-_FLAGS = {2: (), 4: ("-mavx2",), 8: ("-mavx512f", "-mavx512dq", "-mavx512vl")}
-_NEEDS = {4: {"avx2"}, 8: {"avx512f", "avx512dq", "avx512vl"}}
+_FLAGS = {2: (), 4: ("-mavx2", "-mfma"), 8: ("-mavx512f", "-mavx512dq", "-mavx512vl")}
+_NEEDS = {4: {"avx2", "fma"}, 8: {"avx512f", "avx512dq", "avx512vl"}}
 _COMMON_FLAGS = ("-ffp-contract=off", "-Wno-psabi")
 _X86 = ("x86_64", "AMD64")
 
