@@ -120,7 +120,7 @@ def _forest(X: np.ndarray, y: np.ndarray, train: np.ndarray, rng: np.random.Gene
     try:
         ensemble = import_module("sklearn.ensemble")
     except ImportError:
-        raise DataError("forest needs: pip install scikit-learn") from None
+        raise DataError("forest needs: pip install 'apu-casadi[learn]'") from None
     seed = int(rng.integers(2**31))
     model = ensemble.RandomForestClassifier(300, random_state=seed, class_weight="balanced")
     model.fit(X[train], y[train])
