@@ -30,7 +30,8 @@ if not API:
 
 html_theme = "furo"
 html_title = f"apu-casadi {version}"
-html_static_path = []
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_math_renderer = "mathml"
 
 autosummary_generate = API

@@ -94,6 +94,9 @@ def write_pages(app: Sphinx) -> None:
     pages = {"scenario.md": scenario_page(file_schema()), "commands.md": commands_page()}
     for path in sorted((HERE.parent / "notebooks").glob("*.ipynb")):
         pages[f"notebooks/{path.name}"] = path.read_text(encoding="utf-8")
+    for path in MADE.rglob("*.*"):  # of a notebook that has another name now
+        if path.relative_to(MADE).as_posix() not in pages:
+            path.unlink()
     for name, text in pages.items():
         path = MADE / name
         path.parent.mkdir(parents=True, exist_ok=True)
