@@ -125,7 +125,7 @@ class Course(Generic[F]):
         gen, ss: generator and its variant for this load and this fault.
         load, fault: at least one of them changes in time.
         prepare: (u, theta, harmonics at least) -> what propagates with these numbers.
-        end: end of the run, s.
+        end, begin: of what is asked for, s.
     """
 
     gen: Generator
@@ -141,6 +141,7 @@ class Course(Generic[F]):
         fault: Fault | Varying[Fault | None] | None,
         prepare: Callable[[np.ndarray, np.ndarray, int], F],
         end: float,
+        begin: float = 0.0,
     ) -> None:
         self.gen, self.ss, self.load, self.fault = gen, ss, load, fault
         self._prepare: Callable[[np.ndarray, np.ndarray, int], F] = prepare
@@ -155,7 +156,7 @@ class Course(Generic[F]):
             self._ends: list[float] = [low, high if high > low else low + max(abs(low), 1e-9)]
         else:
             bends: set[float] = {t for x in parts for t in x.corners(end)}
-            self._ends = [0.0, *sorted(bends), end]
+            self._ends = [begin, *sorted(t for t in bends if t > begin), end]
         self._pieces: dict[tuple[float, float], Piece[F] | str | None] = {}
 
     # -- the coordinate -------------------------------------------------------------------------

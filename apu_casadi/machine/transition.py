@@ -411,9 +411,13 @@ def _fourier(
     """
     turn = np.ones(kinds.even.size + kinds.odd.size)
     turn[kinds.odd] = -1.0
-    highest = 0
+    highest, P = 0, np.empty((0, 0, 0))
     for resolved in HARMONICS:
-        P = sampled(np.pi * np.arange(resolved) / resolved)
+        if not P.size:
+            P = sampled(np.pi * np.arange(resolved) / resolved)
+        else:  # those in between the angles that are there
+            new = sampled(np.pi * np.arange(1, resolved, 2) / resolved)
+            P = np.stack([P, new], axis=2).reshape(P.shape[0], resolved, -1)
         F = np.fft.rfft(np.concatenate([P, P * turn], axis=1), axis=1) / (2 * resolved)
         size = np.abs(F).max(axis=(0, 2))
         highest = int(np.nonzero(size > TAIL * size.max())[0][-1])

@@ -109,10 +109,11 @@ class Phase:
 
 
 class Way(NamedTuple):
-    """Load and fault on their way, one at least made of profiles, and the end of the run, s."""
+    """Load and fault on their way between two instants, s; one at least is made of profiles."""
 
     load: Load | Varying[Load]
     fault: Fault | Varying[Fault | None] | None
+    begin: float
     end: float
 
 
@@ -243,8 +244,8 @@ class _Exact(Integrator, Generic[F]):
         """Return what propagates along the way over steps with these middles, s."""
         assert self._way is not None
         if self._course is None:
-            p, (load, fault, end) = self.phase, self._way
-            self._course = Course(p.gen, p.ss, load, fault, self._prepare, end)
+            p, (load, fault, begin, end) = self.phase, self._way
+            self._course = Course(p.gen, p.ss, load, fault, self._prepare, end, begin)
         return self._course.blocks(t, before, width)
 
     def columns(self, t: np.ndarray, before: float, width: int) -> tuple[F, Iterator[Numbers]]:

@@ -23,7 +23,7 @@ from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit import validity
 from apu_casadi.unit.apu import Apu, JointPoint
-from apu_casadi.unit.events import Event, Holding, Jump
+from apu_casadi.unit.events import Event, FaultChange, Holding, Jump, LoadChange
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.integrators import Settings
 from apu_casadi.unit.jointstep import BLOCK, LONG
@@ -43,6 +43,7 @@ class Asked:
         phasors, noise, seed, hook: as there.
         settled: whether loads and faults have been there for long.
         strict: whether each block is judged before the next one.
+        events: in order.
     """
 
     start: Holding
@@ -53,6 +54,7 @@ class Asked:
     hook: Callable[[int, np.ndarray], np.ndarray] | None
     settled: bool = False
     strict: bool = False
+    events: Sequence[Event] = ()
 
 
 class Columns:
@@ -127,6 +129,7 @@ class JointRun:
             *there, ambient=self.here.ambient, health=self.here.factors, **more
         )
         own: dict[str, Any] = {"end": float(asked.grid[-1]), "settled": asked.settled}
+        own["changes"] = [e for e in asked.events if isinstance(e, LoadChange | FaultChange)]
         self.machines = Machines(apu, self.point, self.here, settings, asked.phasors, **own)
         self.shaft = self._shaft()
         self._changing = self.now.changing

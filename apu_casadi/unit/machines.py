@@ -16,7 +16,14 @@ from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.unit.apu import Apu, JointPoint, groups
 from apu_casadi.unit.departures import Departure
-from apu_casadi.unit.events import Event, HealthChange, Holding, who
+from apu_casadi.unit.events import (
+    Event,
+    FaultChange,
+    HealthChange,
+    Holding,
+    LoadChange,
+    who,
+)
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
 from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
 from apu_casadi.unit.machinestep import MachineMade, MachineStep
@@ -80,6 +87,7 @@ class Machines:
         phasors: whether phasors are wanted too.
         settled: whether loads and faults have been there for long, and ``point`` is of them.
         end: of the run, s.
+        changes: of loads and faults in it; a course of tables goes no further.
     """
 
     groups: list[MachineStep]
@@ -94,8 +102,9 @@ class Machines:
         *,
         settled: bool = False,
         end: float = 0.0,
+        changes: Sequence[LoadChange | FaultChange] = (),
     ) -> None:
-        self.apu, self.settings, self._end = apu, settings, end
+        self.apu, self.settings, self._end, self._changes = apu, settings, end, changes
         self.means = StepMeans(apu.generator, phasors)
         self.groups = []
         for numbers in kinds(apu, start):
@@ -146,7 +155,9 @@ class Machines:
             parts = [(group.part(tuple(members[i - 1] for i in at)), own) for at, own in others]
             for step, own in [(group, fate), *parts]:
                 k = step.numbers[0] - 1
-                step.follow(*own, self._end)
+                of_it = (e.t for e in self._changes if e.generator in (None, *step.numbers))
+                later = (s for s in of_it if s > t + SAME_INSTANT)
+                step.follow(*own, t, min(later, default=self._end))
                 changed |= step.switch(here.loads[k], here.faults[k], t, smooth=not switched)
                 after.append(step)
             changed |= bool(parts)

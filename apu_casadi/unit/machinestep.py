@@ -101,7 +101,7 @@ class MachineStep:
         self.spikes: list[tuple[Spike, tuple[int, ...] | None]] = []
         self._since = math.inf  # s since the last switch
         self._way: Way | None = None
-        self._asked: tuple[Any, Any] = (load, fault)
+        self._asked: tuple[Any, Any, float] = (load, fault, math.inf)
         symmetric = point.balanced and not settings.noisy
         self._enter(Phase(self.gen, load, fault, point.ss, self.u, point.theta, symmetric))
 
@@ -124,13 +124,13 @@ class MachineStep:
         self._same: tuple[MeanStep | Propagator, Numbers] | None = None
         self._linked: np.ndarray | None = None
 
-    def follow(self, load: Any, fault: Any, end: float) -> None:
-        """Take what load and fault are made of, until the end of the run, s."""
-        if (load, fault) == self._asked:
+    def follow(self, load: Any, fault: Any, begin: float, end: float) -> None:
+        """Take what load and fault are made of, from now until others come, s."""
+        if (load, fault, end) == self._asked:
             return
-        self._asked = (load, fault)
+        self._asked = (load, fault, end)
         changing = any(isinstance(x, Varying) for x in (load, fault))
-        self._way = Way(load, fault, end) if changing else None
+        self._way = Way(load, fault, begin, end) if changing else None
         self._enter(self.phase)
 
     def switch(self, load: Load, fault: Fault | None, t: float, *, smooth: bool = False) -> bool:

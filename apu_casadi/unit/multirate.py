@@ -182,14 +182,15 @@ def joint_course(apu: Apu, **how: Any) -> Course[xr.Dataset]:
     """
     noise = Noise() if how["noise"] is None else how["noise"]
     duration = number("duration", how["duration"], error=ScenarioError)
-    given = {n: how[n] for n in ("exchange", "dt", "waveform_dt", "solver", "rtol", "atol")}
-    settings = _settings(**given, noise=noise)
+    numbers = {n: how[n] for n in ("exchange", "dt", "waveform_dt", "solver", "rtol", "atol")}
+    settings = _settings(**numbers, noise=noise)
     events = in_order(how["events"], duration, generators=len(apu.machines))
     start = start_of(apu, *(how[n] for n in ("load", "fault", "health", "ambient", "N_ref")))
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
     grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(how["start_from"])
     seed, strict = how["seed"], how["strict"]
-    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled, strict)
+    given = how["phasors"], noise, seed, how["hook"], settled, strict, events
+    asked = Asked(start, grid, *given)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
     limits = how["limits"]
     judged = (limits or Limits()) if strict else None
