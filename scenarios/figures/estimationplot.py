@@ -125,7 +125,7 @@ def plot_alarms(groups: Mapping[str, Sequence[Mapping[str, Any]]], note: str) ->
             for ax in (rate, late):
                 ax.minorticks_off()
             rate.set_ylim(-4, 104)
-            late.set_ylim(bottom=0)
+            late.set_ylim(0, max(100.0, late.get_ylim()[1]))
             late.set_xlabel(f"{label} [{_unit(rows)}]")
             fs.legend(rate, "lower right")
         fs.title(axes[0, 0], "True alarms [% of runs]")
