@@ -21,6 +21,9 @@ def _is_command() -> bool:
     return name in ("apu", "apu.exe") or (name == "-m" and "scenarios.cli" in sys.orig_argv)
 
 
-# here, since this is the first line of the package that runs; what follows may take long to import
-if _is_command() and _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
-    _signal.signal(_signal.SIGINT, answer)
+# here, since the first lines of the package run at once; what follows may take long to import
+if _is_command():
+    # small matrices: threads of the linear algebra only wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+        _signal.signal(_signal.SIGINT, answer)

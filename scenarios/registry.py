@@ -36,6 +36,7 @@ __all__ = [
     "engine_file",
     "get",
     "implausible",
+    "joint_arguments",
     "list_scenarios",
     "name_of",
     "prepare",
@@ -169,23 +170,20 @@ def _simulate(
 ) -> xr.Dataset:
     from apu_casadi.unit.multirate import simulate_joint
 
-    return simulate_joint(
-        unit_for(s),
-        duration=s.duration,
+    more: dict[str, Any] = {"strict": strict, "progress": progress}
+    return simulate_joint(**joint_arguments(s), solver=solver, phasors=phasors, **more)
+
+
+def joint_arguments(s: Scenario) -> dict[str, Any]:
+    """Return what a scenario asks of :func:`apu_casadi.unit.multirate.simulate_joint`."""
+    same = ("duration", "ambient", "dt", "exchange", "waveform_dt", "noise", "seed")
+    return {
+        "apu": unit_for(s),
+        **{n: getattr(s, n) for n in same},
         **s.start(),
-        ambient=s.ambient,
-        events=s.events(),
-        dt=s.dt,
-        exchange=s.exchange,
-        waveform_dt=s.waveform_dt,
-        noise=s.noise,
-        seed=s.seed,
-        solver=solver,
-        phasors=phasors,
-        strict=strict,
-        limits=engine_file(s.engine).limits,
-        progress=progress,
-    )
+        "events": s.events(),
+        "limits": engine_file(s.engine).limits,
+    }
 
 
 def prepare(out: str | os.PathLike[str]) -> Path:

@@ -12,12 +12,14 @@ from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.terminals import OUTPUTS
 from estimators.apu import believable
 from estimators.apu.believable import KINDS, LEVEL, Doubt, standing_still
+from estimators.apu.diagnosis import diagnoses
 from estimators.apu.electrical import residuals
-from estimators.apu.electrical.causes import PRIOR, probabilities
+from estimators.apu.electrical.causes import PRIOR, Causes, probabilities
 from estimators.apu.electrical.hypotheses import Hypotheses
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.wild import wild_samples
+from estimators.apu.sensorfailures import failure
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.filtering import FilterResult
 from estimators.information.innovationtests import findings, least
@@ -213,3 +215,54 @@ def test_a_doubt_is_its_sentence_and_its_kind():
     d = Doubt("sensor", "T5 stands still").of("machine 1")
     again = pickle.loads(pickle.dumps(d))
     assert d == again == "machine 1, T5 stands still" and again.kind == d.kind == "sensor"
+
+
+# ------------------------------------------------------------------------------ one answer
+
+
+@pytest.mark.parametrize("kind", ["stuck", "bias", "drift", "noise", "spikes", "dropout"])
+def test_how_a_sensor_failed_is_told(kind):
+    """Of readings of 900 K +- 5 K, over 50 samples, for several draws."""
+    t = 0.02 * np.arange(50)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        true, noise = 900 + 5 * np.sin(t), 5 * rng.standard_normal(50)
+        v = true + noise
+        v = {
+            "stuck": np.full(50, v[0]),
+            "bias": v + 20.0,
+            "drift": v + 60.0 * t,
+            "noise": true + 4 * noise,
+            "spikes": np.where(np.arange(50) == 20 + seed, v + 100.0, v),
+            "dropout": np.where(np.arange(50) > 3, np.nan, v),
+        }[kind]
+        found = failure(t, v, v - true, np.full(50, 5.0))
+        assert max(found, key=found.get) == kind
+        assert sum(found.values()) == pytest.approx(1.0)
+    assert failure(t[:2], true[:2], noise[:2], np.full(2, 5.0)) == {}
+
+
+def test_one_answer_for_what_several_filters_saw():
+    """A short circuit that the gas path took for shaft power; a fault of the gas path alone."""
+    short = Causes(0.5, {"healthy": 0.0, "short circuit b": 0.9, "sensor i_b": 0.1})
+    power = Causes(0.56, {"none": 0.0, "gas path": 0.2, "shaft power": 0.8})
+    (d,) = diagnoses({"machine 1": [short], "gas path": [power]})
+    assert d.best == "machine 1: short circuit b" and d.t == 0.5
+    assert d.probability["gas path"] < 1e-3 and sum(d.probability.values()) == pytest.approx(1.0)
+    worn = Causes(0.56, {"none": 0.0, "gas path": 0.95, "sensor T5": 0.05})
+    bias = {"sensor T5": {"bias": 1.0}}
+    (d,) = diagnoses({"gas path": [worn]})
+    assert d.best == "gas path" and not d.failure
+    # both are sure of something that the other does not see
+    (d,) = diagnoses({"machine 1": [short], "gas path": [worn]})
+    assert d.best == "two at once"
+    failed = Causes(3.0, {"none": 0.1, "gas path": 0.1, "sensor T5": 0.8}, bias)
+    first, second = diagnoses({"machine 2": [short], "gas path": [failed]})
+    assert first.best == "machine 2: short circuit b"
+    assert (second.best, second.failure) == ("sensor T5", {"bias": 1.0})
+    # a pick-up is an input of one filter and an output of the other
+    pickup = Causes(0.5, {"healthy": 1e-9, "sensor w_r": 1.0})
+    speed = Causes(0.54, {"none": 0.0, "sensor N": 1.0})
+    (d,) = diagnoses({"machine 1": [pickup], "gas path": [speed]})
+    assert d.best == "machine 1: sensor w_r"
+    assert diagnoses({}) == []

@@ -154,6 +154,21 @@ def test_numbers_of_many_steps_are_those_of_each():
     assert math.isclose(many.u[2, 0], KW100.R[0], rel_tol=1e-9)
 
 
+def test_numbers_in_blocks_are_those_of_all_steps():
+    """Polynomials of a low degree over a part of an interval, or none, are told to 1e-12."""
+    x = np.linspace(-1.0, 1.0, 9)
+    made = np.polynomial.chebyshev.chebfit(x, np.array([np.exp(x), 2.0 + np.sin(3 * x)]).T, 8)
+    piece = Piece(SimpleNamespace(), 10.0, 5.0, made, np.ones(2), *np.zeros((2, 2)))
+    s = np.linspace(11.0, 11.02, 7)
+    near = piece.near(s[0], s[-1])
+    assert near.powers.shape == (5, 2)
+    assert_allclose(near.at(s), piece.at(s), rtol=1e-12)
+    assert piece.near(6.0, 14.0) is piece
+    alike = piece.near(11.0, 11.0)
+    assert alike.powers.shape == (1, 2)
+    assert_allclose(alike.at(s[:1]), piece.at(s[:1]), rtol=0)
+
+
 def test_tables_are_made_once_for_all_runs(monkeypatch):
     """A second course of the same numbers, as of a second run, computes none."""
     made = []
@@ -174,9 +189,7 @@ def test_tables_are_made_once_for_all_runs(monkeypatch):
 def test_pieces_of_unequal_harmonics_go_on_by_single_steps(monkeypatch):
     """Two pieces of one layout whose tables have more or fewer harmonics: no block of both."""
     fast = SimpleNamespace(layout=("same",), smooth=1.0)
-    pieces = {
-        k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), np.zeros(2), np.zeros(2)) for k in (0, 1)
-    }
+    pieces = {k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), *np.zeros((3, 2))) for k in (0, 1)}
     course = object.__new__(Course)
     course._only, course.ss = None, SimpleNamespace(name="model")
     monkeypatch.setattr(course, "_piece", lambda s: pieces[int(s)], raising=False)

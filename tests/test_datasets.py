@@ -1,9 +1,15 @@
 """Data sets: recipes are checked, runs depend on seeds alone, nothing is lost, scores are right."""
 
+import contextlib
 import dataclasses
+import errno
 import hashlib
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
 from collections import Counter
 
 import numpy as np
@@ -70,6 +76,7 @@ def test_classes_and_splits_are_as_the_recipe_says():
         ({"spread": {"machine.rs": 0.1}}, r"machine.rs.*machine.r_s"),
         ({"spread": {"machine.r_s": 0.5}}, "outside"),
         ({"range": 3}, "range must be a table"),
+        ({"exchange": "papre"}, r"exchange = 'papre' \(did you mean 'paper'"),
     ],
 )
 def test_a_wrong_recipe_is_told(changed, words):
@@ -135,6 +142,16 @@ def test_an_interrupted_one_goes_on_with_the_same_bits(small, made, tmp_path):
         making.make_dataset(small, tmp_path / "full")
 
 
+def test_a_recipe_of_before_runs_as_before_and_what_grows_is_integrated():
+    old = {k: v for k, v in table().items() if k != "exchange"}
+    assert draw(Recipe.of(old), 3, 0).scenario["exchange"] == "predicted"
+    assert draw(REFERENCE, 3, 0).scenario["exchange"] == "paper"
+    for d in (draw(REFERENCE, u, 0) for u in range(66)):
+        electrical = d.labels["class"] in ("ttsc", "field", "combined")
+        cvodes = making.solver_of(d).get("solver") == "cvodes"
+        assert cvodes == (electrical and d.labels["over"] > 0)
+
+
 def test_a_refused_run_keeps_its_reason(small):
     r = dataclasses.replace(small, range={**small.range, "power_kW": (900.0, 900.0)})
     labels, gas, waves = making.make_run(r, 0, 0)
@@ -187,6 +204,19 @@ def test_scores_against_numbers_by_hand(tmp_path):
         (lambda rows: [{**r, "hh": 1} for r in rows], r"column 'hh' \(did you mean 'h'"),
         (lambda rows: [{**r, "h": "big"} for r in rows], "line 2: h = 'big' is no number"),
         (lambda rows: [{"run": r["run"]} for r in rows], "column class is missing"),
+        (
+            lambda rows: [{**r, "class": float("nan")} for r in rows],
+            "line 2: class '' .*is missing",
+        ),
+        (lambda rows: [{**r, "run": -1} for r in rows], "run '-1' is no whole number"),
+        (lambda rows: [{**r, "run": r["run"] + 0.5} for r in rows], "'0.5' is no whole number"),
+        (lambda rows: [{**r, "h": "inf"} for r in rows], "line 2: h = 'inf' is no finite number"),
+        (lambda rows: [{**r, "score": "NaN"} for r in rows], "score = 'NaN' is no finite number"),
+        (lambda rows: [{**r, "h": 0, "h_sigma": -1} for r in rows], "h_sigma = '-1' must be > 0"),
+        (lambda rows: [{**r, "h_sigma": 1} for r in rows], "column h is missing for h_sigma"),
+        (lambda rows: [{**r, "generator": 1.5} for r in rows], "generator '1.5' is no whole"),
+        (lambda rows: [{**r, "phase": "d"} for r in rows], "phase 'd': a, b, c or nothing"),
+        (lambda rows: [], "column run is missing"),
     ],
 )
 def test_predictions_that_do_not_fit_are_refused(tmp_path, change, words):
@@ -194,6 +224,103 @@ def test_predictions_that_do_not_fit_are_refused(tmp_path, change, words):
     rows = change([{"run": k, "class": "healthy"} for k in range(3)])
     with pytest.raises(DataError, match=words):
         scoring.read_predictions(predictions(tmp_path / "p.csv", rows), labels)
+
+
+def test_columns_that_are_named_twice_are_refused(tmp_path):
+    (tmp_path / "p.csv").write_text("run,class,h,h\n0,ttsc,1,2\n")
+    labels = {"run": np.arange(1), "class": np.array(["healthy"])}
+    with pytest.raises(DataError, match="column h is there twice"):
+        scoring.read_predictions(tmp_path / "p.csv", labels)
+
+
+def test_scores_are_those_of_scikit_learn():
+    metrics = pytest.importorskip("sklearn.metrics", reason="extra 'learn'")
+    rng = np.random.default_rng(4)
+    true, said = rng.choice(CLASSES, 500), rng.choice(CLASSES, 500)
+    said = np.where(rng.random(500) < 0.6, true, said)
+    ill, value = true != "healthy", rng.normal(size=500) + (true != "healthy")
+    h, guess = np.where(ill, 1e-3, 0.0), rng.normal(1e-3, 3e-4, 500)
+    y = {"class": true, "h": h}
+    s = scoring.score_of({"class": said, "score": value, "h": guess}, y)
+    assert s["kappa"] == pytest.approx(metrics.cohen_kappa_score(true, said), rel=1e-12)
+    assert s["accuracy"] == pytest.approx(metrics.accuracy_score(true, said), rel=1e-12)
+    table = metrics.confusion_matrix(true, said, labels=CLASSES)
+    ours = [[s["confusion"][a].get(b, 0) for b in CLASSES] for a in CLASSES]
+    np.testing.assert_array_equal(ours, table)
+    recall = metrics.recall_score(true, said, labels=CLASSES, average=None)
+    assert [s["by_class"][c]["right"] for c in CLASSES] == pytest.approx(list(recall), rel=1e-12)
+    rmse = math.sqrt(metrics.mean_squared_error(h, guess))
+    assert s["severities"]["h"]["rmse"] == pytest.approx(rmse, rel=1e-12)
+    false, found, _ = metrics.roc_curve(ill, value, drop_intermediate=False)
+    best = found[false <= scoring.FALSE_ALARMS + 1e-12].max()
+    assert s["detected_at_false_alarms"]["detected"] == pytest.approx(best, rel=1e-12)
+
+
+def test_a_full_disk_is_told_and_nothing_is_lost(small, made, tmp_path, monkeypatch):
+    """The third file finds no room; what was kept stays, and the rest is made later."""
+    folder, write, count = tmp_path / "data", making.files.os.fsync, []
+    units = {u: json.loads((made / f"units/unit_{u:05d}.json").read_text()) for u in range(11)}
+    kept = {
+        u: {"rows": k["rows"], "files": {n: (made / n).read_bytes() for n in k["files"]}}
+        for u, k in units.items()
+    }
+    monkeypatch.setattr(making, "make_unit", lambda table, u: kept[u])
+
+    def full(fd):
+        count.append(fd)
+        if len(count) == 9:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(fd)
+
+    monkeypatch.setattr(making.files.os, "fsync", full)
+    with pytest.raises(DataError, match="No space left on device; free some space"):
+        making.make_dataset(small, folder, workers=1)
+    assert len(list((folder / "units").iterdir())) == 2
+    assert not list(folder.rglob("*.part"))
+    making.make_dataset(small, folder, workers=1)
+    assert (folder / "checksums.sha256").read_text() == (made / "checksums.sha256").read_text()
+
+
+def test_what_a_kill_left_half_written_goes(small, made, tmp_path, monkeypatch):
+    """Also where it came before the recipe was written."""
+    folder = tmp_path / "data"
+    for name in (".123-0.part", "gaspath/.123-1.part"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"half")
+    with pytest.raises(DataError, match="holds other files"):
+        making.make_dataset(small, folder)
+    (folder / "gaspath/.123-1.part").unlink()
+    (folder / "gaspath").rmdir()
+    monkeypatch.setattr(making, "make_unit", lambda table, u: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        making.make_dataset(small, folder, workers=1)
+    assert sorted(p.name for p in folder.iterdir()) == ["recipe.json"]
+
+
+@pytest.mark.ci  # processes that are killed and begun again
+def test_killed_at_any_moment_it_goes_on_with_the_same_bits(small, made, tmp_path):
+    told = json.loads((made / "recipe.json").read_text())["recipe"]
+    text = "\n".join(f"{k} = {json.dumps(v)}" for k, v in told.items() if not isinstance(v, dict))
+    for name, rows in ((k, v) for k, v in told.items() if isinstance(v, dict)):
+        text += f"\n[{name}]\n" + "\n".join(f'"{k}" = {json.dumps(v)}' for k, v in rows.items())
+    (tmp_path / "r.toml").write_text(text)
+    command = [sys.executable, "-m", "scenarios.cli", "dataset", "make", str(tmp_path / "r.toml")]
+    command += ["--out", str(tmp_path / "data"), "--quiet"]
+    rng = np.random.default_rng(7)
+    for _ in range(4):
+        p = subprocess.Popen(command, start_new_session=True)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            p.wait(rng.uniform(1, 12))
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(p.pid, signal.SIGKILL)
+        p.wait()
+    subprocess.run(command, check=True)
+    names = {str(p.relative_to(made)) for p in made.rglob("*") if p.is_file()}
+    assert names == {
+        str(p.relative_to(tmp_path / "data")) for p in (tmp_path / "data").rglob("*") if p.is_file()
+    }
+    for n in names - {making.LOCK}:
+        assert (tmp_path / "data" / n).read_bytes() == (made / n).read_bytes(), n
 
 
 @pytest.mark.long

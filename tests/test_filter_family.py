@@ -19,7 +19,8 @@ from estimators.apu.electrical.machinemodel import electrical_model
 from estimators.apu.fitting import engine_model
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.gaspathmodel import gas_path_model
-from estimators.apu.joint import electrical_samples
+from estimators.apu.joint import electrical_samples, unit_of
+from estimators.apu.monolithic_filter import Monolithic, monolithic_filter
 from estimators.apu.sensors import ELECTRICAL
 from estimators.batch.fit import fit
 from estimators.batch.mhe import moving_horizon
@@ -261,6 +262,47 @@ def test_a_parameter_of_the_machine_is_a_state_of_the_filter(terminals):
     found = extended_kalman_filter(filt.model, prior, filt.recording(terminals), backend="vm")
     mean, sigma = (float(v[-1]) for v in found["machine.r_s"])
     assert sigma < 4e-4 and abs(mean - 0.005) < 4 * sigma
+
+
+def whole_unit(unit: Apu) -> Monolithic:
+    """The filter of a whole unit, of one group of generators or of each on its own."""
+    numbers = (1,) if unit.alike else (1, 2)
+    own = tuple(electrical_filter(unit_of(unit, k).generator.machine, power=True) for k in numbers)
+    gas = gas_path_filter(unit.gas_generator, gains=False, inertia=None)
+    return monolithic_filter(unit, own, gas, None if len(own) > 1 else ((1, 2),))
+
+
+def of_terminals(whole: Monolithic, measured) -> tuple[Belief, Recording]:
+    """Prior and recording of a filter of a whole unit, over three samples."""
+    n, start = len(whole.of), float(measured["t"][0])
+    first = {k: v[:30] for k, v in measured.items()}
+    fast = [f.recording(first, start=start).part(0, 3) for f in whole.electrical]
+    fuel = {k: (np.array([start]), np.array([v])) for k, v in (("Wf", 0.031), ("PW", 2.2e5))}
+    slow = whole.gas.of_readings(fuel | {"N": (fuel["Wf"][0], np.array([3775.0]))})
+    speeds = [measured["w_r"][:3]] * n
+    prior = whole.prior([f.prior(measured) for f in whole.electrical], whole.gas.prior())
+    return prior, whole.recording(fast, slow, speeds, [1.0] * n)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("generator", ["", "generator2."])
+def test_another_unit_as_one_model_builds_and_compiles_nothing(
+    terminals, generator, asked, monkeypatch
+):
+    """The filter of the whole unit: machine, gear and engine of the second have other numbers."""
+    base = {f"{generator}coupling.gear": 3.0} if generator else {}
+    first = whole_unit(Apu().change(base))
+    ends = [first.run(*of_terminals(first, terminals)).mean[:, -1]]
+    before = set(asked)
+    monkeypatch.setattr(FilterModel, "expanded", None)  # what every new step begins with
+    for more in ({"gas_generator.eta_c": 0.8}, {f"{generator}machine.r_s": 0.005}):
+        unit = Apu().change(base | more)
+        other = whole_unit(unit)
+        assert other.model.shared is first.model.shared
+        assert other.model.held[f"{generator}machine.r_s"] == unit.machines[-1][0].machine.r_s
+        ends.append(other.run(*of_terminals(other, terminals)).mean[:, -1])
+        assert np.abs(ends[-1] / ends[0] - 1).max() > 1e-6
+    assert before and asked == before
 
 
 # ------------------------------------------------------------------------------ in general

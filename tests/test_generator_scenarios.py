@@ -175,8 +175,8 @@ def test_captions_tell_generator_and_phase(ds):
     note = runwords.severity_note(ds)
     assert note.startswith("TTSC of phase c of generator 2: µ = 5 %")
     told = runwords.made_with(ds)
-    assert "Load of generator 1 100 kW, then 80 kW, power factor 0.85;" in told
-    assert "Load of generator 2 100 kW;" in told
+    assert "Load of generator 1: 100 kW, then 80 kW, power factor 0.85;" in told
+    assert "; of generator 2: 100 kW;" in told
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ from apu_casadi.core import backend
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.errors import BackendError
 from apu_casadi.core.lanes import lanelibrary
-from apu_casadi.core.lanes.lanelibrary import batch, in_lanes, lanes_in_use, single, unsupported
+from apu_casadi.core.lanes.lanelibrary import batch, in_lanes, lanes_in_use, unsupported
 
 pytestmark = [
     pytest.mark.compiled,
@@ -114,8 +114,6 @@ def test_a_graph_has_the_bits_of_scalar_c():
     given = side_by_side(f, n, rng)
     given[2][0, 1] = np.nan  # also in a table each lane finds a place
     assert_equal_bits(f, in_lanes(f, lanes=n), given)
-    one = [a[:, : f.size2_in(i)] for i, a in enumerate(given)]
-    assert_equal_bits(f, single(f), one)
     common = in_lanes(f, lanes=n, common=(1,))
     assert common.size_in(1) == f.size_in(1)
     whole = [*given[:1], np.tile(given[1][:, :3], (1, n)), given[2]]

@@ -72,6 +72,27 @@ def test_report_is_json_and_the_page_holds_every_run():
     assert "TTSC fault" in study.table(data)
 
 
+def test_events_of_one_machine_are_chosen_and_leave_the_text_alone(tmp_path, monkeypatch, capsys):
+    """The page's paragraph is of the three events of both; a table is added for each of one."""
+    asked = {}
+
+    def measured(**how):
+        asked.update(how)
+        return rows()
+
+    monkeypatch.setattr(study, "measure", measured)
+    assert main(["multirate", "--events", "one", "--out", str(tmp_path), "--json"]) == 0
+    assert asked["cases"] == tuple(study.OF_ONE)
+    capsys.readouterr()
+    data = rows()
+    worse = [study.Measured("TTSC fault of one", r.exchange, r.dt, *[9 * r.N] * 4, cpu=r.cpu)
+             for r in data if r.case == "TTSC fault"]  # fmt: skip
+    page, more = study.page(data), study.page(data + worse)
+    text = page.partition("## ")[0].replace("apu multirate", "apu multirate --events all")
+    assert " ".join(more.partition("## ")[0].split()) == " ".join(text.split())
+    assert "## TTSC fault of one" in more
+
+
 def test_figure_has_a_panel_for_each_quantity():
     """Four logarithmic panels, every exchange in the legend; one step alone is refused."""
     fig = study.figure(rows())
@@ -97,6 +118,7 @@ def test_the_staircase_of_the_paper_s_step_is_near_the_regulator_s_mode():
         (["--steps", "7"], "does not divide 80 ms"),
         (["--steps", "ten"], "numbers in ms"),
         (["--steps", "10,40", "--page", "x.md"], "20 ms"),
+        (["--events", "one", "--page", "x.md"], "--events both, or all"),
     ],
 )
 def test_the_command_refuses_before_it_runs(arguments, words, capsys, tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.profiles.points import Points, Steps
 from apu_casadi.core.profiles.profile import varying
 from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
+from apu_casadi.core.results import phases
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -19,6 +20,8 @@ from apu_casadi.unit.monolithic import simulate_monolithic
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.severity import severity
 from scenarios import registry
+from scenarios.commands.run import table
+from scenarios.figures.runplots import stator_lane
 from scenarios.schema import Scenario
 
 UNIT = Apu()
@@ -376,3 +379,33 @@ def test_a_load_of_a_command_must_not_change(tmp_path, capsys):
     path.write_text("time,power_kW\n0,100\n1,200\n")
     assert main(["trim", "--load", f'kind = "R", power_kW = {{ file = "{path}" }}']) != 0
     assert "changes in time, and a steady state is of one instant" in capsys.readouterr().err
+
+
+INTERMITTENT = """
+name = "intermittent"
+duration = 0.4
+waveform_dt = 0
+[[phase]]
+name = "healthy"
+start = 0.0
+load = { kind = "R", power_kW = 100.0 }
+[[phase]]
+name = "on and off"
+start = 0.1
+fault = { mu = { on = 0.05, off = 0.0, frequency = 10.0, duty = 0.4 }, k_rf = 20.0, phase = "b" }
+"""
+
+
+def test_a_fault_that_is_over_at_the_end_of_a_phase_is_told():
+    """In the summary as the worst of it, in figures where and when it was."""
+    ds = registry.run(Scenario.from_toml_text(INTERMITTENT))
+    first, second = registry.summary(ds)["phases"]
+    assert first["worst"] is None and second["mu"] == 0.0
+    assert second["worst"]["mu"] == 0.05 and second["worst"]["fault_phase"] == "b"
+    text = table([first, second])
+    assert "0, 5 at worst" in text and "20 at worst" in text
+    lane = stator_lane(ds, phases(ds), 1)
+    begins = [a for a, _, words, _ in lane if words.startswith("TTSC")]
+    assert_allclose(begins, [0.1, 0.2, 0.3], atol=1e-9)
+    ends = [b for _, b, words, _ in lane if words.startswith("TTSC")]
+    assert_allclose(ends, [0.14, 0.24, 0.34], atol=1e-9)

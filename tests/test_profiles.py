@@ -114,6 +114,8 @@ def test_a_file_gives_a_column(tmp_path):
         ("time,height\n0,1\n", "row 1: no column 'altitude' (valid: time, height)"),
         ("time,Altitude\n0,1\n", "row 1: no column 'altitude' (did you mean 'Altitude'?)"),
         ("t,altitude\n0,1\n", "row 1: no column 'time'"),
+        ("sep=,\ntime,altitude\n0,1\n", "row 1: delete this line, and put commas between"),
+        ("time,altitude [ft]\n0,1\n", "row 1: column 'altitude [ft]' has a unit; profiles are in"),
         ("time;altitude\n0;1\n", "row 1: cells must be separated by commas, not semicolons"),
         ("time,altitude,altitude\n0,1,2\n", "row 1: column 'altitude' stands 2 times"),
         ("time,altitude\n0,1\n1,x\n", "row 3, column 'altitude': a number is expected, got 'x'"),

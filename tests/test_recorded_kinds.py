@@ -125,6 +125,8 @@ LAYOUTS = {
     "a word at the end": (text() + "\nEnd of data\n", "line 15 below the data left out"),
     "empty rows": (text() + ",,,,,\n,,,,,\n", "an empty row is left out, of 2 in all"),
     "two of a name": (text().replace("\n", ",1,2\n").replace("],1,2", "],a,a"), None),
+    "typographic minus": (
+        text().replace("\n", ",\u22121.5\n").replace("],\u22121.5", "],dT_isa [K]"), "U+2212"),
     "turns": (text(names=["N [U/min]", *NAMES[1:]]), None),
     "thousand turns": (text(names=["N [krpm]", *NAMES[1:]]).replace("36050.500", "36.0505"), None),
 }  # fmt: skip

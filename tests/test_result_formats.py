@@ -6,6 +6,7 @@ from numpy.testing import assert_array_equal
 
 from apu_casadi.core import resultformats, results
 from apu_casadi.core.errors import DataError, ParameterError
+from estimators.apu.recordings.measured import read_recording
 from scenarios import cli, registry
 
 pd = pytest.importorskip("pandas")
@@ -64,6 +65,35 @@ def test_mat_has_units_and_attributes(ds, tmp_path):
     found = loadmat(path, squeeze_me=True, simplify_cells=True)
     assert_array_equal(found["v_a"], ds["v_a"])
     assert found["units"]["T4"] == "K" and found["about"]["seed"] == 3
+
+
+@pytest.mark.parametrize("form", ["nc", "nc4", "csv", "parquet", "mat"])
+def test_every_format_is_read_again(ds, tmp_path, form):
+    """By ``results.load``, and as a recording, whose currents are the same numbers."""
+    pytest.importorskip("pyarrow" if form == "parquet" else "h5netcdf")
+    path, *_ = resultformats.save_as(ds, tmp_path / "r", form)
+    back = results.load(path)
+    digits = {"csv": 1e-11, "nc4": 6e-8}.get(form, 0)
+    for n in ("T4", "i_a", "time_w"):
+        np.testing.assert_allclose(back[n], ds[n], rtol=digits, atol=0 if digits < 1e-9 else 1e-4)
+        assert back[n].attrs["units"] == ds[n].attrs["units"]
+    two = back["v_a_2"] if "v_a_2" in back else back["v_a"][1]
+    np.testing.assert_allclose(two, ds["v_a"][1], rtol=digits, atol=1e-4 if digits else 0)
+    data = read_recording(path)
+    np.testing.assert_array_equal(data["T4"].values, back["T4"])
+
+
+def test_other_files_are_told(tmp_path):
+    for name, text, words in (
+        ("a.csv", "x;y\n1;2\n", "a column 'time \\[s\\]' is expected; recordings of other"),
+        ("b.csv", "time,T4\n0,hot\n", "column T4: no numbers"),
+        ("c.csv", "", "damaged"),
+        ("d.mat", "none", "damaged MAT file"),
+        ("e.parquet", "none", "damaged"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(DataError, match=words):
+            results.load(tmp_path / name)
 
 
 def test_refusals(ds, tmp_path, monkeypatch, capsys):

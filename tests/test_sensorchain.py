@@ -164,3 +164,28 @@ def test_sequences_of_clipped_phases_and_what_they_know():
         z.append(np.mean(np.abs((s.unbalance - 0.01) / s.sigma) ** 2) / 2)
     assert np.sqrt(np.mean(z)) == pytest.approx(1.0, abs=0.15)
     assert s.sigma.mean() > 1.3 * full.sigma.mean()
+
+
+def test_sensors_of_one_clock_share_the_errors_of_their_instants():
+    """Readings of one wave are alike but for noise; a filter takes n times the variance."""
+    s = dataclasses.replace(V_A, jitter=5e-6, clock="adc")
+    other = dataclasses.replace(s, name="v_b")
+    one, two = (sampled_wave(x, t, WAVE, Draws(4, machine=m)) for x, m in ((s, 1), (other, 2)))
+    assert np.array_equal(one[inner], two[inner])
+    alone = dataclasses.replace(other, clock="")
+    assert not np.array_equal(one[inner], sampled_wave(alone, t, WAVE, Draws(4))[inner])
+    own = ELECTRICAL
+    for n in ("i_a", "i_b", "v_a"):
+        own = changed(own, n, jitter=5e-6, clock="adc")
+    own = changed(own, "i_c", jitter=5e-6)
+    d = as_declared(read_recording({"t": t, "i_a": WAVE, "i_b": WAVE, "i_c": WAVE}), GAS_PATH, own)
+    now = d.electrical
+    assert now["i_a"].jitter == pytest.approx(5e-6 * np.sqrt(2)) and now["i_c"].jitter == 5e-6
+    # whatever the slopes of the channels, the shared error is covered: n diag(a^2) - a a' >= 0
+    a = np.random.default_rng(0).standard_normal((50, 6))
+    for v in a:
+        assert np.linalg.eigvalsh(6 * np.diag(v**2) - np.outer(v, v)).min() > -1e-12
+    both = changed(changed(GAS_PATH, "P3", jitter=1e-3, clock="x"), "T5", jitter=1e-3, clock="x")
+    slow = np.arange(0, 4, 0.02)
+    d = as_declared(read_recording({"t": slow, "P3": 8e5 + slow, "T5": 900 + slow}), both, own)
+    assert d.gas_path["P3"].jitter == pytest.approx(1e-3 * np.sqrt(2))

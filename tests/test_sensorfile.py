@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import DataError, ParameterError
+from estimators.apu.electrical.hypotheses import SeverityPrior
 from estimators.apu.priorfile import read_prior
 from estimators.apu.recordings.measured import read_recording
 from estimators.apu.sensorfile import KEYS, TABLED, SensorFile, read_sensors, sensor_schema, to_toml
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, KNOWN, Sensor, SensorSet, unregister
+from estimators.apu.unknowns import UNKNOWNS
 from scenarios import cli
 
 OWN = """
@@ -174,6 +176,34 @@ def test_a_prior_file(tmp_path):
             read_prior(path)
 
 
+def test_a_prior_file_of_generators(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text(
+        "[machine.r_s]\nmean = 0.005\nsigma = 0.02\n[machine.eta_sg]\nsigma = 0\n"
+        "[delay_i]\nsigma = 2e-6\n[h]\nprobability = 0.01\n[h_b]\nmean = 3e-4\nsigma = 1e-4\n"
+    )
+    p = read_prior(path)
+    known = p.unknowns()
+    assert p.values() == {"machine.r_s": 0.005}
+    assert known["machine.r_s"].sigma == 0.02 and known["machine.eta_sg"].how == "known"
+    assert known["delay_i"].sigma == 2e-6 and known["machine.r_fd"] == UNKNOWNS["machine.r_fd"]
+    usual = SeverityPrior()
+    s = p.severity()
+    assert s.probability == 0.01 and s.mean == (0.0, 3e-4, 0.0)
+    assert s.scale == (usual.scale[0], 1e-4, usual.scale[2])
+    assert (p.of_gas_path().mean, p.of_gas_path().sigma) == ({}, {})
+    for text, words in (
+        ("[h]\nprobability = 1.0", "probability = 1.0; a probability in"),
+        ("[h_a]\nprobability = 0.1", "h_a: unknown key 'probability'"),
+        ("[machine.r_s]\nsigma = -1", "sigma must be a number > 0, got -1"),
+        ("[delay_i]\nmean = 1e-6", "declare it in the file of sensors"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=words):
+            wrong = read_prior(path)
+            (wrong.severity(), wrong.values())
+
+
 def test_commands(tmp_path, capsys):
     path = tmp_path / "own.toml"
     path.write_text(OWN)
@@ -192,3 +222,30 @@ def test_identify_takes_a_file(tmp_path, capsys):
     assert cli.main(["identify", "--sensors", str(path), "--gain-errors", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert "EGT" in found["sensors"] and "PW" not in found["sensors"]
+
+
+def test_one_generator_has_sensors_of_its_own(tmp_path):
+    """What is said of i_a_2 holds for that one; the file of the set reads the same again."""
+    path = tmp_path / "two.toml"
+    path.write_text(
+        "[i_a_2]\ngain = 0.02\n[i_a]\nnoise = 2.0\n[v_b_1]\nclock = 'adc'\njitter = 1e-6\n"
+    )
+    made = read_sensors(path)
+    e = made.electrical
+    assert e.numbered == (1, 2) and e["i_a_2"].noise == 2.0
+    one, two = e.machine(1), e.machine(2)
+    assert one.names == two.names == ELECTRICAL.names
+    assert (one["i_a"].gain, two["i_a"].gain) == (0.005, 0.02)
+    assert (one["v_b"].clock, two["v_b"].clock) == ("adc", "")
+    assert e.of_channel("i_a_2") is e["i_a_2"] and e.of_channel("i_a_3") is e["i_a"]
+    assert e.of_channel("v_b") is e["v_b_1"] and e.of_channel("x") is None
+    assert ELECTRICAL.machine(2) is ELECTRICAL
+    path.write_text(to_toml(made))
+    again = read_sensors(path).electrical.machine(2)
+    assert [(s.name, s.noise, s.gain) for s in again.sensors] == [
+        (s.name, s.noise, s.gain) for s in two.sensors
+    ]
+    path.write_text("[i_d_2]\nnoise = 1")
+    with pytest.raises(DataError, match="unknown sensor 'i_d_2'"):
+        read_sensors(path)
+    assert sensor_schema()["patternProperties"]

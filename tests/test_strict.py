@@ -17,8 +17,9 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.departures import REMEDIES
 from apu_casadi.unit.events import LoadChange
+from apu_casadi.unit.monolithic import simulate_monolithic
 from apu_casadi.unit.multirate import simulate_joint
-from apu_casadi.unit.validity import unserved
+from apu_casadi.unit.validity import fuel_limited, unserved
 from scenarios import registry
 from scenarios.cli import main
 from scenarios.commands.run import made_with
@@ -29,6 +30,9 @@ KW100, KW225 = SeriesLoad.from_power(100e3), SeriesLoad.from_power(225e3)
 HOT = SeriesLoad.from_power(285e3)
 LARGE = SeriesLoad.from_power(330e3)
 SHORT = SeriesLoad(R=(1e-3,) * 3)
+ALL = APU.change({"generator.power": "torque"})
+FULL = ConstantPowerLoad(500e3)
+COLD = Limits(T4_max=np.inf)
 TOML = """
 name = "hot"
 duration = 2.0
@@ -82,15 +86,58 @@ def test_one_machine_of_two_stops_it_by_number():
 
 
 def test_what_shows_at_the_end_only_is_refused_there():
-    """An exchange error beyond the limit."""
-    how = {"events": [LoadChange(0.5, KW225)], "dt": 0.08}
-    with pytest.raises(ValidityError, match=r"at t = 2 s: at the end of the run: exchange 'paper'"):
+    """An exchange error beyond the limit, of a transient that has not passed."""
+    how = {"events": [LoadChange(0.5, KW225)], "dt": 0.08, "duration": 0.8}
+    words = r"at t = 0.8 s: at the end of the run: exchange 'paper'"
+    with pytest.raises(ValidityError, match=words):
         run(**how, strict=True)
 
 
-ALL = APU.change({"generator.power": "torque"})
-FULL = ConstantPowerLoad(500e3)
-COLD = Limits(T4_max=np.inf)
+@pytest.mark.parametrize("solver", ["auto", "cvodes"])
+def test_an_exchange_that_errs_stops_it_when_the_transient_has_passed(solver):
+    """At the instant of the largest error, and not at the end of the run."""
+    how = {"events": [LoadChange(0.5, KW225)], "dt": 0.08, "solver": solver}
+    words = r"exchange 'paper' every 80 ms: estimated error [0-9]+ % .* so far; "
+    done = []
+    with pytest.raises(ValidityError, match=words) as caught:
+        run(**how, duration=60.0, strict=True, progress=lambda t, _: done.append(t))
+    assert 0.5 < caught.value.t < 1.5 and done[-1] < 4.0
+    with pytest.warns(ApuWarning) as raised:
+        ds = run(**how, duration=1.6)
+    assert f"{100 * ds.attrs['exchange_error']:.0f} %" in str(caught.value)
+    assert len(raised) == 1
+
+
+@pytest.mark.parametrize(
+    "model", [simulate_joint, pytest.param(simulate_monolithic, marks=pytest.mark.long)]
+)
+def test_a_fuel_limit_stops_it_when_the_speed_has_fallen_for_long(model):
+    """Since when, and how low the speed is; the run that goes on tells the same at its end."""
+    done, events = [], [LoadChange(0.1, SeriesLoad.from_power(308e3))]
+    how = {"load": KW225, "events": events, "limits": Limits.none()}
+    if model is simulate_joint:
+        how["waveform_dt"] = None
+    words = r"asks for more than the engine gives: at t = .* since t = .* and the speed still falls"
+    with pytest.raises(ValidityError, match=words) as caught:
+        model(APU, duration=2.0, **how, strict=True, progress=lambda t, _: done.append(t))
+    since = caught.value.t
+    assert 0.1 < since < 0.5 and since < done[-1] < since + 0.5  # before the step that stops it
+    with pytest.warns(ValidityWarning, match=rf"since t = {since:.6g} s"):
+        model(APU, duration=since + 0.3, **how)
+
+
+def test_a_fuel_limit_that_lasted_within_a_run_is_told():
+    """Half a second of falling speed at the limit, and a recovery; a shorter one is no reason."""
+    t, high = np.arange(0.0, 2.0, 0.02), APU.governor.Wf_max
+    N = APU.N_ref * (1 - 0.01 * np.clip(t - 0.5, 0.0, 0.6))
+    N[t > 1.1] += 0.1
+    Wf = np.where((t > 0.51) & (t < 1.11), high, 0.5 * high)
+    d = fuel_limited(APU, t, N, Wf)
+    assert (d.first, d.at, d.kind) == (pytest.approx(0.52), pytest.approx(1.1), "fuel_limit")
+    assert "at t = 1.1 s the governor is at its limit" in d.text()
+    assert fuel_limited(APU, t, N, np.where(t < 1.0, Wf, 0.5 * high)) is None
+
+
 EACH = {
     "temperature": ({"limits": Limits(T4_max=1150.0)}, [LoadChange(0.1, KW225)]),
     "surge": ({"limits": Limits(SM_min=0.2)}, [LoadChange(0.1, KW225)]),
@@ -124,7 +171,7 @@ def test_every_kind_is_data_and_stops_a_strict_run(kind):
     assert REMEDIES[kind] in text and text.endswith("the run goes on, with a warning")
     if kind == "exchange":
         assert d["first"] is None and d["worst"] == ds.attrs["exchange_error"] > d["limit"]
-        assert caught.value.t == end
+        assert 0.5 < caught.value.t < end
     elif kind == "unserved":  # it has to last before it is told
         assert d["first"] <= caught.value.t <= d["first"] + 0.15 and "asked of generator 2" in text
     else:

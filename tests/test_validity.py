@@ -387,7 +387,7 @@ def test_attributes_tell_what_was_asked(apu):
     assert json.loads(ds.attrs["faults"])[1]["phase"] == "b" and ds.attrs["seed"] == 7
     assert fault_phase(ds, 0.4) == " of phase b" and fault_phase(ds, 0.05) == ""
     words = made_with(ds)
-    for part in ("Load of each generator 215 kW", "ISA +5 K", "propagator", "seed 7"):
+    for part in ("Load of each generator: 215 kW", "ISA +5 K", "propagator", "seed 7"):
         assert part in words
     bare = ds.copy()
     bare.attrs = {}

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import files, netcdf3, netcdf4
+from apu_casadi.core import files, netcdf3, netcdf4, tablefiles
 from apu_casadi.core.errors import DataError, SignalError, nearest
 from apu_casadi.core.filearrays import is_lazy
 
@@ -210,6 +210,9 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
 def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
     """Read a dataset that :func:`save` wrote, or another one in netCDF 3 or 4.
 
+    CSV, Parquet and MAT files of results are read by their ending, the table of waveforms beside
+    that of a run with it; what each generator has of its own is then a variable for each.
+
     Args:
         path: of the file.
         lazy: read values when they are asked for, each time anew, so that a file larger than memory
@@ -219,6 +222,8 @@ def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
         DataError: the file is missing, is no netCDF file, or is damaged; netCDF 4 without h5netcdf.
     """
     path = Path(path)
+    if path.suffix.lower() in tablefiles.ENDINGS:
+        return tablefiles.read(path)
     start, size = files.beginning(path, 8)
     if start.startswith(netcdf4.MARK):
         return netcdf4.read(path)
@@ -360,6 +365,7 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
     extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
     its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
     (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
+    the same of the ``worst`` fault in it, None without one;
     and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
     Where generators differ, all that is of a generator is in ``generators`` instead: a list with
     one table for each, which has its number as ``generator``.
@@ -399,7 +405,10 @@ def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
         end = int(np.flatnonzero(tail)[-1])
         row.update({v: float(col[v][end]) for v in _HEALTH})
         of_each = [
-            _of_one(each[k], tail, end) | _held(ds, each[k], end, p["end"], k) for k in numbers
+            _of_one(each[k], tail, end)
+            | _held(ds, each[k], end, p["end"], k)
+            | _worst(ds, each[k], whole, p["end"], k)
+            for k in numbers
         ]
         if GENERATOR in ds.coords:
             row["generators"] = [
@@ -419,6 +428,19 @@ def _of_one(col: _Columns, tail: np.ndarray, end: int) -> dict[str, Any]:
     more = [v for v in _UNBALANCE if v in col.ds]  # files of before lack them
     means = {v: float(np.mean(col[v][tail])) for v in (*_MEANS_OF_EACH, *more)}
     return means | severity(*(float(col[v][end]) for v in _SEVERITY))
+
+
+def _worst(
+    ds: xr.Dataset, col: _Columns, whole: np.ndarray, t: float, number: int
+) -> dict[str, Any]:
+    """Return the severity of a generator's worst fault in a phase, which may be over at its end."""
+    rows = np.flatnonzero(whole & (col["mu"] > 0))
+    if not rows.size:
+        return {"worst": None}
+    h = severity_h(*(np.asarray(col[v])[rows] for v in ("mu", "k_rf")))
+    k = int(rows[int(np.argmax(h))])
+    phase = _holding(ds, "faults", "phase", t, number)
+    return {"worst": severity(*(float(col[v][k]) for v in _SEVERITY)) | {"fault_phase": phase}}
 
 
 def _held(ds: xr.Dataset, col: _Columns, end: int, t: float, number: int) -> dict[str, Any]:

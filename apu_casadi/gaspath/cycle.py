@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.rootfinding import solve_bordered
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.atmosphere import Ambient, ambient
@@ -253,6 +254,8 @@ class Cycle(Parametric):
         args: Mapping[str, ca.SX],
         point: Point,
         outputs: Callable[[Assembled], Mapping[str, Any]],
+        *,
+        reciprocals: bool = False,
     ) -> ca.Function:
         """Make a function that evaluates the cycle at a point given by its arguments.
 
@@ -262,6 +265,8 @@ class Cycle(Parametric):
             point: where to evaluate the cycle, SX expressions of the arguments.
             outputs: what to return, by name, made from the cycle at the point; what of it is not
                 used costs nothing.
+            reciprocals: divide once by each number; for a Newton step, whose last bits do not
+                matter (:mod:`apu_casadi.core.reciprocals`).
 
         Returns:
             MX function args -> outputs, dense.  It finds the map cells and calls one SX function.
@@ -276,6 +281,8 @@ class Cycle(Parametric):
         free = [k != "c" or not self.held for k in args]
         smooth = {"is_diff_in": [*free, *[False] * len(cells)]}
         inner = ca.Function(f"{name}_sx", [*given, *cells], values, smooth)
+        if reciprocals:
+            inner = by_reciprocals(inner)
         find = ca.Function("find", given, ca.cse(where.call([*point])))
         read = ca.Function("read", [*given, cells[0]], ca.cse(flow.call([*point, cells[0]])))
         q = [ca.MX.sym(k, *s.shape) for k, s in args.items()]

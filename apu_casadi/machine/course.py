@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -36,6 +36,8 @@ TOL = 1e-8  # largest error of transition matrices between nodes, nominal units;
 DEEPEST = 16  # times that an interval may be halved
 #: Products of numbers up to which BLAS does not start threads; with them, waiting takes longer.
 _ONE_THREAD = 250_000
+_NEAR = 4  # degree of polynomials over a small part of an interval ...
+_EQUAL = 1e-12  # ... and their largest error, as of ``TOL``
 _INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 
 F = TypeVar("F", MeanStep, Propagator)
@@ -65,6 +67,7 @@ class Piece(Generic[F]):
         fast: propagates; its numbers are to be replaced.
         middle, half: of the interval.
         powers: coefficients of Chebyshev polynomials, (degree + 1, numbers).
+        weights: of errors of the numbers, which make them nominal or relative.
         nodes, rates: values of the coordinate, and the largest rate of change of a transition
             matrix there, nominal units.
     """
@@ -73,6 +76,7 @@ class Piece(Generic[F]):
     middle: float
     half: float
     powers: np.ndarray
+    weights: np.ndarray
     nodes: np.ndarray
     rates: np.ndarray
     buffers: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
@@ -91,6 +95,27 @@ class Piece(Generic[F]):
         for k in range(0, made.shape[1], size):
             np.matmul(basis, self.powers[:, k : k + size], out=made[:, k : k + size])
         return made.T
+
+    def near(self, low: float, high: float) -> Piece[F]:
+        """Return polynomials of a low degree over a part of the interval, or itself.
+
+        They take less sums, for many values that lie near each other, and must be equal to
+        ``_EQUAL``.
+        """
+        middle, half, degree = (low + high) / 2, (high - low) / 2, _NEAR
+        if not half > 0:
+            powers = self.at(np.array([middle])).T.copy()
+            return replace(self, middle=middle, half=1.0, powers=powers, buffers={})
+        if self.powers.shape[0] <= degree + 1:
+            return self
+        nodes, between = _lobatto(degree), np.array([-0.8, 0.3])
+        values = self.at(middle + half * np.append(nodes, between)).T
+        fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
+        powers = fit @ values[: degree + 1]
+        off = np.polynomial.chebyshev.chebvander(between, degree) @ powers - values[degree + 1 :]
+        if not (np.abs(off) * self.weights).max() <= _EQUAL:
+            return self
+        return replace(self, middle=middle, half=half, powers=powers, buffers={})
 
 
 class Course(Generic[F]):
@@ -150,10 +175,20 @@ class Course(Generic[F]):
     def numbers(self, t: np.ndarray, before: float | None = None) -> tuple[F, Numbers]:
         """Return what propagates over steps whose middles are ``t``, s, and its numbers.
 
-        The next call overwrites the numbers.
+        The next call overwrites the numbers.  Arguments and errors as of :meth:`blocks`.
+        """
+        fast, blocks = self.blocks(t, before, t.size)
+        return fast, next(blocks)
+
+    def blocks(
+        self, t: np.ndarray, before: float | None, width: int
+    ) -> tuple[F, Iterator[Numbers]]:
+        """Return what propagates over steps, and its numbers in blocks.
 
         Args:
+            t: middles of the steps, s.
             before: the middle of the step before them, if the first goes on from it.
+            width: steps in a block, whose numbers the next one overwrites.
 
         Raises:
             NotApplicable: the numbers change too fast from step to step, have no polynomial, or
@@ -162,11 +197,10 @@ class Course(Generic[F]):
         s = self._coordinate(np.asarray(t, dtype=float))
         pieces = [self._piece(float(v)) for v in (s.min(), s.max())]
         alone = pieces[0] is pieces[1]
-        if not alone:
-            pieces = [self._piece(float(v)) for v in s]
-        fast, width = pieces[0].fast, pieces[0].powers.shape[1]
+        pieces = pieces[:1] if alone else [self._piece(float(v)) for v in s]
+        fast, size = pieces[0].fast, pieces[0].powers.shape[1]
         # as many harmonics of the rotor angle, too, which a layout need not tell
-        if any(p.fast.layout != fast.layout or p.powers.shape[1] != width for p in pieces[1:]):
+        if any(p.fast.layout != fast.layout or p.powers.shape[1] != size for p in pieces[1:]):
             raise NotApplicable(f"{self.ss.name}: the structure changes on the way")
         first = s[0] if before is None else self._coordinate(np.array([before]))[0]
         jump = self._jump(pieces, s, float(first))
@@ -176,14 +210,24 @@ class Course(Generic[F]):
                 f"in a step, {fast.smooth:g} at most"
             )
         if alone:
-            values = pieces[0].at(s)
-        else:
-            columns = [p.at(s[k : k + 1]).copy() for k, p in enumerate(pieces)]
-            values = np.concatenate(columns, axis=1)
+            one = pieces[0].near(float(s.min()), float(s.max())) if s.size > width else pieces[0]
+            pieces = [one] * s.size
+        return fast, self._blocks(pieces, s, width)
+
+    def _blocks(self, pieces: list[Piece[F]], s: np.ndarray, width: int) -> Iterator[Numbers]:
+        """Yield the numbers of steps, each of its piece."""
+        fast = pieces[0].fast
         a = fast.vector.size
         b = a + len(self.ss.u)
         c = b + fast.theta.size
-        return fast, Numbers(values[:a], values[a:b], values[b:c], values[c:])
+        for k in range(0, s.size, width):
+            at = slice(k, k + width)
+            if all(p is pieces[k] for p in pieces[at]):
+                values = pieces[k].at(s[at])
+            else:
+                each = zip(pieces[at], s[at, None], strict=True)
+                values = np.concatenate([p.at(v).copy() for p, v in each], axis=1)
+            yield Numbers(values[:a], values[a:b], values[b:c], values[c:])
 
     def _jump(self, pieces: list[Piece[F]], s: np.ndarray, first: float) -> float:
         """Return a bound of the largest change of a transition matrix from step to step."""
@@ -237,16 +281,13 @@ class Course(Generic[F]):
             fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
             powers = fit @ values[: degree + 1]
             off = np.polynomial.chebyshev.chebvander(between, degree) @ powers
-            error = np.abs(off - values[degree + 1 :])
-            n = fast.vector.size
-            own = (error[:, :n] * fast.units).max()
-            scale = np.abs(values[:, n:]).max(axis=0) + 1e-300
-            rest = float((error[:, n:] / scale).max()) if scale.size else 0.0
-            if max(own, rest) <= TOL:
-                slope = np.polynomial.chebyshev.chebder(powers[:, :n]) * fast.units / reach
+            n, units = fast.vector.size, fast.units
+            weights = np.append(units, 1 / (np.abs(values[:, n:]).max(axis=0) + 1e-300))
+            if (np.abs(off - values[degree + 1 :]) * weights).max() <= TOL:
+                slope = np.polynomial.chebyshev.chebder(powers[:, :n]) * units / reach
                 rates = np.abs(np.polynomial.chebyshev.chebvander(nodes, degree - 1) @ slope)
                 at = middle + reach * nodes
-                return Piece(fast, middle, reach, powers, at, rates.max(axis=1))
+                return Piece(fast, middle, reach, powers, weights, at, rates.max(axis=1))
         return None
 
     def _table(

@@ -12,7 +12,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TYPE_CHECKING, ClassVar, Generic, NamedTuple, TypeVar
 
 import casadi as ca
@@ -174,8 +176,15 @@ class Integrator:
         """Return what propagates, where many steps may be one function; else NotApplicable."""
         raise NotApplicable("exact propagation does not hold, or is not asked for")
 
-    def columns(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
-        """Return what propagates over steps with these middles, s, and its numbers in each."""
+    def columns(
+        self, t: np.ndarray, before: float, width: int
+    ) -> tuple[MeanStep | Propagator, Iterator[Numbers]]:
+        """Return what propagates over steps with these middles, s, and its numbers.
+
+        Args:
+            before: middle of the step before, s.
+            width: steps of which numbers come at once.
+        """
         raise NotApplicable("exact propagation does not hold, or is not asked for")
 
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,22 +239,22 @@ class _Exact(Integrator, Generic[F]):
     def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> F:
         raise NotImplementedError
 
-    def _numbers(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
+    def _numbers(self, t: np.ndarray, before: float, width: int) -> tuple[F, Iterator[Numbers]]:
         """Return what propagates along the way over steps with these middles, s."""
         assert self._way is not None
         if self._course is None:
             p, (load, fault, end) = self.phase, self._way
             self._course = Course(p.gen, p.ss, load, fault, self._prepare, end)
-        return self._course.numbers(t, before)
+        return self._course.blocks(t, before, width)
 
-    def columns(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
-        """Return what propagates over steps with these middles, s, and its numbers in each."""
+    def columns(self, t: np.ndarray, before: float, width: int) -> tuple[F, Iterator[Numbers]]:
+        """Return what propagates over steps with these middles, s, and its numbers."""
         if self._way is not None:
-            return self._numbers(t, before)
+            return self._numbers(t, before, width)
         fast, p = self.for_blocks(), self.phase
         severity = () if p.fault is None else tuple(p.fault.severity.values())
         each = (fast.vector, p.u, fast.theta, np.array(severity))
-        return fast, Numbers(*(np.repeat(a[:, None], t.size, axis=1) for a in each))
+        return fast, repeat(Numbers(*(np.repeat(a[:, None], width, axis=1) for a in each)))
 
     def fast(self) -> F:
         """Return what propagates.
@@ -277,7 +286,8 @@ class _Exact(Integrator, Generic[F]):
         if self._way is None:
             return self.fast()
         middle = step.t0 + step.h / 2
-        fast, now = self._numbers(np.array([middle]), middle - min(step.since, step.h))
+        fast, numbers = self._numbers(np.array([middle]), middle - min(step.since, step.h), 1)
+        now = next(numbers)
         fast.put(now.vector[:, 0], now.theta[:, 0])
         return fast
 
@@ -376,9 +386,11 @@ class Samples(_Exact[Propagator]):
         """Return what propagates, where the coefficients are constant."""
         return _constant(self.fast())
 
-    def columns(self, t: np.ndarray, before: float) -> tuple[Propagator, Numbers]:
+    def columns(
+        self, t: np.ndarray, before: float, width: int
+    ) -> tuple[Propagator, Iterator[Numbers]]:
         """Return what propagates over steps, where the coefficients are constant."""
-        fast, now = super().columns(t, before)
+        fast, now = super().columns(t, before, width)
         return _constant(fast), now
 
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,11 +10,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.lanes.together import asking
 from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.gaspath.conditions import AMBIENT
@@ -24,7 +26,7 @@ from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Event, Holding, Jump
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.integrators import Settings
-from apu_casadi.unit.jointstep import BLOCK
+from apu_casadi.unit.jointstep import BLOCK, LONG
 from apu_casadi.unit.machines import Inputs, Machines
 from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
@@ -40,6 +42,7 @@ class Asked:
         grid: exchange instants, s.
         phasors, noise, seed, hook: as there.
         settled: whether loads and faults have been there for long.
+        strict: whether each block is judged before the next one.
     """
 
     start: Holding
@@ -49,10 +52,11 @@ class Asked:
     seed: int | None
     hook: Callable[[int, np.ndarray], np.ndarray] | None
     settled: bool = False
+    strict: bool = False
 
 
 class Columns:
-    """Inputs of the unit in each step of a block, while the same profiles hold.
+    """Inputs of the unit in each of some steps, while the same profiles hold.
 
     Args:
         gg, now, here: gas generator, what holds, and its numbers at some instant.
@@ -62,8 +66,8 @@ class Columns:
     def __init__(self, gg: GasGenerator, now: Holding, here: Holding, shaft: Link) -> None:
         u = gg.U.pack(**{n: getattr(here.ambient, n) for n in AMBIENT}, Wf=0.0, PW=0.0)
         full = gg.full(gg.THETA.pack(here.factors))
-        u, full = (np.repeat(a[:, None], BLOCK, axis=1) for a in (u, full))
-        self._given = Inputs(u, full, np.full(BLOCK, shaft.N_ref))
+        self._start = Inputs(u[:, None], full[:, None], np.full(1, shaft.N_ref))
+        self._given = self._start
         day = now.ambient.profiles if isinstance(now.ambient, Varying) else {}
         self._day = [(gg.U.index(n), p) for n, p in day.items()]
         health = {n: v for n, v in now.factors.items() if isinstance(v, Profile)}
@@ -75,6 +79,8 @@ class Columns:
 
         The next call overwrites the inputs.
         """
+        if self._given.N_ref.size != t.size:
+            self._given = Inputs(*(np.repeat(a, t.size, axis=-1) for a in self._start))
         given = self._given
         factors = dict(self._factors) if self._health else self._factors
         for i, profile in self._day:
@@ -132,8 +138,9 @@ class JointRun:
         self.governor = apu.governor.start(float(gas["Wf"]))
         self.slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
         self._gas_step = gg.stepper if settings.fast else None
-        by_blocks = settings.exact and asked.hook is None and not asked.noise.N
-        self._ways = (self._block, self._step) if by_blocks else (self._step,)
+        self._by_blocks = settings.exact and asked.hook is None and not asked.noise.N
+        off = np.abs(np.diff(asked.grid) - settings.dt) > SAME_INSTANT
+        self._odd = np.append(np.flatnonzero(off), off.size)  # steps of other lengths, and the end
 
     def at_start(self) -> Row:
         """What is recorded of the first instant."""
@@ -166,13 +173,19 @@ class JointRun:
         return self.machines.switch(self.now, here, t, switched=switched)
 
     def advance(self, k: int, until: float) -> tuple[int, Row]:
-        """Go on by a block of exchange steps, or by one."""
-        grid = self.asked.grid
-        free = k + BLOCK < grid.size and grid[k + BLOCK] <= until + SAME_INSTANT
-        return first_able(self._ways if free else self._ways[-1:], k)
+        """Go on by blocks of exchange steps, by one block, or by one step."""
+        grid, ways = self.asked.grid, [self._step]
+        if self._by_blocks:
+            free = int(np.searchsorted(grid, until + SAME_INSTANT, side="right")) - 1
+            free = min(free, int(self._odd[np.searchsorted(self._odd, k)])) - k
+            waves = self.settings.waveform_dt is not None
+            most = BLOCK if waves or self.asked.strict or asking() else LONG
+            sizes = dict.fromkeys((min(free, most) // BLOCK * BLOCK, BLOCK))
+            ways[:0] = [partial(self._blocks, steps=n) for n in sizes if 0 < n <= free]
+        return first_able(ways, k)
 
-    def _block(self, k: int) -> tuple[int, Row]:
-        grid, factors = self.asked.grid[k : k + BLOCK + 1], self.here.factors
+    def _blocks(self, k: int, steps: int) -> tuple[int, Row]:
+        grid, factors = self.asked.grid[k : k + steps + 1], self.here.factors
         state = self.x, self.z, self.governor
         if self._changing:
             if self._columns is None:
@@ -180,12 +193,15 @@ class JointRun:
             middles = (grid[1:] + grid[:-1]) / 2
             unit, factors = self._columns(middles)
             done, made = self.machines.follow(*state, unit, grid, self._middle)
-            self._middle = float(middles[-1])
+            steps = done.y.shape[1]
+            self._middle = float(middles[steps - 1])
+            if steps < middles.size:
+                factors = {n: v[:steps] if np.ndim(v) else v for n, v in factors.items()}
         else:
             done, made = self.machines.block(*state, self.u, self.theta, grid)
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
-        return BLOCK, self._row(done.y, made, factors)
+        return done.y.shape[1], self._row(done.y, made, factors)
 
     def _row(
         self, y: np.ndarray, made: list[MachineMade], factors: Mapping[str, Any] | None = None

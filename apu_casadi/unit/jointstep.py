@@ -13,8 +13,8 @@ Gains and limits of the governor, gearbox and governed speed are inputs of the f
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
+from itertools import pairwise, repeat
 from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
@@ -32,34 +32,37 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 
 BLOCK = 10  # exchange steps in one call
+LONG = 200  # at most in a row of calls, whose results are handed on together
 
 
 Fast: TypeAlias = Propagator | MeanStep
 
 
 class MachineBlock(NamedTuple):
-    """What a block of exchange steps gave of equal generators.
+    """What blocks of exchange steps gave of equal generators.
 
     Args:
         x: state at the end.
-        means: over each step, shape (quantities, BLOCK).
-        waves: samples, shape (outputs, BLOCK * n_out).
+        means: over each step, shape (quantities, steps).
+        w_r: electrical speed in each step, rad/s, (steps,).
+        waves: samples, shape (outputs, steps * n_out).
 
-    ``means`` and ``waves`` are overwritten by the thread's next block.
+    Those of a single block are overwritten by the thread's next one.
     """
 
     x: np.ndarray
     means: np.ndarray
+    w_r: np.ndarray
     waves: np.ndarray
 
 
 class BlockResult(NamedTuple):
-    """What a block of exchange steps gave.
+    """What blocks of exchange steps gave.
 
     Args:
         N, z, governor: states at the end: rotor speed (1,), cycle unknowns, governor.
-        y: gas generator's outputs after each step, shape (ny, BLOCK); overwritten by the thread's
-            next block.
+        y: gas generator's outputs after each step, shape (ny, steps); that of a single block is
+            overwritten by the thread's next one.
         machines: the generators, each group of equal ones once.
     """
 
@@ -187,15 +190,16 @@ class JointBlock(Rebuilt):
         theta: np.ndarray,
         x_sg: Sequence[np.ndarray],
         u_sg: Sequence[np.ndarray],
+        blocks: int = 1,
     ) -> BlockResult:
-        """Advance ``BLOCK`` steps; state and inputs of each group at the end of the arguments.
+        """Advance up to so many blocks with what :meth:`followed` takes, the same in each.
 
-        Raises:
-            NotApplicable: a check fails; step by step it is decided which, and what to do.
+        Args:
+            u_sg: inputs of each group.
         """
         full = self.apu.gas_generator.full(theta)
         held = [a for own, fixed in zip(u_sg, self._fixed, strict=True) for a in (own, *fixed)]
-        return self.followed(N, z, governor, x_sg, [u, full, *held])
+        return self.followed(N, z, governor, x_sg, repeat([u, full, *held], blocks))
 
     def followed(
         self,
@@ -203,36 +207,62 @@ class JointBlock(Rebuilt):
         z: np.ndarray,
         governor: tuple[float, ...],
         x_sg: Sequence[np.ndarray],
-        held: Sequence[Any],
+        held: Iterable[Sequence[Any]],
     ) -> BlockResult:
-        """Advance ``BLOCK`` steps with all that :func:`block_function` takes beside the state.
+        """Advance a block for each of ``held``, up to the first that is not right.
+
+        Args:
+            N, z, governor: states of the unit.
+            x_sg: state of each group.
+            held: all that :func:`block_function` takes beside the state.
 
         Raises:
-            NotApplicable: a check fails; step by step it is decided which, and what to do.
+            NotApplicable: the first is not; step by step it is decided why, and what to do.
         """
-        carry = np.concatenate([N, z, governor, *x_sg])
-        last, y, residual, *rest = self._call(carry, *held)
-        if not (np.all(residual <= RESIDUAL_TOL) and np.isfinite(last).all()):
-            raise NotApplicable("a step of the block is not right: the cycle's residual")
+        carry, made = np.concatenate([N, z, governor, *x_sg]), list[tuple[np.ndarray, ...]]()
+        for given in held:
+            if len(made) == 1:
+                made[0] = tuple([a.copy() for a in made[0]])  # views, which the next call changes
+            last, *out = self._call(carry, *given)
+            wrong = self._wrong(last, *out)
+            if wrong and not made:
+                raise NotApplicable(wrong)
+            if wrong:
+                break
+            carry = last.copy()
+            made.append(tuple([a.copy() for a in out]) if made else tuple(out))
+        y, _, *rest = (
+            c[0] if len(c) == 1 else np.concatenate(c, axis=1) for c in zip(*made, strict=True)
+        )
         ends = np.cumsum([0, N.size, z.size, self._n_gov, *self._n_x]).tolist()
-        # copied: the state stays when a later block is refused
-        N, z, x_gov, *x1 = (last[i:j].copy() for i, j in pairwise(ends))
-        made = []
-        for m, x, sampled in zip(self.machines, x1, self._sampled, strict=True):
-            means, (*miss, w_r), *rest = rest
+        N, z, x_gov, *x1 = (carry[i:j] for i, j in pairwise(ends))
+        groups = []
+        for x, sampled in zip(x1, self._sampled, strict=True):
+            means, (*_, w_r), *rest = rest
+            waves = np.empty((0, 0))
+            if sampled:
+                waves, *rest = rest
+            groups.append(MachineBlock(x, means, w_r, waves))
+        return BlockResult(N, z, tuple(x_gov.tolist()), y, groups)
+
+    def _wrong(
+        self, last: np.ndarray, _y: np.ndarray, residual: np.ndarray, *rest: np.ndarray
+    ) -> str:
+        """Return why a block cannot be taken; "" if it can."""
+        if not (residual.max() <= RESIDUAL_TOL and math.isfinite(last.sum())):
+            return "a step of the block is not right: the cycle's residual"
+        for m, sampled in zip(self.machines, self._sampled, strict=True):
+            (means, checks), rest = rest[:2], rest[2 + sampled :]
+            w_r = checks[-1]
             good = (
-                np.all(m.limits >= np.array(miss).T)
-                and np.isfinite(means).all()
+                (checks[:-1].max(axis=1) <= m.limits).all()
+                and math.isfinite(means.sum())
                 and m.valid(float(w_r.min()))
                 and m.valid(float(w_r.max()))
             )
             if not good:
-                raise NotApplicable(f"{m.ss.name}: a step of the block is not right")
-            waves = np.empty((0, 0))
-            if sampled:
-                waves, *rest = rest
-            made.append(MachineBlock(x, means, waves))
-        return BlockResult(N, z, tuple(x_gov.tolist()), y, made)
+                return f"{m.ss.name}: a step of the block is not right"
+        return ""
 
 
 def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: bool) -> Together:

@@ -7,7 +7,7 @@ exchange steps where all can, else by single steps, each with the integrator tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from apu_casadi.unit.apu import Apu, JointPoint, groups
 from apu_casadi.unit.departures import Departure
 from apu_casadi.unit.events import Event, HealthChange, Holding, who
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
-from apu_casadi.unit.jointstep import BlockResult, JointBlock
+from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
 from apu_casadi.unit.machinestep import MachineMade, MachineStep
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
@@ -189,7 +189,7 @@ class Machines:
         theta: np.ndarray,
         grid: np.ndarray,
     ) -> tuple[BlockResult, list[MachineMade]]:
-        """Advance the whole unit over the exchange steps of a block at once.
+        """Advance the whole unit over the exchange steps of blocks, as far as they go.
 
         Raises:
             NotApplicable: that is not possible here.
@@ -205,10 +205,11 @@ class Machines:
                 self._no_block = str(error)
                 raise
         states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
-        done = self._block(x, z, governor, u, theta, states, inputs)
-        N = float(x[0])
+        blocks = (grid.size - 1) // BLOCK
+        done = self._block(x, z, governor, u, theta, states, inputs, blocks)
+        grid = grid[: done.y.shape[1] + 1]
         pairs = zip(self.groups, done.machines, strict=True)
-        return done, [g.went_on(one, N, grid) for g, one in pairs]
+        return done, [g.went_on(one, grid) for g, one in pairs]
 
     def _check_block(self, grid: np.ndarray) -> None:
         if not all(g.settled for g in self.groups):
@@ -225,7 +226,7 @@ class Machines:
         grid: np.ndarray,
         before: float,
     ) -> tuple[BlockResult, list[MachineMade]]:
-        """Advance the whole unit over a block whose inputs have a column for each step.
+        """Advance the whole unit over blocks whose inputs have a column for each step.
 
         Args:
             before: the middle of the step before the block, s.
@@ -235,20 +236,31 @@ class Machines:
         """
         self._check_block(grid)
         middles = (grid[1:] + grid[:-1]) / 2
-        given = [g.columns(middles, before) for g in self.groups]
-        fast = [one for one, _ in given]
+        fast, numbers = zip(*(g.columns(middles, before) for g in self.groups), strict=True)
         layouts = [one.layout for one in fast]
         if self._wide is None or self._wide[0] != layouts:
             links = [g.link for g in self.groups]
             self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
-        held: list[Any] = [unit.u, unit.theta]
-        for g, (one, own) in zip(self.groups, given, strict=True):
-            numbers = g.numbers_of_link
-            numbers[0] = unit.N_ref
-            held += [own.u, own.theta, numbers, own.vector, one.dt]
-        done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held)
-        N, pairs = float(x[0]), zip(self.groups, done.machines, given, strict=True)
-        return done, [g.went_on(one, N, grid, own.severity) for g, one, (_, own) in pairs]
+        severity: list[list[np.ndarray]] = [[] for _ in self.groups]
+
+        def held() -> Iterator[list[Any]]:
+            for k, own in zip(
+                range(0, middles.size, BLOCK), zip(*numbers, strict=False), strict=False
+            ):
+                at = slice(k, k + BLOCK)
+                given: list[Any] = [unit.u[:, at], unit.theta[:, at]]
+                for g, one, now, kept in zip(self.groups, fast, own, severity, strict=True):
+                    link = g.numbers_of_link
+                    link[0] = unit.N_ref[at]
+                    kept.append(now.severity.copy())
+                    given += [now.u, now.theta, link, now.vector, one.dt]
+                yield given
+
+        done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held())
+        n = done.y.shape[1]
+        severe = [np.concatenate(kept, axis=1)[:, :n] for kept in severity]
+        pairs = zip(self.groups, done.machines, severe, strict=True)
+        return done, [g.went_on(one, grid[: n + 1], own) for g, one, own in pairs]
 
     def rows(self, made: Sequence[MachineMade]) -> list[Of]:
         """What is to be recorded of what the groups made."""

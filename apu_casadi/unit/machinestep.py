@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -195,8 +197,10 @@ class MachineStep:
         """Return what propagates over many steps at once; else NotApplicable."""
         return self._integrators[0].for_blocks()
 
-    def columns(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
-        """Return what propagates over the steps of a block, and what it takes in each.
+    def columns(
+        self, t: np.ndarray, before: float
+    ) -> tuple[MeanStep | Propagator, Iterator[Numbers]]:
+        """Return what propagates over the steps of blocks, and what it takes in each.
 
         Args:
             t, before: middles of the steps and of the one before, s.
@@ -204,15 +208,17 @@ class MachineStep:
         Raises:
             NotApplicable: exact propagation does not hold, or numbers change too fast.
         """
-        if self._same is not None:
-            return self._same
-        fast, now = self._integrators[0].columns(t, before)
+        if self._same is None:
+            fast, blocks = self._integrators[0].columns(t, before, BLOCK)
+            if self._way is not None:
+                return fast, map(self._regulated, blocks)
+            self._same = fast, self._regulated(next(blocks))
+        return self._same[0], itertools.repeat(self._same[1])
+
+    def _regulated(self, now: Numbers) -> Numbers:
         inputs = now.u.copy()
         inputs[self._V_ref_at] = self.V_ref
-        made = fast, now._replace(u=inputs)
-        if self._way is None:
-            self._same = made
-        return made
+        return now._replace(u=inputs)
 
     @property
     def numbers_of_link(self) -> np.ndarray:
@@ -221,10 +227,8 @@ class MachineStep:
             self._linked = np.repeat(self.link.numbers[:, None], BLOCK, axis=1)
         return self._linked
 
-    def went_on(
-        self, done: MachineBlock, N: float, grid: np.ndarray, severity: Any = ()
-    ) -> MachineMade:
-        """Go on from the end of a block over a grid, s, which began at the rotor speed N, rad/s.
+    def went_on(self, done: MachineBlock, grid: np.ndarray, severity: Any = ()) -> MachineMade:
+        """Go on from the end of blocks over a grid, s.
 
         Args:
             severity: of the fault in each step, in the order of its names, where it changes.
@@ -232,9 +236,10 @@ class MachineStep:
         fast = self._integrators[0]
         t, w = fast.waves(done.waves, grid)
         self.propagated += grid.size - 1
-        self.w_r = self.link.w_r(N)
+        w_r = np.repeat(done.w_r[::BLOCK], BLOCK)  # at the beginning of each block
+        self.w_r = float(w_r[-1])
         h, symmetric = self.settings.dt, self.phase.symmetric
-        means = RawMeans.of(fast.quad, symmetric, done.means, h, self.w_r, grid[1:])
+        means = RawMeans.of(fast.quad, symmetric, done.means, h, w_r, grid[1:])
         self.x = done.x
         fault = self.phase.fault
         changing = self._way is not None and fault is not None and len(severity)

@@ -30,6 +30,7 @@ from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL, GasGenerator
+from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu, JointPoint, groups
@@ -43,6 +44,7 @@ from apu_casadi.unit.multirate import exchange_grid, load_notes, settled_start, 
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Recorder, Row, stored_severities
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
+from apu_casadi.unit.strictness import Strict
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -188,6 +190,8 @@ def simulate_monolithic(
     events: Sequence[Event] = (),
     dt: float = 0.02,
     start_from: str = "balanced",
+    strict: bool = False,
+    limits: Limits | None = None,
     solver: str = "idas",
     rtol: float = 1e-8,
     atol: float = 1e-10,
@@ -196,8 +200,8 @@ def simulate_monolithic(
     """Simulate the unit as one model, from the steady state that :func:`simulate_joint` starts in.
 
     Args:
-        apu, duration, load, ambient, health, fault, N_ref, events, start_from: as for
-            :func:`apu_casadi.unit.multirate.simulate_joint`.
+        apu, duration, load, ambient, health, fault, N_ref, events, start_from, strict, limits: as
+            for :func:`apu_casadi.unit.multirate.simulate_joint`.
         dt: output interval, s; events and jumps of profiles are output instants too.  Means and rms
             values are over it, and profiles are straight within it.
         solver, rtol, atol: integrator and its tolerances; IDAS solves the gas path along with the
@@ -210,7 +214,8 @@ def simulate_monolithic(
         included.
 
     Raises:
-        ScenarioError, OperatingPointError, SimulationError: as for ``simulate_joint``.
+        ScenarioError, OperatingPointError, SimulationError, ValidityError: as for
+            ``simulate_joint``.
 
     Warns:
         ValidityWarning: as ``simulate_joint``.
@@ -228,8 +233,11 @@ def simulate_monolithic(
     severities = stored_severities(events, *start.faults)
     record = Recorder(apu.gas_generator, grid, 0, means, severities=severities)
     system.means = means
-    record.put(0, 1, system.at_start())
-    run(system, grid, stops, record=record.put, progress=progress)
+    put = record.put
+    if strict:
+        put = Strict(system, grid, means, record.put, limits or Limits(), events)
+    put(0, 1, system.at_start())
+    run(system, grid, stops, record=put, progress=progress)
     rows = record.instants()
     told = runrecord.asked(start=start, events=events)
     attrs = {**system.how, "nsteps": system.nsteps, **told}
@@ -238,7 +246,8 @@ def simulate_monolithic(
     ds = record.collect(apu, {**rows, **more}, Noise(), rng, attrs, signals)
     notes = [d.warning() for d in record.warnings]
     notes += load_notes(apu, record, start, events, rows)
-    return validity.conclude(ds, departures(apu.gas_generator, grid, rows), notes)
+    found = departures(apu.gas_generator, grid, rows, limits)
+    return validity.conclude(ds, found, notes, strict=strict)
 
 
 class _Variant(NamedTuple):

@@ -45,7 +45,7 @@ from apu_casadi.core.runloop import SAME_INSTANT, steps
 from apu_casadi.gaspath.steady.steadypoint import Limits
 from apu_casadi.unit import runrecord, validity
 from apu_casadi.unit.apu import Apu
-from apu_casadi.unit.departures import departures
+from apu_casadi.unit.departures import Departure, departures
 from apu_casadi.unit.events import (
     STARTS,
     Ambient,
@@ -189,13 +189,25 @@ def joint_course(apu: Apu, **how: Any) -> Course[xr.Dataset]:
     stops = sorted([*events, *jumps(start, events, duration)], key=lambda e: e.t)
     grid, settled = exchange_grid(duration, settings.dt, stops), settled_start(how["start_from"])
     seed, strict = how["seed"], how["strict"]
-    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled)
+    asked = Asked(start, grid, how["phasors"], noise, seed, how["hook"], settled, strict)
     system = JointRun(apu, asked, settings, np.random.default_rng(seed))
     limits = how["limits"]
     judged = (limits or Limits()) if strict else None
-    record = yield from _moved(system, events, stops, how["storage"], judged, how["progress"])
+    watched = how["exchange"] if how["warn_exchange"] and _estimated(asked, events) else None
+    way = judged, watched, how["progress"]
+    record = yield from _moved(system, events, stops, how["storage"], *way)
     told = {"warn_exchange": how["warn_exchange"], "strict": strict, "limits": limits}
     return _concluded(system, record, how["exchange"], events, **told, attrs=how["attrs"] or {})
+
+
+def _estimated(asked: Asked, events: Sequence[Event]) -> bool:
+    """Tell whether the error of a run's exchange can be estimated.
+
+    State noise is drawn for each exchange step, and no other exchange has it; the estimate knows
+    one governed speed.
+    """
+    steered = asked.start.N_ref is not None or any(isinstance(e, SpeedChange) for e in events)
+    return asked.hook is None and not asked.noise.N and not steered
 
 
 def start_of(
@@ -218,9 +230,13 @@ def _moved(
     stops: Sequence[Event | Jump],
     storage: str | os.PathLike[str],
     strict: Limits | None,
+    watched: str | None,
     progress: Callable[[float, float], None] | None,
 ) -> Course[Recorder]:
-    """Run the unit over its grid, strictly within limits if given; return what was recorded."""
+    """Run the unit over its grid, strictly within limits if given; return what was recorded.
+
+    ``watched`` is the exchange whose error a strict run watches.
+    """
     apu, asked, grid = system.apu, system.asked, system.asked.grid
     means = {k: means_of(apu, k, asked.phasors) for k in kinds(apu, system.now, events)}
     severities = stored_severities(events, *asked.start.faults)
@@ -228,7 +244,9 @@ def _moved(
     record = Recorder(apu.gas_generator, grid, samples, means, storage, severities)
     put = record.put
     if strict is not None:
-        put = Strict(system, means, record.put, strict, events)
+        way = None if watched is None else (watched, system.settings.dt, system.point.gas)
+        spikes: Callable[[], list[Departure]] = lambda: system.machines.spikes  # noqa: E731
+        put = Strict(system, grid, means, record.put, strict, events, spikes, way)
     put(0, 1, system.at_start())
     yield from steps(system, grid, stops, record=put, progress=progress)
     return record

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from apu_casadi.unit.machines import Of
     from apu_casadi.unit.noise import Noise
 
-_TOGETHER = 512  # entries of means whose rms values are made at once
+_TOGETHER = 5000  # steps whose rms values are made at once
 _STORED = Signals(Ttsc.severities)  # severities that every run stores
 _P_WAVE = f"{WAVEFORMS[-1]} waveform"  # P_total is a mean as well
 
@@ -94,7 +94,7 @@ class _Kept:
 
     def _later(self, at: int, means: RawMeans) -> None:
         """Take means whose rms values are made together with those of their neighbours."""
-        if self._raw and (len(self._raw) >= _TOGETHER or self._raw[0][:2] != means[:2]):
+        if self._raw and (at - self._raw_at >= _TOGETHER or self._raw[0][:2] != means[:2]):
             self.settle()
         if not self._raw:
             self._raw_at = at

@@ -56,20 +56,20 @@ class RawMeans(NamedTuple):
     Args:
         quad, symmetric: names of the means, and whether the phases differ by rotation only.
         values: shape (means, steps); ``MEANS`` come first.
-        turn, w_r: electrical periods in each step, and electrical speed, rad/s.
+        turn, w_r: electrical periods in each step, and electrical speed, rad/s; one or (steps,).
         t: end of each step, s; one instant or (steps,).
     """
 
     quad: tuple[str, ...]
     symmetric: bool
     values: np.ndarray
-    turn: float
-    w_r: float
+    turn: Any
+    w_r: Any
     t: Any
 
     @classmethod
     def of(
-        cls, quad: tuple[str, ...], sym: bool, means: np.ndarray, h: float, w_r: float, t: Any
+        cls, quad: tuple[str, ...], sym: bool, means: np.ndarray, h: float, w_r: Any, t: Any
     ) -> RawMeans:
         """Copy the means of steps of length h that end at t, s."""
         values = means.reshape(len(quad), -1).copy()
@@ -117,9 +117,8 @@ class StepMeans:
         eq. (8) says.
         """
         values = np.concatenate([r.values for r in raw], axis=1)
-        steps = [r.values.shape[1] for r in raw]
-        turn, w_r = (np.repeat(x, steps) for x in ([r.turn for r in raw], [r.w_r for r in raw]))
-        t = np.concatenate([np.atleast_1d(r.t) for r in raw])
+        each = [np.broadcast_to(x, r.values.shape[1]) for r in raw for x in (r.turn, r.w_r, r.t)]
+        turn, w_r, t = (np.concatenate(each[i::3]) for i in range(3))
         by_name = as_dict(raw[0].quad, values)
         more = settled(by_name, turn=turn, symmetric=raw[0].symmetric, phasors=True)
         rms, parts = more[: len(RMS)], more[len(RMS) :]

@@ -63,6 +63,7 @@ __all__ = [
     "EXCHANGE_LIMIT",
     "Departure",
     "ExchangeError",
+    "FollowedRotor",
     "before",
     "beyond_words",
     "by_phase",
@@ -72,6 +73,7 @@ __all__ = [
     "exchange_words",
     "found_in",
     "fuel_limited",
+    "fuel_words",
     "notes_of_exchange",
     "overload",
     "unserved",
@@ -86,6 +88,10 @@ PAPER_ERROR = 0.1
 """Error up to which that is accepted: twice the 5 % that it loses with the paper's governor."""
 SERVED = 0.9
 """Share of its demand that a constant-power load gets at least."""
+FALLING = 0.5
+"""Time at the fuel limit, s, with the speed falling, after which a load is more than is given."""
+PASSED = 0.5
+"""Time, s, without a larger error or excursion of the speed after which a transient has passed."""
 SETTLED = 0.1  # s after which a constant-power load should have its power
 _STILL = 1e-5  # of the governed speed: a smaller excursion is none
 
@@ -96,22 +102,36 @@ _STILL = 1e-5  # of the governed speed: a smaller excursion is none
 def fuel_limited(
     apu: Apu, t: np.ndarray, N: np.ndarray, Wf: np.ndarray, N_ref: float | None = None
 ) -> Departure | None:
-    """Return what is told of a run that ends with the fuel at its limit and the speed falling.
+    """Return what is told of a run whose fuel is at its limit while the speed falls.
 
-    ``N_ref`` is the governed speed at its end, rad/s, where that is not the unit's.
+    At the end of the run, or for ``FALLING`` at least.  ``N_ref`` is the governed speed at its end,
+    rad/s, where that is not the unit's.
     """
-    high = apu.governor.Wf_max
-    if N.size < 2 or not (Wf[-1] >= high * (1 - 1e-9) and N[-1] < N[-2]):
+    if N.size < 2:
         return None
-    below = np.flatnonzero(Wf < high * (1 - 1e-9))
-    since, end = float(t[below[-1] + 1]) if below.size else float(t[0]), float(t[-1])
-    words = (
-        f"the load asks for more than the engine gives: at the end of the run the governor is at "
-        f"its limit Wf_max = {high:g} kg/s, since t = {since:.6g} s, and the speed still falls "
-        f"({N[-1] * RPM:.0f} r/min, {100 * N[-1] / (N_ref or apu.N_ref):.1f} % of the governed one)"
+    limited = Wf >= apu.governor.Wf_max * (1 - 1e-9)
+    starved = limited & (np.diff(N, prepend=N[0]) < 0)
+    if starved[-1]:
+        below, last = np.flatnonzero(~limited), N.size - 1
+        first, when = int(below[-1]) + 1 if below.size else 0, "at the end of the run"
+    else:
+        span = _lasting(starved, t, FALLING)
+        if span is None:
+            return None
+        (first, last), when = span, f"at t = {t[span[1]]:.6g} s"
+    since, end = float(t[first]), float(t[last])
+    words = fuel_words(apu, when, since, float(N[last]), N_ref)
+    high, at = apu.governor.Wf_max, (since, end, end - since)
+    return Departure("Wf", "kg/s", high, float(Wf[last]), *at, "fuel_limit", said=words)
+
+
+def fuel_words(apu: Apu, when: str, since: float, N: float, N_ref: float | None = None) -> str:
+    """Return the words for a load that the engine cannot carry, at a speed N, rad/s."""
+    return (
+        f"the load asks for more than the engine gives: {when} the governor is at its limit "
+        f"Wf_max = {apu.governor.Wf_max:g} kg/s, since t = {since:.6g} s, and the speed still "
+        f"falls ({N * RPM:.0f} r/min, {100 * N / (N_ref or apu.N_ref):.1f} % of the governed one)"
     )
-    at = since, end, end - since
-    return Departure("Wf", "kg/s", high, float(Wf[-1]), *at, "fuel_limit", said=words)
 
 
 def unserved(
@@ -160,11 +180,11 @@ def unserved_words(t: float, P_e: float, asked: float, numbers: Sequence[int] | 
     )
 
 
-def _lasting(lacks: np.ndarray, t: np.ndarray) -> tuple[int, int] | None:
-    """Return the first and last instant of what lasts: to the end, or for ``SETTLED``."""
+def _lasting(lacks: np.ndarray, t: np.ndarray, length: float = SETTLED) -> tuple[int, int] | None:
+    """Return the first and last instant of what lasts: to the end, or for a length, s."""
     cuts = np.flatnonzero(np.diff(np.concatenate([[False], lacks, [False]]).astype(int)))
     for a, b in cuts.reshape(-1, 2).tolist():
-        if b == lacks.size or t[b - 1] - t[a] >= SETTLED:
+        if b == lacks.size or t[b - 1] - t[a] >= length - 1e-9:
             return a, b - 1
     return None
 
@@ -264,34 +284,58 @@ def exchange_error(
         t, N, Wf: exchange instants (s), speed there (rad/s), and the fuel flow (kg/s) held over the
             step that ends there, shape (K,).
     """
-    rotor = _Rotor(apu, point, float(N[0]), float(Wf[0]))
-    for first in range(0, t.size - 1, _CHUNK):
-        at = slice(first, min(first + _CHUNK + 1, t.size))
-        h, run = np.diff(t[at]), N[at] - N[0]
-        e = np.exp(rotor.a * h)
-        g = np.expm1(rotor.a * h) / rotor.a if rotor.a else h
-        d = (run[1:] - e * run[:-1]) / g - rotor.b * (Wf[at][1:] - Wf[0])
-        rotor.drive(h, d, run[1:])
-    return ExchangeError(rotor.error / max(rotor.excursion, _STILL * apu.N_ref), rotor.excursion)
+    rotor = FollowedRotor(apu, point, t, N, Wf)
+    for first in range(1, t.size, _CHUNK):
+        at = slice(first, first + _CHUNK)
+        rotor.follow(t[at], N[at], Wf[at])
+    return ExchangeError(rotor.share, rotor.excursion)
 
 
 _CHUNK = 8192  # steps at a time: the memory of a long run stays small
 
 
-class _Rotor:
-    """The linear rotor under the continuous governor.
+class FollowedRotor:
+    """The linear rotor under the continuous governor, driven by what drove a run's.
 
     Exact where the fuel is within its limits and the law is linear in speed and states, as it is
     linearised at the start; by Heun's rule in small parts of the step where a limit is met.
+
+    Args:
+        apu, point: the unit, and the steady point that the run starts from.
+        t, N, Wf: of the run, of which the first values count here.
     """
 
-    def __init__(self, apu: Apu, point: OperatingPoint, N_0: float, Wf_0: float) -> None:
-        self.link, self.N_0, self.Wf_0 = apu.shaft, N_0, Wf_0
+    def __init__(
+        self, apu: Apu, point: OperatingPoint, t: np.ndarray, N: np.ndarray, Wf: np.ndarray
+    ) -> None:
+        self.link, self.N_0, self.Wf_0 = apu.shaft, float(N[0]), float(Wf[0])
         self.a, self.b = _slopes(apu.gas_generator, point)
-        self.state = np.array([0.0, *apu.governor.start(Wf_0)])  # speed from its start, governor's
+        start = apu.governor.start(self.Wf_0)
+        self.state = np.array([0.0, *start])  # speed from its start, governor's
         self.error = self.excursion = 0.0
+        self.grew = float(t[0])
+        self._last = float(t[0]), 0.0
         self._matrix, self._demand = self._linear()
         self._moves: dict[float, np.ndarray] = {}
+
+    @property
+    def share(self) -> float:
+        """Largest error of the speed so far, of its largest excursion so far."""
+        return self.error / max(self.excursion, _STILL * float(self.link.N_ref))
+
+    def follow(self, t: np.ndarray, N: np.ndarray, Wf: np.ndarray) -> None:
+        """Go on to the next instants of the run; see :func:`exchange_error`."""
+        h, run = np.diff(t, prepend=self._last[0]), N - self.N_0
+        e = np.exp(self.a * h)
+        g = np.expm1(self.a * h) / self.a if self.a else h
+        d = (run - e * np.append(self._last[1], run[:-1])) / g - self.b * (Wf - self.Wf_0)
+        speeds = self._driven(h, d)
+        self._last = float(t[-1]), float(run[-1])
+        for name, values in (("error", np.abs(run - speeds)), ("excursion", np.abs(speeds))):
+            k = int(values.argmax())
+            if values[k] > getattr(self, name):
+                setattr(self, name, float(values[k]))
+                self.grew = max(self.grew, float(t[k]))
 
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:
         """Rates of (n, x) and demand under the unlimited governor: factors of n, x, d and 1."""
@@ -325,8 +369,8 @@ class _Rotor:
         self._moves[h] = np.vstack([E[:m], self._demand @ E])
         return self._moves[h]
 
-    def drive(self, h: np.ndarray, d: np.ndarray, run: np.ndarray) -> None:
-        """Go on over steps of lengths h by their disturbances; compare with the speeds of a run."""
+    def _driven(self, h: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Return the speeds after steps of lengths h by their disturbances."""
         low, high = self.link.governor.Wf_min, self.link.governor.Wf_max
         m, v, speeds = self.state.size, np.append(self.state, [0.0, 1.0]), []
         now = float(self._demand @ v)
@@ -346,8 +390,7 @@ class _Rotor:
             now = then
             speeds.append(float(v[0]))
         self.state = v[:m].copy()
-        self.error = max(self.error, float(np.abs(run - speeds).max()))
-        self.excursion = max(self.excursion, float(np.abs(speeds).max()))
+        return np.array(speeds)
 
     def _by_parts(self, state: np.ndarray, h: float, dist: float) -> np.ndarray:
         def rates(s: np.ndarray) -> np.ndarray:

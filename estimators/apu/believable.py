@@ -37,7 +37,7 @@ from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
-from estimators.apu.gaspathmodel import engine_function
+from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.information.innovationtests import Finding, findings, least
 
@@ -79,6 +79,7 @@ STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
+RECENT = 0.1  # s, before a report, in which a reset is its own
 SETTLED = 0.1  # s after a report, in which its innovations are explained
 SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
 FEWEST_SAMPLES = 100
@@ -262,7 +263,11 @@ def machine_causes(
     """
     reports, resets = _reports(side), [float(t) for t in side.resets]
     known = [t for t, _ in reports]
-    begins = {t: max([r for r in resets if r <= t + 1e-9], default=float(side.t[0])) for t in known}
+    # a small one makes no reset: it came about when it was found, if it was not there before
+    begins = {
+        t: max([r for r in resets if t - RECENT <= r <= t + 1e-9], default=max(t - DT, side.t[0]))
+        for t in known
+    }
     changes = [(begins[t], f"short circuit {p}") for t, p in reports]
     changes += [(t, "") for t in resets if t not in begins.values()]
     for t, said in sorted(changes)[:MOST_CAUSES]:
@@ -313,7 +318,12 @@ def gas_doubts(
             usual = 3 * s / math.sqrt(float(np.median(r.innovation_variance[k])))
             z[k] -= np.clip(np.nanmean(np.where(quiet, z[k], np.nan)), -usual, usual)
     each = {n: np.where(quiet, row, np.nan) for n, row in zip(r.y.names, z, strict=True)}
-    for f in least(findings(each, margin=MARGIN), LEVEL):
+    found = findings(each, margin=MARGIN)
+    if {"Wf", "PW"} & {
+        *r.x.names
+    }:  # freer than a load moves: innovations alternate, sigma is large
+        found = [f for f in found if f.test != "colour" or f.value > 0]
+    for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
     if len(tracked.alarms) >= MOST_JUMPS:
@@ -382,6 +392,7 @@ def _map_doubts(filt: GasPathFilter, tracked: Tracked) -> Iterator[Doubt]:
     """Operating points beyond the tables of the maps, at the end."""
     r, gg = tracked.result, filt.gg
     u = dict(zip(filt.model.u.names, tracked.data.u[:, -1], strict=True))
+    u |= {n: float(r[n][0][-1]) for n in ("Wf", "PW") if n in r.x}
     given = gg.U.pack({n: float(u.get(n, 0.0)) for n in gg.U.names})
     theta = gg.THETA.pack({n: float(r[n][0][-1]) for n in HEALTH})
     N = np.array([float(r["N"][0][-1])])

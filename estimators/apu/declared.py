@@ -12,6 +12,7 @@ becomes noise by the slope of the signal.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +89,7 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     """
     notes, doubts = list[str](), list[Doubt]()
     channels: dict[str, Channel] = dict(m.channels)
-    waves = {n: electrical[plain(n)] for n in m.electrical if plain(n) in electrical}
+    waves = {n: s for n in m.electrical if (s := electrical.of_channel(n)) is not None}
     slow = {n: gas_path[n] for n in m.gaspath if n in gas_path}
     every = slow | waves
     for n, s in every.items():
@@ -105,6 +106,7 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
             notes.append(f"{n} is {s.delay:g} s late: its readings count for that earlier instant")
     grown = _undone(channels, waves, notes)
     changed = [_noisier(s, channels, waves, grown) for s in electrical.sensors]
+    gas_path = SensorSet(tuple(_clocked(s, slow) for s in gas_path.sensors))
     late = max((s.delay for s in every.values()), default=0.0)
     if late:
         notes.append(f"what is said of an instant is known {late:g} s later, by the sensors' delay")
@@ -114,6 +116,21 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     return Declared(
         ready, gas_path, SensorSet(tuple(changed)), tuple(notes), tuple(doubts), late, coarse
     )
+
+
+def _end(name: str) -> str:
+    return name.removeprefix(plain(name))
+
+
+def _clocked(s: Sensor, beside: Mapping[str, Sensor]) -> Sensor:
+    """Return a sensor whose jitter stands for that of a clock which samples others beside it.
+
+    The clock's error acts on n channels by their slopes a, and n diag(a^2) >= a a': as independent
+    errors of n times the variance they are never taken for smaller than they are, in any
+    combination of the channels.
+    """
+    n = sum(of.clock == s.clock and of.jitter > 0 for of in beside.values()) if s.clock else 1
+    return dataclasses.replace(s, jitter=math.sqrt(n) * s.jitter) if n > 1 else s
 
 
 def _kept(c: Channel, s: Sensor, notes: list[str], doubts: list[Doubt], *, wave: bool) -> Channel:
@@ -164,7 +181,7 @@ def _undone(
             values, more = interpolated(c.t, c.values, c.t + rest, more=s.tau)
             values[c.t + rest > c.t[-1]] = np.nan
             # between samples it is less, but no longer white: at the signal's frequency the same
-            grown[plain(n)] = max(1.0, float(np.median(more)))
+            grown[s.name] = max(1.0, float(np.median(more)))
         if common:
             moved.setdefault(id(c.t), c.t - common)
         t = moved.get(id(c.t), c.t)
@@ -184,7 +201,13 @@ def _noisier(
     s = dataclasses.replace(s, noise=by * s.noise, quantum=by * s.quantum) if by != 1.0 else s
     if not s.jitter:
         return s
-    each = [channels[n] for n in waves if plain(n) == s.name]
+    mine = [n for n, of in waves.items() if of.name == s.name]
+    if mine:
+        beside = {
+            k: of for k, of in waves.items() if plain(k) in WAVES and _end(k) == _end(mine[0])
+        }
+        s = _clocked(s, beside)
+    each = [channels[n] for n in mine]
     fastest = max((float(slopes(c.t, c.values, wave=True).max()) for c in each), default=0.0)
     # two digits: the model of the filter is made for the number
     return dataclasses.replace(s, extra=float(f"{s.jitter * fastest:.2g}"))

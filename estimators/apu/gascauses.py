@@ -17,7 +17,9 @@ import numpy as np
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.electrical.causes import Causes, probabilities
 from estimators.apu.gaspath import JUMP, GasPathFilter
+from estimators.apu.gaspathmodel import LAGGING
 from estimators.apu.healthjumps import Tracked
+from estimators.apu.sensorfailures import failure
 from estimators.detection.glr import glr
 from estimators.detection.signatures import Jump, linearised
 from estimators.filters.belief import Belief
@@ -27,6 +29,7 @@ __all__ = ["PRIOR", "causes_of_alarms"]
 
 BACK, ON = 40, 50  # samples before and after an alarm that are looked at
 SIZE = 0.05  # standard deviation of a jump of a sensor's gain, of the reading
+WIDE = 1e8  # factor on the variance of a reading that says nothing
 N_SIZE = 0.02  # the same of the speed's sensor
 #: Prior weights by kind; sensors share theirs.
 PRIOR = {"none": 1.0, "gas path": 1.0, "sensor": 0.3, "shaft power": 0.3}
@@ -36,7 +39,7 @@ def _jumps(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str], 
     """Jumps that may be, and by hypothesis the names and standard deviations of its own."""
     jumps = [Jump("state", n) for n in HEALTH]
     of = {"gas path": (list(HEALTH), [JUMP] * len(HEALTH))}
-    for n in filt.model.y.names:
+    for n in (n for n in filt.model.y.names if n not in LAGGING):
         if f"gain_{n}" in filt.model.x:
             jumps.append(Jump("state", f"gain_{n}"))
             of[f"sensor {n}"] = ([f"gain_{n}"], [SIZE])
@@ -67,8 +70,33 @@ def causes_of_alarms(
         u[row, onset:] = 0.0
         stop = min(k + ON, tracked.data.size)
         data = _part(replace(tracked.data, u=u), stop)
-        out.append(Causes(float(data.t[k]), _weighed(filt, data, k, tracked.prior, backend)))
+        weighed = _weighed(filt, data, k, tracked.prior, backend)
+        failed = _failed(
+            filt, data, onset, max(weighed, key=lambda n: weighed[n]), tracked, backend
+        )
+        out.append(Causes(float(data.t[k]), weighed, failed))
     return out
+
+
+def _failed(
+    filt: GasPathFilter,
+    data: Recording,
+    onset: int,
+    what: str,
+    tracked: Tracked,
+    backend: str | None,
+) -> dict[str, dict[str, float]]:
+    """How the sensor failed that is the most probable cause: by a filter that it tells nothing."""
+    name = what.removeprefix("sensor ")
+    if name == what or name not in filt.model.y:
+        return {}
+    row, late = filt.model.y.index(name), slice(onset + 1, data.size)
+    blind = data.variance.copy()
+    blind[row, late] *= WIDE
+    r = filt.run(replace(data, variance=blind), prior=tracked.prior, backend=backend)
+    own = np.sqrt(data.variance[row, late])
+    found = failure(data.t[late], data.y[row, late], r.innovation[row, late], own)
+    return {what: found} if found else {}
 
 
 def _part(data: Recording, stop: int) -> Recording:

@@ -35,9 +35,11 @@ from apu_casadi.unit.control import Governor
 from estimators.apu.gaspathmodel import (
     DT,
     GOVERNOR,
+    LAGGING,
     OUTPUTS,
     engine_function,
     gas_path_model,
+    lag_of,
     model_sensors,
 )
 from estimators.apu.sensorchain import Draws, sampled, spread
@@ -75,6 +77,9 @@ N_SIGMA = 20.0  # rad/s; prior of speed, 0.5 %
 N_WALK = 1.0  # rad/s/sqrt(s); what discretisation and sampling leave after a load drop
 PW_PRIOR = (3e5, 2e5)  # W; mean and standard deviation of an unknown shaft power
 LOSS_WALK = 500.0  # W/sqrt(s); a severity of 2e-5 in a second
+#: Relative, 1/sqrt(s), of a fuel flow that is known through a lag: the governor's law is followed,
+#: and what it lacks, limits and another governor, is 7 % in a step.
+FUEL_WALK = 0.5
 PW_WALK = 1e6  # W/sqrt(s); a load may drop by 280 kW at once, and no less freedom helps the health
 MODEL_ERROR = 0.003  # relative; other maps and gas data shift P3 and P5 by 0.1 % from load to load
 J_SIGMA = 0.1  # relative; the paper gives no inertia
@@ -117,7 +122,7 @@ class GasPathFilter(Parametric):
     @derived
     def lagging(self) -> tuple[Sensor, ...]:
         """Sensors with a state of their own."""
-        return tuple(s for s in self.sensors.sensors if s.tau)
+        return tuple(s for s in self.sensors.sensors if lag_of(s) in self.model.x and s.tau)
 
     @derived
     def gains(self) -> tuple[str, ...]:
@@ -142,7 +147,9 @@ class GasPathFilter(Parametric):
         """
         means = {"N": self.gg.parameters.N} | dict.fromkeys(HEALTH, 1.0)
         means |= {n: 0.0 for n in self.model.x.names if n.startswith(("gain_", "bias_"))}
-        means |= {s.name: s.signal.nominal for s in self.lagging}
+        means |= {lag_of(s): s.signal.nominal for s in self.lagging}
+        if "Wf" in self.model.x:
+            means["Wf"] = self.gg.design.values["Wf"]
         means |= {n: v for n, v in self.gg.held.items() if n in self.model.x}
         if not self.known_power:
             means["PW"] = PW_PRIOR[0]
@@ -256,7 +263,7 @@ class GasPathFilter(Parametric):
         own = {n: tv for n, tv in readings.items() if n in self.sensors}
         sigma = {n: spread(self.sensors[n], *tv) for n, tv in own.items()}
         held: dict[str, Any] = {}
-        for n in ("Wf", "PW") if self.known_power else ("Wf",):
+        for n in (n for n in LAGGING if n in self.model.u.names):
             t, v, s = power if n == "PW" and power is not None else (*readings[n], sigma[n])
             held |= {n: (t, v), f"sigma_{n}": (t, s)}
         outputs = {n: readings[n] for n in self.model.y.names if n in readings}
@@ -344,8 +351,10 @@ def gas_path_filter(
     """
     gg = GasGenerator() if gg is None else gg
     held = _held(sensors, power)
+    slow = tuple(sensors[n] for n in held if sensors[n].tau)
     named = (sensors.uncertain if gains else ()) if isinstance(gains, bool) else tuple(gains)
-    sigma, walks = _spreads(health_sigma, power=power, loss=loss)
+    unknown = [s.name for s in slow] + ["PW"] * (power == "unknown")
+    sigma, walks = _spreads(health_sigma, unknown, loss=loss)
     sigma |= {f"gain_{n}": math.hypot(sensors[n].unsure("gain"), model_error) for n in named}
     biased, consider = _offsets(sensors, named, (*sensors.outputs, *held))
     sigma |= {f"bias_{s.name}": s.bias for s in biased}
@@ -356,7 +365,8 @@ def gas_path_filter(
     if eta is not None:
         named, consider = (*named, "PW"), (*consider, *(["gain_PW"] if consider_eta else []))
         sigma["gain_PW"] = eta
-    sigma |= {s.name: LAG_SIGMA * s.signal.nominal for s in sensors.sensors if s.tau}
+    lags = [s for s in sensors.sensors if s.tau and (s in slow or s.name not in LAGGING)]
+    sigma |= {lag_of(s): LAG_SIGMA * s.signal.nominal for s in lags}
     model = gas_path_model(
         gg,
         power=power,
@@ -367,7 +377,7 @@ def gas_path_filter(
         governed=governed,
         power_jumps=power_jumps,
         loss=loss,
-        sensors=model_sensors(gg, sensors.only(sensors.outputs).sensors),
+        sensors=model_sensors(gg, (*sensors.only(sensors.outputs).sensors, *slow)),
         free=tuple((free or {}).items()),
     )
     sigma |= {n: FREE_SIGMA * model.x[n].nominal for n in free or {}}
@@ -375,20 +385,24 @@ def gas_path_filter(
 
 
 def _held(sensors: SensorSet, power: str) -> tuple[str, ...]:
-    """Return the measured inputs of a filter, all of which have a sensor without a lag."""
-    held = ("Wf", "PW") if power == "measured" else ("Wf",)
+    """Return the measured inputs of a filter, all of which have a sensor."""
+    held = LAGGING if power == "measured" else ("Wf",)
     if missing := [n for n in held if n not in sensors]:
         raise ParameterError(f"a gas-path filter takes {missing[0]} as an input: no sensor of it")
-    if late := [n for n in held if sensors[n].tau]:
-        raise ParameterError(f"sensor {late[0]}: the lag of a measured input is not modelled")
     return held
 
 
-def _spreads(health: float, *, power: str, loss: bool) -> tuple[dict[str, float], dict[str, float]]:
+def _spreads(
+    health: float, unknown: Sequence[str], *, loss: bool
+) -> tuple[dict[str, float], dict[str, float]]:
     """Return standard deviations at the start and random walks of the states without sensors."""
     sigma = {"N": N_SIGMA} | dict.fromkeys(HEALTH, health)
     walks = {"N": N_WALK} | dict.fromkeys(HEALTH, HEALTH_WALK)
-    if power == "unknown":
+    if "Wf" in unknown:
+        sigma["Wf"], walks["Wf"] = (
+            by * GasGenerator.U["Wf"].nominal for by in (LAG_SIGMA, FUEL_WALK)
+        )
+    if "PW" in unknown:
         sigma["PW"], walks["PW"] = PW_PRIOR[1], PW_WALK
     if loss:
         sigma["loss_PW"], walks["loss_PW"] = 0.0, LOSS_WALK
@@ -429,7 +443,7 @@ def true_readings(
     """Return the filter's instants in a joint run, and what the sensors would read without errors.
 
     Each lags and is late as it declares.  The shaft power is the mean of the window from an instant
-    to the next.
+    to the next, but for one that lags.
 
     Args:
         sensors: the set.
@@ -447,6 +461,8 @@ def true_readings(
         n: sampled(sensors[n], time, v, t, of) if n in late else v[rows]
         for n, v in sensors.true(time, there).items()
     }
+    if "PW" in sensors and sensors["PW"].tau:
+        return t, truth
     delay = sensors["PW"].delay if "PW" in sensors else 0.0
     return t, truth | {"PW": window_means(time, ds["PW"].values, t - delay)}
 

@@ -12,6 +12,9 @@ A sensor with a lag tau has a state of its own: tau dx/dt = v - x with the value
 the step, by which the speed goes on as well, held over the step:
 
     x(k+1) = v + exp(-dt/tau) (x(k) - v).
+
+So has the sensor of an input that lags, ``Wf_lag``; the input itself is then a state that walks,
+``Wf``, which follows the governor's law, and the reading an output.
 """
 
 from __future__ import annotations
@@ -40,9 +43,11 @@ __all__ = [
     "DT",
     "GAINED",
     "GOVERNOR",
+    "LAGGING",
     "OUTPUTS",
     "engine_function",
     "gas_path_model",
+    "lag_of",
     "model_sensors",
 ]
 
@@ -50,6 +55,7 @@ DT = 0.02  # s; step of the gas-path filter (paper, section 3.3)
 OUTPUTS = GAS_PATH.outputs
 GAINED = GAS_PATH.uncertain
 POWER = ("measured", "unknown")
+LAGGING = ("Wf", "PW")  # measured inputs, of which the sensors may lag
 GOVERNOR = GovernorParameters()
 
 
@@ -99,7 +105,7 @@ def model_sensors(gg: GasGenerator, sensors: Sequence[Sensor]) -> tuple[Sensor, 
             which is not known at the sample.
     """
     of_inputs = gg.family.equations.jac_sparsity(2, 2)  # dy/du
-    for s in sensors:
+    for s in (s for s in sensors if s.name not in LAGGING):
         for n in s.reads:
             if n not in Y.names:
                 raise ParameterError(f"sensor {s.name}: no output {n!r} {nearest(n, Y.names)}")
@@ -115,14 +121,19 @@ def _relative(name: str, doc: str, default: float | None = 0.0) -> Signal:
     return Signal(name, "1", doc, default=default, nominal=0.01)
 
 
+def lag_of(s: Sensor) -> str:
+    """Return the state of a sensor that lags: its name is the input's where it reads one."""
+    return f"{s.name}_lag" if s.name in LAGGING else s.name
+
+
 def _states(
-    known: bool,
+    held: Sequence[str],
     gains: Sequence[str],
     biases: Sequence[str],
     sensors: Sequence[Sensor],
     loss: bool,
 ) -> Signals:
-    power = () if known else (dataclasses.replace(U["PW"], default=None),)
+    inputs = [dataclasses.replace(U[n], default=None) for n in reversed(LAGGING) if n not in held]
     docs = {n: _GAIN_DOCS.get(n, f"relative gain error of the sensor of {n}") for n in gains}
     errors = [_relative(f"gain_{n}", doc) for n, doc in docs.items()]
     signals = {s.name: s for s in (*U, *(s.signal for s in sensors))}
@@ -130,14 +141,13 @@ def _states(
         Signal(f"bias_{n}", s.unit, f"offset of the sensor of {n}", 0.0, 0.01 * s.nominal)
         for n, s in ((n, signals[n]) for n in biases)
     ]
-    lags = [dataclasses.replace(s.signal, default=None) for s in sensors if s.tau]
+    lags = [dataclasses.replace(s.signal, name=lag_of(s), default=None) for s in sensors if s.tau]
     losses = [Signal("loss_PW", "W", _LOSS, default=0.0, nominal=1e4)] if loss else []
-    return Signals([*X, *THETA, *power, *errors, *lags, *losses])
+    return Signals([*X, *THETA, *inputs, *errors, *lags, *losses])
 
 
-def _inputs(known: bool, power_jumps: bool, loss: bool) -> tuple[Signals, Signals]:
+def _inputs(measured: Sequence[str], power_jumps: bool, loss: bool) -> tuple[Signals, Signals]:
     """Inputs and noises."""
-    measured = ("Wf", "PW") if known else ("Wf",)
     spread = [
         Signal(
             f"sigma_{n}",
@@ -148,7 +158,7 @@ def _inputs(known: bool, power_jumps: bool, loss: bool) -> tuple[Signals, Signal
         )
         for n in measured
     ]
-    given = [s for s in U if known or s.name != "PW"] + spread
+    given = [s for s in U if s.name in measured or s.name not in LAGGING] + spread
     given += [_relative("jump", "standard deviation of a sudden change of health in this step")]
     W = [Signal(f"w_{n}", "1", f"error of the measured {n} over its sigma") for n in measured]
     if power_jumps:
@@ -172,11 +182,11 @@ def _check_gains(
 ) -> None:
     if power not in POWER:
         raise ParameterError(f"power {power!r} {nearest(power, POWER)}")
-    if loss and power != "measured":
-        raise ParameterError("loss: the shaft power must be measured")
+    if loss and (power != "measured" or "PW" in names):
+        raise ParameterError("loss: the shaft power must be measured, without a lag")
     if power_jumps and ("PW" not in gains or "gain_PW" in consider):
         raise ParameterError("power_jumps: gain_PW must be among the estimated states")
-    measured = (*GAINED, *sorted(names - {*OUTPUTS, *GAINED}))
+    measured = (*GAINED, *sorted(names - {*OUTPUTS, *GAINED, "PW"}))
     possible = (*measured, "PW", "J") if power == "measured" else measured
     for n in gains:
         if n not in possible:
@@ -187,7 +197,7 @@ def _lagged(
     sensors: Sequence[Sensor], y: dict[str, Any], at: dict[str, Any], dt: Any
 ) -> dict[str, Any]:
     """States of lagging sensors at the end of a step, of the outputs amid it."""
-    lag = {s.name: (s.of(y), s.tau) for s in sensors if s.tau}
+    lag = {lag_of(s): (s.of(y), s.tau) for s in sensors if s.tau}
     return {n: v + ca.exp(-dt / tau) * (at[n] - v) for n, (v, tau) in lag.items()}
 
 
@@ -260,9 +270,10 @@ def _family(
     sensors: tuple[Sensor, ...],
 ) -> FilterModel:
     """The model of all engines of a structure, with their numbers as known parameters."""
-    known, numbers = power == "measured", Signals(engines.theta[len(THETA) :])
-    states = _states(known, gains, biases, sensors, loss)
-    inputs_of, noises = _inputs(known, power_jumps, loss)
+    numbers, slow = Signals(engines.theta[len(THETA) :]), [s.name for s in sensors]
+    held = [n for n in LAGGING if n not in slow and (n == "Wf" or power == "measured")]
+    states = _states(held, gains, biases, sensors, loss)
+    inputs_of, noises = _inputs(held, power_jumps, loss)
     signals = states, inputs_of, numbers, noises, Signals([s.signal for s in sensors])
     x, u, p, w = (ca.MX.sym(n, len(s)) for n, s in zip("xupw", signals, strict=False))
     dt = ca.MX.sym("dt")
@@ -272,12 +283,14 @@ def _family(
     )
 
     def true(name: str) -> Any:  # reading = (1 + gain) true + bias + sigma w
+        if name not in held:
+            return at[name]
         error = given[f"sigma_{name}"] * noise[f"w_{name}"]
         if name in biases:
             error += at[f"bias_{name}"]
         return (given[name] - error) / (1 + at.get(f"gain_{name}", 0.0))
 
-    reads = dict.fromkeys(n for s in sensors for n in s.reads if n not in X.names)
+    reads = dict.fromkeys(n for s in sensors for n in s.reads if n not in (*X.names, *LAGGING))
     function, N = engine_function(engines, tuple(reads)), at["N"]
 
     def engine(N: Any, inputs: Mapping[str, Any]) -> Any:
@@ -287,7 +300,7 @@ def _family(
     # the outputs do not depend on the shaft power
     _, y, check_out, _ = engine(N, inputs | {"PW": ca.MX(0)})
     seen = {"N": N} | {n: y[i] for i, n in enumerate(reads)}
-    own = {s: at[s.name] if s.tau else s.of(seen) for s in sensors}
+    own = {s: at[lag_of(s)] if s.tau else s.of(seen) for s in sensors}
     readings = [v * (1 + at.get(f"gain_{s.name}", 0.0)) for s, v in own.items()]
     readings = [
         v + at[f"bias_{s.name}"] if s.name in biases else v
@@ -297,7 +310,7 @@ def _family(
     at |= {n: at[n] + given["jump"] * noise[f"w_{n}"] for n in HEALTH}
     if power_jumps:
         at["gain_PW"] += given["jump_PW"] * noise["w_gain_PW"]
-    inputs["PW"] = true("PW") if known else at["PW"]
+    inputs["PW"] = true("PW")
     if loss:
         at["loss_PW"] += given["jump_loss"] * noise["w_loss_PW"]
         inputs["PW"] += at["loss_PW"]
@@ -308,7 +321,10 @@ def _family(
         inputs["Wf"] += dt / 2 * slope
     k2, y_mid, check_mid, _ = engine(N + dt / 2 * k1, inputs)
     x1 = at | {"N": N + dt * k2 / (1 + at.get("gain_J", 0.0))}
+    if "Wf" not in held and governed is not None:
+        x1["Wf"] = at["Wf"] + dt * slope
     amid = {"N": N + dt / 2 * k1} | {n: y_mid[i] for i, n in enumerate(reads)}
+    amid |= {n: inputs[n] for n in LAGGING}
     x1 |= _lagged(sensors, amid, at, dt)
     step = ca.vertcat(*x1.values()), check + check_mid
     output, name = (ca.vertcat(*readings), check_out), f"gas_path_{power}"

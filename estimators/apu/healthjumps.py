@@ -55,8 +55,8 @@ class JumpTest:
         tests = 3600.0 / dt * len(self.windows)
         return float(self.margin * exceeded(self.rate / tests, ny))
 
-    def first(self, result: FilterResult, start: int) -> tuple[int, int] | None:
-        """Return the first alarm at or after sample ``start``: (alarm, onset), or None."""
+    def statistic(self, result: FilterResult, start: int) -> np.ndarray:
+        """Return the largest of the windows that end at each sample, from ``start`` on, (K,)."""
         e = whitened(result, self.limit)
         total = np.concatenate([np.zeros((1, e.shape[1])), np.cumsum(e, axis=0)])
         K = e.shape[0]
@@ -65,6 +65,13 @@ class JumpTest:
             at = np.arange(max(start, 0) + n - 1, K)
             stat = np.sum((total[at + 1] - total[at + 1 - n]) ** 2, axis=1) / n
             best[at] = np.maximum(best[at], stat)
+        return best
+
+    def first(self, result: FilterResult, start: int) -> tuple[int, int] | None:
+        """Return the first alarm at or after sample ``start``: (alarm, onset), or None."""
+        e = whitened(result, self.limit)
+        total = np.concatenate([np.zeros((1, e.shape[1])), np.cumsum(e, axis=0)])
+        best = self.statistic(result, start)
         over = np.flatnonzero(best > self.threshold(e.shape[1]))
         if not over.size:
             return None

@@ -6,8 +6,8 @@ What passes between them is what couples the models, eqs. (1) and (2):
   in it (:mod:`estimators.apu.electrical.electricalside`).  Its 200 samples are one measurement: the
   energy since the window's start is a state of the electrical filter.  What is common to all
   windows does not average out and is a state of the gas-path filter as well: ``gain_PW`` for the
-  efficiency and the gain errors of the electrical sensors, ``loss_PW`` for the loss of a short
-  circuit that may be there, or of the error of its severity.
+  efficiency and the errors of gains and delay of the electrical sensors, ``loss_PW`` for the loss
+  of a short circuit that may be there, or of the error of its severity.
 * Nothing is decided before that: until a short circuit is found, power is the mean over a healthy
   machine and a short circuit in each phase.  When one is found, the course of the power since it
   came is known better, and the gas-path filter goes over it again: what it is told from then on
@@ -17,7 +17,7 @@ What passes between them is what couples the models, eqs. (1) and (2):
   weighted mean of both.
 
 Of generators that differ in the run each has filters and gain errors of its own, and which one is
-faulty is found; the gas path gets the mean of their powers.  :func:`estimate_joint` can leave h out
+faulty is found; the gas path gets the sum of their powers.  :func:`estimate_joint` can leave h out
 (``ttsc=False``), to show what is mistaken then.
 """
 
@@ -51,7 +51,8 @@ from estimators.apu.electrical.electricalside import (
     electrical_side,
     loosened,
 )
-from estimators.apu.electrical.terminalsignals import GAIN_SENSORS
+from estimators.apu.electrical.hypotheses import SeverityPrior
+from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, PHASES_I
 from estimators.apu.gaspath import (
     GasPathFilter,
     gas_path_filter,
@@ -61,9 +62,18 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, spliced, track_jumps
+from estimators.apu.machinepowers import shaft_courses
 from estimators.apu.priorfile import Prior
+from estimators.apu.sensorchain import interpolated
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
-from estimators.apu.unknowns import Knowledge, of_parameter, usual
+from estimators.apu.unknowns import (
+    EFFICIENCY,
+    ETA_SIGMA,
+    UNKNOWNS,
+    Knowledge,
+    of_parameter,
+    usual,
+)
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import StepMaker
 from estimators.models.recording import Recording
@@ -91,8 +101,6 @@ __all__ = [
     "unit_of",
 ]
 
-ETA_SIGMA = 0.02  # relative; efficiency of the generators
-SETTLED = 5  # windows after which the electrical filters have settled
 TEST = JumpTest()
 
 
@@ -103,6 +111,7 @@ def electrical_samples(
     *,
     sensors: SensorSet = ELECTRICAL,
     gains: Mapping[str, float] | None = None,
+    delay: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Measure the waveforms of a joint run: t, w_r, voltages and currents with noise.
 
@@ -114,6 +123,7 @@ def electrical_samples(
         rng: of the noise; None adds none.
         sensors: the 1-sigma table.
         gains: actual relative gain errors by sensor.
+        delay: actual delay of the phase currents, s.
 
     Raises:
         DataError: the run has no waveforms, or its generators differ.
@@ -124,6 +134,8 @@ def electrical_samples(
         raise DataError("the run has no waveforms; simulate with waveform_dt=1e-4")
     t = np.asarray(ds["time_w"].values, float)
     truth = {n: np.asarray(ds[n].values, float) for n in GAIN_SENSORS}
+    if delay:
+        truth |= {n: interpolated(t, truth[n], t - delay)[0] for n in PHASES_I}
     truth["w_r"] = np.asarray(apu.w_r(np.interp(t, ds["time"].values, ds["N"].values)))
     return {"t": t} | sensors.measure(truth, rng, gains=gains)
 
@@ -231,9 +243,11 @@ def estimate_joint(
     electrical_sensors: SensorSet = ELECTRICAL,
     gas_gains: Mapping[str, float] | None = None,
     electrical_gains: Mapping[str, float] | None = None,
-    eta: float = ETA_SIGMA,
+    delay: float = 0.0,
+    eta: float | None = None,
     gain_errors: bool = True,
     unknowns: Mapping[str, Knowledge] | None = None,
+    severity: SeverityPrior | None = None,
     step: StepMaker | None = None,
     electrical_step: StepMaker = ekf_step,
     backend: str | None = None,
@@ -252,12 +266,13 @@ def estimate_joint(
         gas_sensors, electrical_sensors: 1-sigma tables.
         gas_gains, electrical_gains: actual relative gain errors by sensor; ``PW`` of the former is
             the relative error of efficiency.  Of generators that differ, ``v_a_2``.
-        eta: relative standard deviation of the efficiency; gain errors of the electrical sensors
-            are added to it.
+        delay: actual delay of the phase currents, s.
+        eta: relative standard deviation of the efficiency, instead of that in ``unknowns``.
         gain_errors: whether the filters take gain errors into account; False only where there are
             none.
         unknowns: parameters of the unit that are estimated or considered, by name, see
             :mod:`estimators.apu.unknowns`.
+        severity: prior of a short circuit that may be there.
         step: makes the step of the gas-path filter for its model; its own by default.
         electrical_step: the same of the electrical filters.
         backend: see :func:`apu_casadi.core.backend.compiled`.
@@ -276,17 +291,22 @@ def estimate_joint(
     apu = Apu() if apu is None else apu
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
     t, _ = samples(ds)
+    unknowns = usual(unknowns, gain_errors)
+    if eta is not None:
+        unknowns = {**unknowns, EFFICIENCY: Knowledge.of(eta)}
     how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend, "unknowns": unknowns}
-    also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step}
+    also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step, "prior": severity}
+    also["efficiency_error"] = (gas_gains or {}).get("PW", 0.0)
     sides, pickups = {}, []
     for number, (ending, one, view) in enumerate(machines_of(ds, apu), 1):
         own = own_gains(electrical_gains, ending)
-        measured = electrical_samples(view, one, rng, sensors=electrical_sensors, gains=own)
+        errors: dict[str, Any] = {"gains": own, "delay": delay}
+        measured = electrical_samples(view, one, rng, sensors=electrical_sensors, **errors)
         sides[number] = electrical_side(one, electrical_sensors, measured, t, **also, **how)
         pickups.append((measured["t"], measured["w_r"]))
     gas_sensors.only([*(gas_gains or ())])  # all of them are there
     read = gas_sensors.measure(true_readings(gas_sensors, ds)[1], noise, gains=gas_gains)
-    how |= {"power": power, "eta": eta, "step": step}
+    how |= {"power": power, "step": step}
     gas, tracked = fused(
         apu,
         [*sides.values()],
@@ -294,7 +314,6 @@ def estimate_joint(
         gas_sensors,
         speed=pickups[0] if speed else None,
         speed_sigma=electrical_sensors.sigma("w_r", float(np.median(pickups[0][1]))),
-        efficiency_error=(gas_gains or {}).get("PW", 0.0),
         **how,
     )
     return beside_truth(ds, sides, gas, tracked)
@@ -309,11 +328,9 @@ def fused(
     speed: tuple[np.ndarray, np.ndarray] | None = None,
     speed_sigma: float = math.nan,
     power: bool = True,
-    efficiency_error: float = 0.0,
     prior: Mapping[str, float] | None = None,
     spread: Prior | None = None,
     inputs: Mapping[str, Any] | None = None,
-    eta: float = ETA_SIGMA,
     gain_errors: bool = True,
     unknowns: Mapping[str, Knowledge] | None = None,
     step: StepMaker | None = None,
@@ -325,23 +342,24 @@ def fused(
 
     Args:
         apu: the unit as the filters know it.
-        sides: of one machine, which stands for both, or of the two, on the same instants.
+        sides: of each machine in their order, or, of equal ones, of some, which stand for all; on
+            the same instants.
         readings: ``{name: (t, values)}`` by gas-path sensor.
         sensors: 1-sigma table of the gas path.
         speed: instants and samples of a generator's speed pick-up.
         speed_sigma: standard deviation of each of them.
         power: whether the filter gets the shaft power.
-        efficiency_error: actual relative error of the generators' efficiency.
         prior: means of the start by state.
         spread: of which the standard deviations are taken.
         inputs, max_dt: as for :meth:`GasPathFilter.of_readings`.
         test: of jumps of the health.
-        eta, gain_errors, unknowns, step, backend: as for :func:`estimate_joint`.
+        gain_errors, unknowns, step, backend: as for :func:`estimate_joint`.
     """
     J = of_parameter(usual(unknowns, gain_errors), "J")
-    gas = _gas_filter(apu, sensors, power, gain_errors, eta, J)
+    share = max(math.hypot(s.eta, s.share) for s in sides)
+    gas = _gas_filter(apu, sensors, power, gain_errors, share, J)
     t = sides[0].t
-    courses = _courses(apu, sides)
+    courses = shaft_courses(apu, sides)
     streams: dict[str, Any] = {"readings": readings, "max_dt": max_dt}
     tracked: Tracked | None = None
     if spread is not None:
@@ -353,8 +371,7 @@ def fused(
             given["jump_loss"] = (t, _opening(loss))
         else:
             white = np.hypot(white, loss)
-        told = mean * (1 + efficiency_error)
-        known = t, np.append(told, told[-1]), np.append(white, white[-1])
+        known = t, np.append(mean, mean[-1]), np.append(white, white[-1])
         data = gas.of_readings(**streams, power=known, inputs=given)
         if speed is not None:
             data = _with_speed(gas, data, speed, speed_sigma, apu)
@@ -364,29 +381,6 @@ def fused(
         tracked = now if tracked is None else spliced(tracked, now, k)
     assert tracked is not None
     return gas, tracked
-
-
-def _courses(
-    apu: Apu, sides: Sequence[ElectricalSide]
-) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-    """Shaft power as the gas path is told: from which window on, mean, noise, coherent error, W."""
-    n, eta = len(sides), apu.coupling.eta_gtSg
-    out = []
-    for first in sorted({v.start for s in sides for v in s.views}):
-        views = [[v for v in s.views if v.start <= first][-1] for s in sides]
-        common = [_common(v.loss) for v in views]
-        pairs = zip(views, common, strict=True)
-        noise = sum(v.noise + np.maximum(v.loss - c, 0.0) for v, c in pairs)
-        mean = apu.PW(sum(v.P for v in views) / n)
-        out.append((first, mean, np.sqrt(noise) / n / eta, np.sqrt(sum(common)) / n / eta))
-    return out
-
-
-def _common(loss: np.ndarray) -> np.ndarray:
-    """What of the variance is the same error in all windows: what it is once it has settled."""
-    k = min(SETTLED, loss.size - 1)
-    later: np.ndarray = np.maximum.accumulate(loss[k:])
-    return np.append(np.full(k, later[0]), later)
 
 
 def _opening(loss: np.ndarray) -> np.ndarray:
@@ -408,9 +402,8 @@ def _with_speed(
 
 
 def _gas_filter(
-    apu: Apu, sensors: SensorSet, power: bool, gain_errors: bool, eta: float, J: Knowledge
+    apu: Apu, sensors: SensorSet, power: bool, gain_errors: bool, share: float, J: Knowledge
 ) -> GasPathFilter:
-    common = math.hypot(eta, GAIN_SHARE if gain_errors else 0.0)
     return gas_path_filter(
         apu.gas_generator,
         sensors,
@@ -418,9 +411,9 @@ def _gas_filter(
         gains=gain_errors,
         inertia=J.sigma or None,
         consider_inertia=J.how == "considered",
-        eta=common if power and common else None,
+        eta=share if power and share else None,
         consider_eta=False,
-        loss=bool(power and common),
+        loss=bool(power and share),
     )
 
 
@@ -468,7 +461,9 @@ def beside_truth(
     P_true = window_means(ds["time"].values, ds["P_total"].values, t)[:-1]
     share = int(ds.attrs.get("generators", 2)) / 2 / len(known)
     P = share * np.sum([s.P for s in known.values()], axis=0)
-    sigma = share * np.sqrt(np.sum([s.variance for s in known.values()], axis=0))
+    # the machines are of one kind: the efficiency errs in all of them alike
+    own = np.sqrt(np.sum([s.given_efficiency for s in known.values()], axis=0))
+    sigma = share * np.hypot(own, np.sum([s.eta * s.P for s in known.values()], axis=0))
     doc = "mean mechanical power of both generators over the window before"
     P, sigma, P_true = (np.append(np.nan, v) for v in (P, sigma, P_true))
     put("P_total", "W", doc, P, sigma, P_true)
@@ -486,14 +481,31 @@ def beside_truth(
 
 @dataclass(frozen=True)
 class JointCase:
-    """Errors of sensors and efficiency drawn for one seed."""
+    """Errors of sensors, efficiency and winding drawn for one seed.
+
+    Args:
+        gas_gains, electrical_gains: of sensors; ``PW`` is the error of the efficiency.
+        delay: of the phase currents, s.
+        r_s: relative error of the stator's resistance as the filters know it.
+    """
 
     gas_gains: dict[str, float]
     electrical_gains: dict[str, float]
+    delay: float = 0.0
+    r_s: float = 0.0
+
+    def unit(self, apu: Apu) -> Apu:
+        """Return the unit as the filters know it, of a true one."""
+        return apu.change({"machine.r_s": apu.generator.machine.r_s * (1 + self.r_s)})
+
+    def errors(self) -> dict[str, Any]:
+        """Return what :func:`estimate_joint` takes of it."""
+        named = ("gas_gains", "electrical_gains", "delay")
+        return {n: getattr(self, n) for n in named}
 
 
 def joint_case(seed: int, *, electrical: bool = True, machines: int = 1) -> JointCase:
-    """Draw the gain errors of a seed from the sensor sets, and the error of efficiency.
+    """Draw the gain errors of a seed from the sensor sets, and what else is considered.
 
     With more than one of ``machines`` that differ, their names have endings, ``v_a_2``.
     """
@@ -504,7 +516,8 @@ def joint_case(seed: int, *, electrical: bool = True, machines: int = 1) -> Join
     if machines > 1:
         more = [gains, *(ELECTRICAL.draw_gains(rng, GAIN_SENSORS) for _ in range(1, machines))]
         gains = {f"{n}_{k}": v for k, own in enumerate(more, 1) for n, v in own.items()}
-    return JointCase(gas, gains if electrical else {})
+    rest = [UNKNOWNS[n].sigma * float(rng.standard_normal()) for n in ("delay_i", "machine.r_s")]
+    return JointCase(gas, gains if electrical else {}, *rest)
 
 
 def cross_talk(

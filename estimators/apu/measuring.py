@@ -27,7 +27,7 @@ from estimators.apu.gaspath import true_readings
 from estimators.apu.joint import electrical_samples, machines_of
 from estimators.apu.sensorchain import Draws, disturbed, sampled_wave
 from estimators.apu.sensorfile import SensorFile, read_sensors
-from estimators.apu.sensors import SensorSet
+from estimators.apu.sensors import SensorSet, plain
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -75,25 +75,32 @@ def measure_run(
     times = {"gaspath": t}
     if "time_w" in ds and s.electrical.sensors:
         made["electrical"] = {}
-        for number, (ending, one, view) in enumerate(machines_of(ds, apu), 1):
-            own, of = _drawn(s.electrical, GAIN_SENSORS, with_gains), Draws(seed, number)
+        for number, (ending, one, view) in enumerate(_machines(ds, apu, s.electrical), 1):
+            table = s.electrical.machine(number)
+            own, of = _drawn(table, GAIN_SENSORS, with_gains), Draws(seed, number)
             true = electrical_samples(view, one, None)
             times["electrical"] = t_w = true.pop("t")
-            here = {
-                n: sampled_wave(s.electrical[n], t_w, true[n], of)
-                for n in true
-                if n in s.electrical
-            }
-            read = s.electrical.measure(here, draws[1], gains=own)
-            read = disturbed(s.electrical, t_w, read, of, errors=gains)
+            here = {n: sampled_wave(table[n], t_w, true[n], of) for n in true if n in table}
+            read = table.measure(here, draws[1], gains=own)
+            read = disturbed(table, t_w, read, of, errors=gains)
             made["electrical"] |= {f"{n}{ending}": v for n, v in read.items()}
     for n in s.rates:
-        if not any(n in read for read in made.values()):
+        if not any(n in map(plain, read) or n in read for read in made.values()):
             raise DataError(f"rate of {n}: it is not measured in this run")
     units = {x.name: x.unit for x in (*s.gas_path.sensors, *s.electrical.sensors)}
     return {
         kind: _dataset(ds, kind, times[kind], read, units, s.rates) for kind, read in made.items()
     }
+
+
+def _machines(ds: xr.Dataset, apu: Apu, sensors: SensorSet) -> list[tuple[str, Apu, xr.Dataset]]:
+    """Generators as :func:`machines_of`; alike ones with sensors of their own one by one."""
+    found, own = machines_of(ds, apu), sensors.numbered
+    if own and own[-1] > len(apu.machines):
+        raise DataError(f"sensors of generator {own[-1]}: the unit has {len(apu.machines)}")
+    if own and len(found) < len(apu.machines):
+        return [(f"_{k}", *found[0][1:]) for k in range(1, len(apu.machines) + 1)]
+    return found
 
 
 def drawn_gains(sensors: SensorFile, seed: int) -> dict[str, float]:
@@ -129,8 +136,8 @@ def _dataset(
 
     out = xr.Dataset(coords={"time": ("time", t, {"units": "s"})})
     for n, v in read.items():
-        plain = n if n in units else n.rpartition("_")[0]
-        out[n] = ("time", _thinned(plain, t, v, rates), {"units": units[plain]})
+        own = n if n in units else plain(n)
+        out[n] = ("time", _thinned(own, t, v, rates), {"units": units[own]})
     if kind == "gaspath" and "ambient" in ds.attrs:
         for n, v in json.loads(ds.attrs["ambient"]).items():
             if n in CONDITIONS:

@@ -13,7 +13,7 @@ The error of a fuel reading holds for 20 ms.  It is a state, drawn anew with eve
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,12 +22,15 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, EstimationError
 from apu_casadi.core.results import GENERATOR, of_generator
-from apu_casadi.core.sharing import Parametric, kept
+from apu_casadi.core.sharing import Parametric, keep, kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.conditions import AMBIENT
+from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.health import HEALTH
-from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.apu import Apu, CouplingParameters
 from apu_casadi.unit.events import who
+from apu_casadi.unit.exchange import Link
+from apu_casadi.unit.jointfamily import of_group
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.tracking import window_power
 from estimators.apu.gaspath import GasPathFilter, gas_path_filter, samples
@@ -122,12 +125,8 @@ class Monolithic(Parametric):
         return extended_kalman_filter(self.model, prior, data, full=True, backend=backend)
 
 
-def _named(numbers: tuple[int, ...], signals: Iterable[Signal], alone: bool) -> list[Signal]:
-    """Return signals of a group under the names that they have in the unit."""
-    prefix, of = f"generator{numbers[0]}.", who(numbers)
-    if alone:
-        return [*signals]
-    return [dataclasses.replace(s, name=prefix + s.name, doc=f"{of}: {s.doc}") for s in signals]
+def _prefix(numbers: tuple[int, ...], alone: bool) -> str:
+    return "" if alone else f"generator{numbers[0]}."
 
 
 def _kept_noises(me: FilterModel) -> list[int]:
@@ -144,7 +143,7 @@ def _signals(
         speed = dataclasses.replace(me.u["w_r"], default=None)
         parts = ([*me.x], [*me.u], [me.w[i] for i in _kept_noises(me)], [*me.y, speed])
         for all_of, own in zip((x, u, w, y), parts, strict=True):
-            all_of += _named(k, own, len(of) == 1)
+            all_of += of_group(own, _prefix(k, len(of) == 1), k)
     fuel = (mg.u[n] for n in ("Wf", "sigma_Wf", *AMBIENT))
     w.append(Signal("w_Wf", "1", "error of the next fuel reading"))
     return (
@@ -187,48 +186,91 @@ def monolithic_filter(
             raise EstimationError(
                 f"{who(group)} differ: one electrical filter cannot stand for them"
             )
-    mg, gg, models = gas.model, gas.gg, [f.model for f in each]
+    if gas.model.x.names != (*gas.gg.X.names, *HEALTH) or any(len(f.model.p) for f in each):
+        raise EstimationError(
+            "the filter of the whole unit takes a gas-path filter without gains, inertia or "
+            "efficiency among its states, and electrical filters with all three severities"
+        )
+    whole = _family(gas.gg, gas.model, of, [f.model for f in each])
+    held = dict(gas.model.held)
+    for group, f in zip(of, each, strict=True):
+        gear = apu.machines[group[0] - 1].coupling.held("coupling")
+        prefix = _prefix(group, len(of) == 1)
+        held |= {prefix + n: v for n, v in (f.model.held | gear).items()}
+    return Monolithic(apu, each, gas, whole.member(held), of)
+
+
+def _family(
+    gg: GasGenerator,
+    mg: FilterModel,
+    of: tuple[tuple[int, ...], ...],
+    models: Sequence[FilterModel],
+) -> FilterModel:
+    """The model of all units of a structure, made once, with their numbers as parameters."""
+    shared = tuple(m.shared for m in models)
+    return keep(gg.family, _family, (mg.shared, of, shared), lambda: _all_units(gg, mg, of, shared))
+
+
+def _all_units(
+    gg: GasGenerator,
+    mg: FilterModel,
+    of: tuple[tuple[int, ...], ...],
+    models: Sequence[FilterModel],
+) -> FilterModel:
     X, U, W, Y = _signals(of, models, mg)
-    x, u, w = (ca.MX.sym(n, len(s)) for n, s in (("x", X), ("u", U), ("w", W)))
-    p, dt = ca.MX.sym("p", 0), ca.MX.sym("dt")
-    at = dict(zip(X.names, ca.vertsplit(x), strict=True))
-    given = dict(zip(U.names, ca.vertsplit(u), strict=True))
+    engine_numbers, own = mg.shared.p, _numbers(of, models)
+    P = Signals([*engine_numbers, *(s for numbers in own for s in numbers)])
+    x, u, p, w = (ca.MX.sym(n, len(s)) for n, s in zip("xupw", (X, U, P, W), strict=True))
+    dt = ca.MX.sym("dt")
+    at, given, value = (
+        dict(zip(s.names, ca.vertsplit(v), strict=True)) for s, v in ((X, x), (U, u), (P, p))
+    )
     N, health = at["N"], ca.vertcat(*(at[n] for n in HEALTH))
     moved, seen, checks, power = [], [], [], []
     i = j = n = 0
-    for group, me in zip(of, models, strict=True):
-        link, ne, keep = apu.link_of(group), len(me.x), _kept_noises(me)
+    for group, me, numbers in zip(of, models, own, strict=True):
+        ne, keep_w, prefix = len(me.x), _kept_noises(me), _prefix(group, len(of) == 1)
+        gear = {k: value[f"{prefix}coupling.{k}"] for k in ("gear", "eta_gtSg")}
+        n_pp = value[f"{prefix}machine.n_pp"]
+        link = Link(GOVERNOR, value["gas_generator.N"], **gear, n_pp=n_pp, pairs=len(group) / 2)
+        p_e = p[P.indices(numbers.names[: len(me.p)])]
         # the generators at the speed of the rotor, (2)
         known = dict(zip(me.u.names, ca.vertsplit(u[j : j + len(me.u)]), strict=True))
         u_e = me.u.stack(known | {"w_r": link.w_r(N), "keep": ca.MX(0)})
         w_e = ca.MX.zeros(len(me.w))
-        for k, own in enumerate(keep):
-            w_e[own] = w[n + k]
-        x_e, check_e = me.transition(x[i : i + ne], u_e, p, w_e, dt)
-        y_e, _ = me.output(x[i : i + ne], u_e, p, w_e)
+        for k, place in enumerate(keep_w):
+            w_e[place] = w[n + k]
+        x_e, check_e = me.transition(x[i : i + ne], u_e, p_e, w_e, dt)
+        y_e, _ = me.output(x[i : i + ne], u_e, p_e, w_e)
         moved.append(x_e)
         seen += [y_e, link.w_r(N)]
         checks.append(check_e)
         power.append(link.PW(x_e[me.x.index("energy")]) / ca.fmax(dt, 1e-12))
-        i, j, n = i + ne, j + len(me.u), n + len(keep)
+        i, j, n = i + ne, j + len(me.u), n + len(keep_w)
     # their power of this step loads the rotor, (1)
     PW = sum(power[1:], power[0])
     Wf = given["Wf"] - given["sigma_Wf"] * at["error_Wf"]
-    engine = engine_function(gg.cycle)
+    function, theta = engine_function(gg.family), ca.vertcat(health, p[: len(engine_numbers)])
     inputs: dict[str, Any] = {n: given[n] for n in AMBIENT} | {"PW": PW, "Wf": Wf}
-    _, y_g, check_y, _ = engine(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), health)
-    k1, _, check, _ = engine(N, gg.U.stack(inputs), health)
-    slope = GOVERNOR.slope(N, k1, gg.parameters.N)
+    _, y_g, check_y, _ = function(N, gg.U.stack(inputs | {"PW": ca.MX(0)}), theta)
+    k1, _, check, _ = function(N, gg.U.stack(inputs), theta)
+    slope = GOVERNOR.slope(N, k1, value["gas_generator.N"])
     now = inputs | {"Wf": Wf + given["since"] * slope}
-    k2, _, check_2, _ = engine(N, gg.U.stack(now), health)
+    k2, _, check_2, _ = function(N, gg.U.stack(now), theta)
     error = (1 - given["fresh"]) * at["error_Wf"] + given["fresh"] * w[len(W) - 1]
     x1 = ca.vertcat(*moved, N + dt * k2, health, error)
     y = ca.vertcat(*seen, N, y_g)
     step, output = (x1, sum(checks[1:], checks[0]) + check + check_2), (y, check_y)
-    model = FilterModel.of("unit", (X, U, Signals(), W, Y), (x, u, p, w, dt), step, output)
+    model = FilterModel.of("unit", (X, U, P, W, Y), (x, u, p, w, dt), step, output)
     walk = np.concatenate([*(me.walk for me in models), mg.walk, [0.0]])
-    model = model.with_walk(dict(zip(X.names, walk, strict=True)))
-    return Monolithic(apu, each, gas, model, of)
+    return model.with_walk(dict(zip(X.names, walk, strict=True)))
+
+
+def _numbers(of: Sequence[tuple[int, ...]], models: Sequence[FilterModel]) -> list[Signals]:
+    """Numbers of the machine, and of the gear behind them, of each group."""
+    gear = CouplingParameters().signals("coupling")
+    each = zip(of, models, strict=True)
+    return [Signals(of_group([*me.p, *gear], _prefix(k, len(of) == 1), k)) for k, me in each]
 
 
 class _Side(NamedTuple):

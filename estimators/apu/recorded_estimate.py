@@ -14,8 +14,9 @@ believed.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,25 +24,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.errors import DataError, EstimationError, ParameterError, nearest
+from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
-from estimators.apu.believable import (
-    Doubt,
-    channel_doubts,
-    gas_causes,
-    gas_doubts,
-    machine_causes,
-    machine_doubts,
-)
+from apu_casadi.unit.events import who
+from estimators.apu.believable import channel_doubts, gas_causes, gas_doubts
 from estimators.apu.declared import as_declared, tables
+from estimators.apu.diagnosis import Diagnosis, diagnoses
 from estimators.apu.electrical.causes import Causes
-from estimators.apu.electrical.electricalfilter import window_starts
-from estimators.apu.electrical.gaps import evened, usable
-from estimators.apu.electrical.sequences import Sequences, sequences
-from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_I, PHASES_V, VOLTAGES
-from estimators.apu.electrical.wild import wild_samples
+from estimators.apu.electrical.electricalfilter import ElectricalFilter
+from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import (
     ITERATED,
     ITERATIONS,
@@ -49,15 +42,11 @@ from estimators.apu.gaspath import (
     GasPathFilter,
     gas_path_filter,
 )
-from estimators.apu.gaspathmodel import DT
+from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
-from estimators.apu.joint import (
-    ETA_SIGMA,
-    ElectricalSide,
-    electrical_side,
-    fused,
-    unit_of,
-)
+from estimators.apu.joint import ElectricalSide, fused, unit_of
+from estimators.apu.machinepowers import fusable
+from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
     gas_dataset,
@@ -67,9 +56,11 @@ from estimators.apu.recorded_report import (
     side_dataset,
     words,
 )
+from estimators.apu.recordedwaves import Waves, machines_in, told
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.unknowns import EFFICIENCY
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.filters.robust import limit_of, robust_ekf_step
@@ -78,12 +69,10 @@ from estimators.models.recording import Recording
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["PARTS", "RecordedEstimate", "estimate", "gas_path_data"]
+__all__ = ["PARTS", "RecordedEstimate", "electrical_data", "estimate", "gas_path_data"]
 
 PARTS = ("gaspath", "electrical")
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
-NEEDED = ("w_r", *VOLTAGES, *MEASURED)
-PER_PERIOD = 8  # samples of a period that the electrical filter needs
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
 GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
@@ -109,6 +98,7 @@ class RecordedEstimate:
         path: the gas-path filter and its result with the jumps that it found.
         sides: what the electrical filters say, by machine.
         causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
+        compared: what a comparison of the machines says (:mod:`estimators.apu.peers`).
     """
 
     gaspath: xr.Dataset | None
@@ -122,11 +112,17 @@ class RecordedEstimate:
     path: tuple[GasPathFilter, Tracked] | None = field(default=None, repr=False)
     sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
     causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
+    compared: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def believable(self) -> bool:
         """Whether nothing speaks against the estimates."""
         return not self.doubts
+
+    @property
+    def diagnoses(self) -> list[Diagnosis]:
+        """One answer for each change, by all that saw it."""
+        return diagnoses(self.causes)
 
     def datasets(self) -> dict[str, xr.Dataset]:
         """Return the estimates over time by what they are of."""
@@ -139,8 +135,11 @@ class RecordedEstimate:
         if self.gaspath is not None:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
+        if self.compared:
+            out["compared"] = dict(self.compared)
         out["sequences"] = {n: sequence_report(s) for n, s in self.sequences.items()}
         out["causes"] = {n: [asdict(c) for c in told] for n, told in self.causes.items() if told}
+        out["changes"] = [asdict(d) for d in self.diagnoses]
         return out | {"lacking": dict(self.lacking), "notes": list(self.notes)}
 
     def summary(self) -> str:
@@ -171,7 +170,8 @@ def estimate(
         electrical_sensors: those of the generators, where ``sensors`` are the gas path's alone.
         ambient: altitude, Mach, dT_isa, war; they go before columns, and these before the default
             day.
-        prior: means and standard deviations of states of the gas-path filter, or their file.
+        prior: means and standard deviations of states of the gas-path filter, of parameters of
+            the generators and of a short circuit, or their file.
         efficiency_error: actual relative error of the generators' efficiency, where the shaft power
             comes from the waveforms.
         backend: see :func:`apu_casadi.core.backend.compiled`.
@@ -184,6 +184,8 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu, start = _known(engine, prior)
+    how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
+    how |= {"efficiency_error": efficiency_error, "backend": backend}
     lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
@@ -197,8 +199,9 @@ def estimate(
     if only != "electrical" and reason is not None and (m.gaspath or only):
         lacking["gas path"] = reason
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
-    for k in _machines(m) if only != "gaspath" and m.electrical else ():
-        waves = _Waves(m.machine(k), k, unit_of(apu, k), electrical_sensors, backend)
+    for k in machines_in(m) if only != "gaspath" and m.electrical else ():
+        own = electrical_sensors.machine(k)
+        waves = Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
@@ -206,26 +209,34 @@ def estimate(
     if only == "electrical" and not m.electrical:
         lacking["generators"] = "nothing of them was measured"
     found_by, e = None, None
-    fusable = _fusable(m, apu, sides, notes) if gas else {}
+    fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
-        given = ambient or {}, notes, doubts, backend, start, efficiency_error
-        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fusable, electrical_sensors)
+        given = ambient or {}, notes, doubts, backend, start
+        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         e = gas_dataset(filt, tracked)
         doubts += gas_doubts(filt, tracked, list(sides.values()))
-        causes["gas path"], odd = _told(gas_causes(filt, tracked))
+        causes["gas path"], odd = told(gas_causes(filt, tracked))
         doubts += odd
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
+    compared, alike = compared_sides(sides)[1:]
+    doubts += alike
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
     if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
-        some = ", ".join(map(str, sides))
-        notes.append(f"only machine {some} is estimated; power is that of {n} equal ones")
+        some, rest = (
+            who(ks).replace("generator", "machine")
+            for ks in (tuple(sides), [k for k in range(1, n + 1) if k not in sides])
+        )
+        notes.append(
+            f"only {some} {'is' if len(sides) == 1 else 'are'} estimated, not {rest}; power is "
+            f"that of {n} equal ones"
+        )
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    end: Any = found_by and found_by[1].result, found_by, sides, causes
-    return RecordedEstimate(e, machines, found, bool(fusable), lacking, *texts, *end)
+    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
+    return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
 
 
 def gas_path_data(
@@ -249,47 +260,45 @@ def gas_path_data(
     if reason := _no_gas_path(ready.m, ready.gas_path):
         raise DataError(f"no gas path: {reason}")
     notes = [*m.notes, *ready.notes, *ready.doubts]
-    given = ambient or {}, notes, notes, None, start, 0.0
+    given = ambient or {}, notes, notes, None, start
     path = _GasPath(ready.m, apu, ready.gas_path, *given)
     filt, data, begin = path.alone()
     return filt, data, begin, tuple(dict.fromkeys(notes))
 
 
+def electrical_data(
+    m: Measurements,
+    engine: Apu | str | Path | None = None,
+    *,
+    machine: int | None = None,
+    sensors: SensorSet | SensorFile | str | Path | None = None,
+) -> tuple[ElectricalFilter, Recording, Belief, tuple[str, ...]]:
+    """Return one generator's filter for a recording, its data, its prior, and notes.
+
+    Args:
+        m, engine, sensors: as of :func:`estimate`.
+        machine: number of the generator; None: the first that was measured.
+
+    Raises:
+        DataError: as of :func:`estimate`; the recording has not what the filter needs.
+    """
+    apu, _ = _known(engine, None)
+    ready = as_declared(m, *tables(m, sensors, ELECTRICAL))
+    there = machines_in(ready.m)
+    k = there[0] if machine is None else machine
+    if k not in there:
+        raise DataError(f"generator {k} was not measured, but {', '.join(map(str, there))}")
+    notes = [*m.notes, *ready.notes, *ready.doubts, f"generator {k}"]
+    waves = Waves(ready.m.machine(k), k, unit_of(apu, k), ready.electrical.machine(k), {})
+    return *waves.filtered(notes), tuple(dict.fromkeys(notes))
+
+
 def _known(engine: Apu | str | Path | None, prior: Prior | str | Path | None) -> tuple[Apu, Prior]:
     """Return the unit and the prior, from their files where they are named."""
     apu = engine if isinstance(engine, Apu) else Apu() if engine is None else read_unit(engine).unit
-    return apu, read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
-
-
-def _told(
-    found: Iterable[tuple[Causes, Doubt | None]],
-) -> tuple[tuple[Causes, ...], list[Doubt]]:
-    """Part causes from the doubts that they raise."""
-    both = list(found)
-    return tuple(c for c, _ in both), [d for _, d in both if d is not None]
-
-
-def _fusable(
-    m: Measurements, apu: Apu, sides: Mapping[int, ElectricalSide], notes: list[str]
-) -> dict[int, ElectricalSide]:
-    """Return the machines whose powers make the shaft power."""
-    if not sides:
-        return {}
-    if not apu.alike:
-        notes.append("the generators differ: the gas path has no shaft power from the waveforms")
-        return {}
-    t, fuel = next(iter(sides.values())).t, m.streams("Wf")["Wf"][0]
-    if min(t[-1], fuel[-1]) - max(t[0], fuel[0]) < 0.5 * (fuel[-1] - fuel[0]):
-        notes.append(
-            f"the waveforms, {t[0]:g} to {t[-1]:g} s, cover less than half of the gas path's time: "
-            "the two are estimated apart; give that part of the gas path alone to have both"
-        )
-        return {}
-    alike = {k: s for k, s in sides.items() if s.t.shape == t.shape}
-    alike = {k: s for k, s in alike.items() if np.abs(s.t - t).max() <= 1e-9}
-    if len(alike) < len(sides):
-        notes.append("the generators were sampled at other instants: power is that of the first")
-    return alike
+    start = read_prior(prior) if isinstance(prior, str | Path) else prior or Prior()
+    values = start.values()
+    return apu.change(values) if values else apu, start
 
 
 def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
@@ -301,110 +310,6 @@ def _no_gas_path(m: Measurements, table: SensorSet) -> str | None:
     if not [n for n in table.outputs if n in m and n != "N"]:
         return f"none of {', '.join(n for n in table.outputs if n != 'N')} was measured"
     return None
-
-
-def _machines(m: Measurements) -> list[int]:
-    """Numbers of the machines that were measured; 1 where the names have none."""
-    ends = {n.rpartition("_")[2] for n in m.electrical} & set("1234")
-    return sorted(map(int, ends)) or [1]
-
-
-# ------------------------------------------------------------------------------ generators
-
-
-@dataclass(frozen=True, eq=False)
-class _Waves:
-    """One machine's waveforms and what they suffice for."""
-
-    m: Measurements
-    number: int
-    apu: Apu
-    sensors: SensorSet
-    backend: str | None
-
-    def sequences(self, lacking: dict[str, str]) -> dict[str, Sequences]:
-        """Symmetrical components of currents and voltages."""
-        out = {}
-        for kind, names in (("i", PHASES_I), ("v", PHASES_V)):
-            there = [n for n in names if n in self.m]
-            what = f"{kind} of machine {self.number}"
-            for n in there:
-                self._check_rate(n)
-            if 0 < len(there) < 3:
-                no = ", ".join(self.m.lacking(names))
-                lacking[f"symmetrical components, {what}"] = f"{no} was not measured"
-            elif there:
-                a = self.m.samples(*names)
-                try:
-                    out[what] = sequences(a["t"], np.array([a[n] for n in names]))
-                except DataError as e:
-                    lacking[f"symmetrical components, {what}"] = str(e)
-        return out
-
-    def _check_rate(self, name: str) -> None:
-        rate, f = self.m[name].rate, self.apu.generator.machine.f_rated
-        if rate < 2 * f * (1 - 1e-6):
-            raise DataError(
-                f"{self.m[name].source}: {rate:g} samples a second show nothing of {f:g} Hz: "
-                f"{2 * f:g} are needed at least, {PER_PERIOD * f:g} for the electrical filter; "
-                "give the engine if the machine has another frequency"
-            )
-
-    def side(
-        self,
-        begin: float,
-        lacking: dict[str, str],
-        doubts: list[str],
-        notes: list[str],
-        causes: dict[str, tuple[Causes, ...]],
-    ) -> ElectricalSide | None:
-        """Run the electrical filter from an instant on; None where it cannot."""
-        what = f"severity, machine {self.number}"
-        no = [n for n in NEEDED if n not in self.m or n not in self.sensors]
-        if no:
-            lacking[what] = f"the electrical filter needs {', '.join(no)} too"
-            return None
-        rate, f = self.m["v_a"].rate, self.apu.generator.machine.f_rated
-        if rate < PER_PERIOD * f * (1 - 1e-6):
-            lacking[what] = (
-                f"{rate:g} samples a second; the electrical filter needs {PER_PERIOD * f:g}, "
-                f"{PER_PERIOD} a period"
-            )
-            return None
-        waves = self.m.samples(*NEEDED[1:])
-        w = self.m.streams("w_r")["w_r"]
-        if self.m["w_r"].t is not self.m["v_a"].t:
-            inside = (waves["t"] >= w[0][0]) & (waves["t"] <= w[0][-1])
-            waves["w_r"] = np.where(inside, np.interp(waves["t"], *w), np.nan)
-        else:
-            waves |= self.m.samples("w_r")
-        try:
-            a = usable({n: waves[n] for n in ("t", *NEEDED)}, ("w_r", *VOLTAGES))
-            a = {n: v[a["t"] >= begin - 1e-9] for n, v in a.items()}
-            if a["t"].size < 2 or a["t"][-1] - a["t"][0] < DT:
-                raise DataError(f"the waveforms hold no window of {DT * 1e3:g} ms")
-            a = self._tame(a, notes)
-            even = evened(a)["t"]
-            t = even[window_starts(even, DT, None)]
-            side = electrical_side(self.apu, self.sensors, a, t, judged=True, backend=self.backend)
-        except (DataError, EstimationError) as e:
-            lacking[what] = str(e)
-            return None
-        how, name = (side, self.apu.generator.machine, self.sensors, a), f"machine {self.number}"
-        causes[name], odd = _told(machine_causes(*how))
-        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
-        return side
-
-    def _tame(self, a: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
-        """Take single wild samples of the waveforms for missing."""
-        names = (*PHASES_V, *PHASES_I)
-        sigma = {n: self.sensors.sigma(n, 0.0) for n in names}
-        w = float(np.nanmedian(a["w_r"]))
-        wild = wild_samples(a["t"], {n: a[n] for n in names}, w, sigma)
-        told = ", ".join(f"{int(v.sum())} of {n}" for n, v in wild.items() if v.any())
-        if told:
-            notes.append(f"machine {self.number}: single wild samples are taken for gaps: {told}")
-        return a | {n: np.where(v, np.nan, a[n]) for n, v in wild.items() if v.any()}
 
 
 # ------------------------------------------------------------------------------ gas path
@@ -422,7 +327,6 @@ class _GasPath:
     doubts: list[str]
     backend: str | None
     prior: Prior
-    efficiency_error: float
 
     def run(
         self, of: Mapping[int, ElectricalSide], electrical: SensorSet
@@ -434,9 +338,16 @@ class _GasPath:
         span = (sides[0].t[0], sides[0].t[-1]) if sides else (-math.inf, math.inf)
         readings = self._readings(sensors, inputs, span, known_power=power and not sides)
         if sides:
-            own = self.m.machine(next(iter(of))).streams("w_r")["w_r"]
+            first = next(iter(of))
+            electrical = electrical.machine(first)
+            own = self.m.machine(first).streams("w_r")["w_r"]
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
-            own = own[0][inside], own[1][inside]
+            # as the first machine's would be
+            ratio = self.apu.w_r(1.0) / unit_of(self.apu, first).w_r(1.0)
+            own = own[0][inside], ratio * own[1][inside]
+            if "PW" in sensors:  # of which the sensor is not used
+                plain = dataclasses.replace(sensors["PW"], tau=0.0)
+                sensors = SensorSet(tuple(plain if s.name == "PW" else s for s in sensors.sensors))
             return fused(
                 self.apu,
                 sides,
@@ -444,9 +355,9 @@ class _GasPath:
                 sensors,
                 speed=own,
                 speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
-                prior=self._start(readings, sensors) | dict(self.prior.mean),
-                spread=self.prior,
-                efficiency_error=self.efficiency_error,
+                prior=self._start(readings, sensors) | dict(self.prior.of_gas_path().mean),
+                spread=self.prior.of_gas_path(),
+                unknowns=self.prior.unknowns(),
                 inputs=inputs,
                 step=ROBUST,
                 test=JUMPS,
@@ -478,17 +389,20 @@ class _GasPath:
     ) -> tuple[GasPathFilter, Recording, Belief]:
         if not power:
             self.notes.append("no shaft power was measured: it is a random walk")
+        unknowns, known = self.prior.unknowns(), self.prior.of_gas_path()
         filt = gas_path_filter(
             self.apu.gas_generator,
             sensors,
             power="measured" if power else "unknown",
-            eta=ETA_SIGMA if power else None,
+            inertia=unknowns["J"].sigma or None,
+            consider_inertia=unknowns["J"].how == "considered",
+            eta=unknowns[EFFICIENCY].sigma or None if power else None,
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x)
-        means = self._start(readings, sensors) | dict(self.prior.mean)
-        return filt, data, filt.prior(self.prior.sigma, **means)
+        self.prior.check(filt.model.x, generators=False)
+        means = self._start(readings, sensors) | dict(known.mean)
+        return filt, data, filt.prior(known.sigma, **means)
 
     def _inputs(self) -> dict[str, Any]:
         """Ambient conditions: as given, else of columns."""
@@ -516,15 +430,18 @@ class _GasPath:
         streams = self.m.streams(*(n for n in sensors.names if n in self.m))
         for n in [n for n, (t, _) in streams.items() if not t.size]:
             del streams[n]
-        held = ["Wf", "PW"] if known_power else ["Wf"]
-        for n in held:
+        inputs_of = ["Wf", "PW"] if known_power else ["Wf"]
+        for n in inputs_of:
             if n not in streams:
                 raise DataError(f"{n} has no reading")
+        held = [n for n in inputs_of if not sensors[n].tau]
+        for n in held:
             self._check_gaps(n, streams[n][0])
         stamps = [v[0] for v in inputs.values() if isinstance(v, tuple)]
-        begin = max(span[0], *(streams[n][0][0] for n in held), *(t[0] for t in stamps))
-        last = {n: streams[n][0] for n in held}
-        end = min(span[1], *(t[-1] + float(np.median(np.diff(t))) for t in last.values()))
+        firsts = [*(streams[n][0][0] for n in held), *(t[0] for t in stamps)]
+        begin = max([span[0], *firsts])
+        lasts = (streams[n][0] for n in held)
+        end = min([span[1], *(t[-1] + float(np.median(np.diff(t))) for t in lasts)])
         out = {}
         for n, (t, v) in streams.items():
             inside = (t <= end + 1e-9) & ((t >= begin - 1e-9) | (n in held))
@@ -559,7 +476,8 @@ class _GasPath:
 
     def _start(self, readings: Streams, sensors: SensorSet) -> dict[str, float]:
         """Means of the start from the first readings, where the usual ones are far off."""
-        out = {s.name: float(readings[s.name][1][0]) for s in sensors.sensors if s.tau}
+        slow = [s for s in sensors.sensors if s.tau and s.name in readings]
+        out = {n: float(readings[s.name][1][0]) for s in slow for n in {s.name, lag_of(s)}}
         if "N" in readings:
             t, v = readings["N"]
             N, governed = float(v[t < t[0] + 0.2].mean()), self.apu.gas_generator.parameters.N

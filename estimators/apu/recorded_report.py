@@ -120,6 +120,11 @@ def sequence_report(s: Sequences) -> dict[str, Any]:
     return out | {"reference_windows": s.reference, "alarms": list(s.alarms)}
 
 
+def _likely(probability: Mapping[str, float]) -> str:
+    likely = sorted(probability.items(), key=lambda x: -x[1])[:3]
+    return ", ".join(f"{what} {100 * p:.0f} %" for what, p in likely if p > 0.005)
+
+
 def words(r: Mapping[str, Any]) -> Iterator[str]:
     """Yield a report's lines."""
     if "gaspath" in r:
@@ -150,6 +155,11 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
             yield f"  short circuit in phase {a['phase']}, reported at {a['t']:g} s"
         if not e["alarms"]:
             yield "  no short circuit reported; one within the bands above may be there"
+    for k, of in r.get("compared", {"machines": {}})["machines"].items():
+        yield (
+            f"compared with the others, generator {k} has a short circuit with a probability of "
+            f"{of['probability']:.3f}, likeliest in phase {of['likeliest_phase']}"
+        )
     for n, s in r["sequences"].items():
         yield (
             f"{n}: {s['frequency']:.2f} Hz, positive sequence {s['positive']:.4g}, negative over "
@@ -163,9 +173,11 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
             yield "  no change of it" if s["reference_windows"] else f"  {few}"
     for n, told in r["causes"].items():
         for c in told:
-            likely = sorted(c["probability"].items(), key=lambda x: -x[1])[:3]
-            shown = ", ".join(f"{what} {100 * p:.0f} %" for what, p in likely if p > 0.005)
-            yield f"{n}: the change at {c['t']:g} s is: {shown}"
+            yield f"{n}: the change at {c['t']:g} s is: {_likely(c['probability'])}"
+    for d in r["changes"]:
+        yield f"at {d['t']:g} s: {_likely(d['probability'])}" + (
+            f"; it failed by {_likely(d['failure'])}" if d["failure"] else ""
+        )
     yield from (f"not estimated: {n}: {why}" for n, why in r["lacking"].items())
     yield from (f"read: {n}" for n in r["notes"])
     yield from (f"doubt: {d}" for d in r["doubts"])

@@ -42,10 +42,15 @@ class Draws:
         key = [self.seed, 3, self.machine, _KINDS.index(kind), zlib.crc32(name.encode())]
         return np.random.default_rng(key).standard_normal(n)
 
+    def jitter(self, s: Sensor, n: int) -> np.ndarray:
+        """Return the errors of a sensor's instants, s; sensors of one clock have the same ones."""
+        of, name = (Draws(self.seed), f"clock {s.clock}") if s.clock else (self, s.name)
+        return s.jitter * of.normal(name, "jitter", n)
+
 
 def sampled(s: Sensor, time: np.ndarray, v: np.ndarray, t: np.ndarray, of: Draws) -> np.ndarray:
     """Return what it shows at instants of a slow quantity, lag included in ``v``."""
-    at = t - s.delay + s.jitter * of.normal(s.name, "jitter", t.size)
+    at = t - s.delay + of.jitter(s, t.size)
     return np.asarray(np.interp(at, time, v))
 
 
@@ -55,7 +60,7 @@ def sampled_wave(s: Sensor, t: np.ndarray, v: np.ndarray, of: Draws) -> np.ndarr
         v = _followed(t, v, s.tau)
     if not (s.delay or s.jitter):
         return v
-    at = t - s.delay + s.jitter * of.normal(s.name, "jitter", t.size)
+    at = t - s.delay + of.jitter(s, t.size)
     shown = interpolated(t, v, at)[0]
     shown[(at < 2 * t[0] - t[1]) | (at > 2 * t[-1] - t[-2])] = np.nan  # nothing was there yet
     return shown

@@ -20,8 +20,12 @@
     factor = 0.1061        # Hz per rad/s
     noise = 0.05
 
-What an entry does not say is the table's; ``complete = true`` above all entries leaves out the
-sensors that have none.  :func:`sensor_schema` is the JSON schema of such a file, for editors.
+    [i_a_2]                # of the second generator alone
+    noise = 4.0
+
+What an entry does not say is the table's, of ``i_a_2`` that of ``i_a``; ``complete = true`` above
+all entries leaves out the sensors that have none.  :func:`sensor_schema` is the JSON schema of such
+a file, for editors.
 """
 
 from __future__ import annotations
@@ -37,7 +41,17 @@ from apu_casadi.core.register import Key
 from apu_casadi.core.tomlnumbers import read_toml
 from apu_casadi.core.units import UNITS
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from estimators.apu.sensors import ELECTRICAL, KNOWN, WAYS, Sensor, SensorSet, gas_path_table, known
+from estimators.apu.sensors import (
+    ELECTRICAL,
+    KNOWN,
+    NUMBERS,
+    WAYS,
+    Sensor,
+    SensorSet,
+    gas_path_table,
+    known,
+    plain,
+)
 
 __all__ = ["KEYS", "SensorFile", "read_sensors", "sensor_schema", "to_toml"]
 
@@ -64,6 +78,7 @@ _BY_NAME = {k.name: k for k in KEYS}
 _SPANS = {"range": "what it can show; there it saturates", "plausible": "of a running engine"}
 _FLAGS = {"relative": "noise is a share of the reading", "fails": "whether it can fail"}
 _TEXTS = {"quantity": "what it reads", "unit": "of its numbers", "source": "of its numbers"}
+_TEXTS |= {"clock": "what samples it: sensors of one clock share their jitter"}
 _ALL = (*_BY_NAME, *_SPANS, *_FLAGS, *_TEXTS)
 _OWN = {"lag": "tau", "range": "limits"}  # names of Sensor, where they differ
 _SI = {si for si, _, _ in UNITS.values()}
@@ -103,40 +118,42 @@ def read_sensors(path: str | Path | None) -> SensorFile:
     if not isinstance(complete, bool):
         raise DataError(f"{path}: complete must be true or false, got {complete!r:.40}")
     sets = {False: gas_path_table(), True: ELECTRICAL}
-    for name, row in data.items():
+    for name, row in sorted(data.items(), key=lambda x: plain(x[0]) != x[0]):
         if not isinstance(row, dict):
             raise DataError(f"{path}: a table [{name}] is expected, got {row!r:.40}")
         try:
-            new = _sensor(name, row, str(path))
+            new = _sensor(name, row, str(path), sets[True])
         except (DataError, ParameterError) as e:
             raise DataError(f"{path}, {e}") from None
-        table = sets[name in ELECTRICAL]
+        waves = plain(name) in ELECTRICAL
+        table = sets[waves]
         there = (new if s.name == name else s for s in table.sensors)
         changed = tuple(there) if name in table else (*table.sensors, new)
-        sets[name in ELECTRICAL] = SensorSet(changed)
+        sets[waves] = SensorSet(changed)
     if complete:
         sets = {k: s.only([n for n in s.names if n in data]) for k, s in sets.items()}
     return SensorFile(sets[False], sets[True], complete)
 
 
-def _sensor(name: str, row: Mapping[str, Any], source: str) -> Sensor:
-    """Return the sensor of an entry."""
+def _sensor(name: str, row: Mapping[str, Any], source: str, waves: SensorSet) -> Sensor:
+    """Return the sensor of an entry; ``waves``: the generators' so far."""
     for key in row:
         if key not in _ALL:
             raise DataError(f"{name}: unknown key {key!r} {nearest(key, _ALL)}")
     given = {k: _value(name, k, v) for k, v in row.items()}
     valid = (*KNOWN, *ELECTRICAL.names)
     quantity = given.pop("quantity", None)
-    if quantity is None and name not in valid:
+    if quantity is None and plain(name) not in valid:
         hint = "a sensor of its own says its quantity"
         raise DataError(f"unknown sensor {name!r} {nearest(name, valid)}; {hint}")
-    base = ELECTRICAL[name] if name in ELECTRICAL else KNOWN.get(name)
+    electrical = plain(name) in ELECTRICAL
+    base = dataclasses.replace(waves[plain(name)], name=name) if electrical else KNOWN.get(name)
     if quantity is not None:
         base = _reading(name, quantity, base)
     assert base is not None
     changes = {"source": source} | _in_si(name, given, base)
     new = dataclasses.replace(base, **changes)
-    return new if base is KNOWN.get(name) or name in ELECTRICAL else known(new)
+    return new if electrical or base is KNOWN.get(name) else known(new)
 
 
 def _value(name: str, key: str, v: Any) -> Any:
@@ -168,7 +185,7 @@ def _value(name: str, key: str, v: Any) -> Any:
 def _reading(name: str, quantity: str, base: Sensor | None) -> Sensor:
     """Return a sensor of an output: the table's own of that output under another name."""
     outputs = GasGenerator.Y.names
-    if name in ELECTRICAL or (base is not None and base.reads != (quantity,)):
+    if plain(name) in ELECTRICAL or (base is not None and base.reads != (quantity,)):
         raise DataError(f"{name}: it reads {name} in all files: take another name for {quantity}")
     if base is not None and base.name in gas_path_table().names:
         return base
@@ -238,7 +255,9 @@ def sensor_schema() -> dict[str, Any]:
     named["complete"] = {"type": "boolean", "description": doc}
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "apu-casadi sensors"}
     own = {"allOf": [of, {"required": ["quantity"]}], "description": "a sensor of its own"}
+    numbered = {f"^({'|'.join(ELECTRICAL.names)})_[{''.join(NUMBERS)}]$": of}
     made = {"type": "object", "properties": named, "additionalProperties": own}
+    made["patternProperties"] = numbered
     return head | made | {"definitions": {"sensor": table}}
 
 
@@ -256,17 +275,18 @@ def to_toml(sensors: SensorFile) -> str:
 
 
 def _lines(sensors: SensorFile) -> Iterator[str]:
-    plain = {f.name: f.default for f in dataclasses.fields(Sensor)}
-    names = {_OWN.get(n, n): n for n in (*_BY_NAME, "range", "fails")}
+    usual = {f.name: f.default for f in dataclasses.fields(Sensor)}
+    names = {_OWN.get(n, n): n for n in (*_BY_NAME, "range", "fails", "clock")}
     for s in (*sensors.gas_path.sensors, *sensors.electrical.sensors):
         yield f"\n[{s.name}]".ljust(24) + f"# {s.unit}; {s.source}"
-        if s.reads != (s.name,) and s.value is None and s.name not in TABLED:
+        own = s.name not in TABLED and plain(s.name) not in ELECTRICAL
+        if s.reads != (s.name,) and s.value is None and own:
             yield f'quantity = "{s.reads[0]}"\nunit = "{s.unit}"'
         relative = str(s.relative).lower()
         yield f"noise = {s.noise!r}\nrelative = {relative}\ngain = {s.gain!r}"
         for n in (n for n in names if n not in ("noise", "gain")):
             v = getattr(s, n)
-            if v != plain[n]:
+            if v != usual[n]:
                 v = list(v) if isinstance(v, tuple) else v
                 text = str(v).lower() if isinstance(v, bool) else repr(v).replace("'", '"')
                 yield f"{names[n]} = {text}"

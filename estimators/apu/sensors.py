@@ -50,6 +50,7 @@ __all__ = [
     "SensorSet",
     "gas_path_table",
     "known",
+    "plain",
     "register",
     "respond",
     "unregister",
@@ -60,6 +61,8 @@ def _itself(value: Any) -> Any:
     return value
 
 
+#: Endings of the names of one generator's channels, ``i_a_2``.
+NUMBERS = ("1", "2", "3", "4")
 #: What a filter makes of a constant error: a state, one that is considered, or nothing.
 WAYS = ("estimated", "considered", "known")
 _POSITIVE = ("noise", "gain", "tau", "bias", "drift", "delay", "jitter", "quantum", "extra")
@@ -88,7 +91,8 @@ class Sensor:
         bias_mean, bias_as: the same of the offset.
         drift: random walk of the offset, unit per sqrt(s).
         delay: by which a reading is older than its stamp, s.
-        jitter: standard deviation of the instant of each sample, s, independent.
+        jitter: standard deviation of the instant of each sample, s.
+        clock: what samples it; sensors of one clock share their jitter.  "": its own.
         quantum: step of its digits, unit.
         limits: lowest and highest value that it can show, unit; there it saturates.
         factor: reading over what it reads: ``unit`` over that of the output.
@@ -123,6 +127,7 @@ class Sensor:
     factor: float = 1.0
     fails: bool = True
     extra: float = 0.0
+    clock: str = ""
 
     def __post_init__(self) -> None:
         for label in _POSITIVE:
@@ -207,6 +212,7 @@ class Sensor:
         out |= {"gain_mean": f"{self.gain_mean:g}"} if self.gain_mean else {}
         if self.limits is not None:
             out["range"] = f"{self.limits[0]:g} to {self.limits[1]:g} {self.unit}"
+        out |= {"clock": self.clock} if self.clock else {}
         ways = {n: getattr(self, n) for n in ("gain_as", "bias_as")}
         return out | {n: way for n, way in ways.items() if way != WAYS[0]}
 
@@ -296,6 +302,25 @@ class SensorSet:
             ParameterError: unknown sensor.
         """
         return SensorSet(tuple(self[n] for n in names))
+
+    def of_channel(self, name: str) -> Sensor | None:
+        """Return the sensor of a channel, ``i_a_2``, or ``i_a`` of machine 1, or None."""
+        asked = (name, f"{name}_1") if plain(name) == name else (name,)
+        return next((self[n] for n in (*asked[::-1], plain(name)) if n in self), None)
+
+    def machine(self, number: int) -> SensorSet:
+        """Return one generator's sensors by plain names; entries of it alone go first."""
+        if not self.numbered:
+            return self
+        names = dict.fromkeys(plain(n) for n in self.names)
+        own = {n: next((e for e in (f"{n}_{number}", n) if e in self), None) for n in names}
+        made = (dataclasses.replace(self[e], name=n) for n, e in own.items() if e is not None)
+        return SensorSet(tuple(made))
+
+    @property
+    def numbered(self) -> tuple[int, ...]:
+        """Numbers of the generators of which some sensor is declared by itself."""
+        return tuple(sorted({int(n[-1]) for n in self.names if n != plain(n)}))
 
     def table(self) -> list[dict[str, Any]]:
         """Return one row for each sensor, for printing."""
@@ -429,6 +454,13 @@ ELECTRICAL = SensorSet(
         Sensor("w_r", 5e-4, True, 0.0, "rad/s", "assumed: speed pick-up, 0.05 %"),
     )
 )
+
+
+def plain(name: str) -> str:
+    """Return a quantity of a generator without the machine's number: ``v_a`` of ``v_a_2``."""
+    head, _, machine = name.rpartition("_")
+    return head if machine in NUMBERS and head in ELECTRICAL else name
+
 
 #: All gas-path sensors by name, registered ones among them.
 KNOWN: dict[str, Sensor] = {s.name: s for s in (*GAS_PATH.sensors, *MORE)}

@@ -93,16 +93,35 @@ def _corrected(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) 
     a = forward(L, nu)
     K = backward(L, forward(L, PH.T)).T
     if fixed:
-        keep = ca.SX.ones(n)
-        keep[list(fixed)] = 0
-        K = ca.diag(keep) @ K
-    A = ca.SX.eye(n) - K @ H
-    P1 = symmetric(A @ P @ A.T + K @ ca.diag(R) @ K.T)
+        K, P1 = _partly(P, H, K, PH, R, fixed)
+    else:
+        A = ca.SX.eye(n) - K @ H
+        P1 = symmetric(A @ P @ A.T + K @ ca.diag(R) @ K.T)
     nis = ca.dot(a, a)
     measured = ca.sum1(there)
     logdet = 2 * sum((ca.log(L[i, i]) for i in range(ny)), ca.SX(0))
     loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
     return Corrected(K @ nu, P1, S, nis, loglik, measured)
+
+
+def _partly(
+    P: ca.SX, H: ca.SX, K: ca.SX, PH: ca.SX, R: ca.SX, fixed: tuple[int, ...]
+) -> tuple[ca.SX, ca.SX]:
+    """Gain and covariance where some rows stay: Joseph's form, products of n x ny matrices only.
+
+    With considered states n is large and ny is not, and their own covariance does not change.
+    """
+    n = P.shape[0]
+    free = [i for i in range(n) if i not in fixed]
+    own = K[free, :]
+    M = P[free, :] - own @ PH.T
+    new = symmetric(M[:, free] - (M @ H.T) @ own.T + own @ ca.diag(R) @ own.T)
+    gain, P1 = ca.SX(n, K.shape[1]), ca.SX(P)
+    gain[free, :] = own
+    P1[free, free] = new
+    P1[free, list(fixed)] = M[:, list(fixed)]
+    P1[list(fixed), free] = M[:, list(fixed)].T
+    return gain, P1
 
 
 def correct(P: Any, H: Any, nu: Any, R: Any, fixed: tuple[int, ...] = ()) -> Corrected:

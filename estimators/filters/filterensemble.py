@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.lanes.lanelibrary import lanes_in_use
 from apu_casadi.core.lanes.together import CHUNK, ensemble
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult, FilterStep, course
+from estimators.filters.stackedrun import One, run_stacked, stackable
 from estimators.models.recording import Recording
 
 __all__ = ["run_many"]
@@ -47,9 +49,19 @@ def run_many(
     n = lengths.pop() if lengths else 1
     steps, priors, all_data = ([*a] if isinstance(a, Sequence) else [a] * n for a in given)
     results: list[FilterResult | None] = [None] * n
-    courses = (course(*one, full=full) for one in zip(steps, priors, all_data, strict=True))
+    filters = [*zip(steps, priors, all_data, strict=True)]
     done = 0
-    for k, made in ensemble(courses, chunk=chunk, n_threads=n_threads):
+    for group in [] if full else _groups(filters, chunk):
+        together, solved = run_stacked([filters[k] for k in group], n_threads)
+        for k, one in zip(group, together, strict=True):
+            results[k] = one
+        done += solved
+        if progress is not None and solved:
+            progress(done, n)
+    left = [k for k in range(n) if results[k] is None]
+    courses = (course(*filters[k], full=full) for k in left)
+    for at, made in ensemble(courses, chunk=chunk, n_threads=n_threads):
+        k = left[at]
         if isinstance(made, Exception):
             made.add_note(f"filter {k} of the ensemble")
             raise made
@@ -57,3 +69,16 @@ def run_many(
         if progress is not None:
             progress(done, n)
     return [r for r in results if r is not None]
+
+
+def _groups(filters: Sequence[One], chunk: int) -> list[list[int]]:
+    """Return which filters run as arrays together, some multiples of the lanes each."""
+    lanes, together = lanes_in_use(), dict[tuple[int, int], list[int]]()
+    if lanes == 1:
+        return []
+    for k, (step, prior, data) in enumerate(filters):
+        if stackable(step, prior, data):
+            together.setdefault((id(step.shared), data.size), []).append(k)
+    most = max(1, chunk // lanes) * lanes
+    groups = [g for g in together.values() if len(g) > 1]
+    return [g[i : i + most] for g in groups for i in range(0, len(g), most)]

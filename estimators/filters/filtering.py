@@ -16,14 +16,24 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use
 from apu_casadi.core.errors import EstimationError, SignalError
 from apu_casadi.core.lanes.together import Course, Question, Together, alone
 from apu_casadi.core.results import dataset
-from apu_casadi.core.sharing import Parametric, derived, kept
+from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.core.signals import Signal, Signals
 from estimators.filters.algebra import cholesky_semidefinite, root_of
 from estimators.filters.belief import Belief
+from estimators.filters.filterblock import (
+    BLOCK,
+    CHAIN,
+    ROOT_OUT,
+    STEP_IN,
+    STEP_OUT,
+    block_function,
+    block_of,
+    padded,
+)
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
@@ -33,6 +43,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BLOCK",
     "CHAIN",
+    "ROOT_OUT",
     "STEP_IN",
     "STEP_OUT",
     "FilterResult",
@@ -44,17 +55,7 @@ __all__ = [
     "run",
 ]
 
-CHAIN = 10  # a block is this many chains of this many steps
-BLOCK = CHAIN**2  # samples in one call
-STEP_IN = ["m", "P", "u", "p", "y", "R", "dt"]
-STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
-"""Of a step: belief before the sample, inputs, parameters, sample, variances (< 0: not measured),
-step to the next sample; then the predicted belief at the next sample, the filtered belief, the
-cross-covariance of filtered state and next state, innovation, its covariance, and ``STATS``."""
 STATS = ("check", "nis", "loglik", "measured")
-ROOT_OUT = ["Y", "Z", "Lf"]
-"""What a step in square-root form may give beside: roots for the smoother, see
-:mod:`estimators.filters.rootfilter`."""
 WIDE = 1e7  # innovation over noise variance from which a covariance loses more than eight digits
 NARROW = 1e-9  # share of a variance that is left when the other states are known; below: the same
 
@@ -239,93 +240,6 @@ class FilterResult:
 StepMaker = Callable[[FilterModel], FilterStep]
 
 
-def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
-    """Call ``f`` n times, as one function.
-
-    The first ``carried`` outputs go to the inputs of the same place in the next call; the last
-    input is the same for all calls, the others stand side by side, as do the last ``kept`` outputs;
-    of the others only the last are returned.
-
-    The same as ``mapaccum``, which takes a hundred times as long to build in CasADi 3.8.
-    """
-    ins = [ca.MX.sym(f.name_in(i), f.size1_in(i), f.size2_in(i)) for i in range(f.n_in())]
-    # a symbol without elements has no name to ask for
-    wide = [
-        ca.MX.sym(f.name_in(carried + i), s.shape[0], s.shape[1] * n)
-        for i, s in enumerate(ins[carried:-1])
-    ]
-    split = [ca.horzsplit(w, s.shape[1]) for w, s in zip(wide, ins[carried:-1], strict=True)]
-    now, results = ins[:carried], []
-    for k in range(n):
-        out = f(*now, *(s[k] for s in split), ins[-1])
-        now = out[:carried]
-        results.append(out)
-    first = f.n_out() - kept
-    out = [
-        *results[-1][:first],
-        *(ca.horzcat(*(r[i] for r in results)) for i in range(first, f.n_out())),
-    ]
-    return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
-
-
-def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) -> ca.Function:
-    """Return ``BLOCK`` calls of a step as one function.
-
-    Args:
-        one: step; its first ``carried`` outputs are those inputs of the next call, its last input
-            is the same in all calls.
-        name: of the result, which takes the other inputs and gives the other outputs side by side.
-        carried: number of inputs that are handed on; of these outputs the last is returned.
-        short: ``CHAIN`` calls only, for steps that take long.
-    """
-    kept = one.n_out() - carried
-    chain = _chained(one, CHAIN, f"{name}_chain", carried, kept)
-    return chain if short else _chained(chain, CHAIN, f"{name}_block", carried, kept)
-
-
-@kept
-def _block(
-    step: FilterStep, full: bool, backend: str | None, _in_use: str
-) -> tuple[ca.Function, ca.Function]:
-    """``BLOCK`` steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
-
-    (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
-    before each sample and C, S; matrices as columns.
-    """
-    nx, nu, np_, _, ny = step.model.sizes
-    s = [
-        ca.MX.sym(n, *shape)
-        for n, shape in zip(
-            STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
-        )
-    ]
-    m, P, u, p, y, R, dt = s
-    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
-    kept = [o["m_f"], ca.vec(o["P_f"]), o["nu"], ca.diag(o["S"]), o["stats"]]
-    if full:
-        kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
-    if step.gives_roots:
-        kept += [ca.vec(o[n]) for n in (ROOT_OUT if full else ROOT_OUT[-1:])]
-    name = f"{step.function.name()}{'_full' if full else ''}"
-    out = [o["m1"], o["P1"], *(ca.densify(k) for k in kept)]
-    one = ca.Function(f"{name}_one", [m, P, u, y, R, dt, p], out)
-    block = block_of(one, name, 2)
-    return compiled(block, backend=backend), block
-
-
-def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:
-    """Return (y, R, u, dt) as a step takes them, ``pad`` samples longer, one column a sample.
-
-    A padded sample measures nothing and lasts no time; what comes out of it is dropped.
-    """
-    missing = np.isnan(data.y)
-    y = np.pad(np.where(missing, 0.0, data.y), ((0, 0), (0, pad)))
-    R = np.pad(np.where(missing, -1.0, data.variance), ((0, 0), (0, pad)), constant_values=-1.0)
-    u = np.pad(data.u, ((0, 0), (0, pad)), mode="edge")
-    dt = np.pad(data.dt, (0, pad))[None, :]
-    return y, R, u, dt
-
-
 def run(
     step: FilterStep,
     prior: Belief,
@@ -377,7 +291,7 @@ def course(
         raise SignalError(
             f"prior of {', '.join(prior.x.names)}; {model.name} has {', '.join(model.x.names)}"
         )
-    passes = _Passes(step, prior, full, backend)
+    passes = _Passes(step, prior, full, backend, short=not full and cov_at is None)
     nx, _, _, _, ny = model.sizes
     K = data.size
     n_blocks = -(-K // BLOCK)
@@ -398,7 +312,7 @@ def course(
         out = yield from passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], p)
         for target, source in (
             (mean, out[2]),
-            (var, out[3][:: nx + 1]),
+            (var, out[3] if passes.short else out[3][:: nx + 1]),
             (nu, out[4]),
             (S, out[5]),
             (stats, out[6]),
@@ -406,12 +320,13 @@ def course(
             target[:, r] = source[:, :n]
         _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
         here = (wanted >= r.start) & (wanted < r.stop)
-        some[here] = out[3].T[wanted[here] - r.start].reshape(-1, nx, nx)
+        if here.any():
+            some[here] = out[3].T[wanted[here] - r.start].reshape(-1, nx, nx)
         if kept is not None:
             kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=passes.rooted)
         if progress is not None:
             progress(b * BLOCK + n, K)
-    last = out[3][:, n - 1].reshape(nx, nx)
+    last = passes.P_last if passes.short else out[3][:, n - 1].reshape(nx, nx)
     last = (last + last.T) / 2
     np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
     root = None if not passes.now.gives_roots else out[-1][:, n - 1].reshape(nx, nx).T.copy()
@@ -437,11 +352,15 @@ class _Passes:
 
     Args:
         step: the filter. prior, full, backend : as of :func:`run`.
+        short: of the covariances only variances are asked for, and the last one.
     """
 
-    def __init__(self, step: FilterStep, prior: Belief, full: bool, backend: str | None) -> None:
+    def __init__(
+        self, step: FilterStep, prior: Belief, full: bool, backend: str | None, *, short: bool
+    ) -> None:
         self.step = self.now = step
-        self.full, self.backend = full, backend
+        self.full, self.backend, self._short = full, backend, short
+        self.P_last = np.zeros_like(prior.cov)
         self.m = prior.mean.copy()
         self.P = prior.cov.copy()
         # the buffers are this run's own: runs may be nested, or go on in several threads
@@ -458,6 +377,11 @@ class _Passes:
         """Whether roots are carried now."""
         return self.now.root
 
+    @property
+    def short(self) -> bool:
+        """Whether blocks return variances instead of covariances: not those that give roots."""
+        return self._short and not self.now.gives_roots and bool(self.now.model.y.names)
+
     def _root(self, L: np.ndarray) -> None:
         self.P = L
         if not self.step.root:
@@ -466,14 +390,21 @@ class _Passes:
 
     def _call(self, *args: np.ndarray) -> Course[tuple[np.ndarray, ...]]:
         if self.rooted not in self.calls:
-            blocks = _block(self.now.shared, self.full, self.backend, backend_in_use())
+            how = self.full, self.short, self.backend, backend_in_use()
+            blocks = block_function(self.now.shared, *how)
             self.calls[self.rooted] = Together(*blocks)
+        carried = (self.m, self.P, self.P_last) if self.short else (self.m, self.P)
         while True:
             try:
-                return self.calls[self.rooted](self.m, self.P, *args)
+                out = self.calls[self.rooted](*carried, *args)
+                break
             except Question as question:
                 asked = question
             yield asked
+        if self.short:
+            self.P_last = out[2].reshape(self.P.shape).copy()
+            out = (*out[:2], *out[3:])
+        return out
 
     def block(
         self, u: np.ndarray, y: np.ndarray, R: np.ndarray, dt: np.ndarray, p: np.ndarray
@@ -486,7 +417,7 @@ class _Passes:
         nx = self.m.size
         self.done += 1
         ends = self.done % 4 == 1
-        if self.step.wide is not None and not self.rooted and _lossy(out, R, nx, ends):
+        if self.step.wide is not None and not self.rooted and lossy(out, R, nx, ends):
             self._root(root_of(self.P))
             out = yield from self._call(u, y, R, dt, p)
         self.m, self.P = out[0].ravel().copy(), out[1].reshape(nx, nx).copy()
@@ -511,7 +442,7 @@ def narrow(P: np.ndarray, *, root: bool = False) -> bool:
     return not bool((pivots**2 >= NARROW).all())
 
 
-def _lossy(out: Sequence[np.ndarray], R: np.ndarray, nx: int, ends: bool) -> bool:
+def lossy(out: Sequence[np.ndarray], R: np.ndarray, nx: int, ends: bool) -> bool:
     """Whether a block of the covariance filter has lost digits; out as of :func:`_block`.
 
     A sample far better than the belief makes a narrow direction at once, and shows in S.  What

@@ -38,12 +38,18 @@ name {chance,thresholds,forest,estimators} | forest needs scikit-learn
 --seed int N =1                | of the random numbers
 --quiet                        | no progress bar
 """
+_PAGE = """
+--dataset DIR =results/dataset  | the data set (default %(default)s)
+--page FILE =results/DATASET.md | the page, with figures in images/ beside it (default %(default)s)
+--seed int N =1                 | of the random numbers of the baselines
+--quiet                         | no progress bar
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions."""
     rows = (("make", _make, _MAKE), ("recipe", _recipe, ""), ("baseline", _base, _BASELINE))
-    usage.actions(parser, rows)
+    usage.actions(parser, (*rows, ("page", _page, _PAGE)))
 
 
 run = usage.act
@@ -95,4 +101,17 @@ def _base(args: argparse.Namespace) -> int:
     with bar(args.name, 1, show=not args.quiet and sys.stderr.isatty()) as progress:
         made = predict(args.name, args.dataset, seed=args.seed, progress=progress)
     print(f"written: {write_predictions(made, args.out)}")
+    return 0
+
+
+def _page(args: argparse.Namespace) -> int:
+    """Score all baselines and write docs/DATASET.md, or another page; forest needs scikit-learn."""
+    from scenarios.datasets.baselines import METHODS
+    from scenarios.datasets.page import write_page
+
+    show = not args.quiet and sys.stderr.isatty()
+    with bar("page", len(METHODS), show=show) as progress:
+        told = lambda name, share: progress(METHODS.index(name) + share, len(METHODS))  # noqa: E731
+        made = write_page(args.dataset, args.page, seed=args.seed, progress=told)
+    print(*(f"written: {p}" for p in made), sep="\n")
     return 0

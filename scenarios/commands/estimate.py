@@ -13,6 +13,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,7 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 {readingoptions.OPTIONS.strip()}
 --only {{gaspath,electrical}} | one of the two
 --sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
---prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
+--prior FILE   | what is known before (TOML): mean, sigma by state, machine.r_s, delay_i, h
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep estimates, JSON and figure there
 --figures =on  | draw estimates and bands into it (default)
@@ -104,11 +105,8 @@ run = usage.act
 
 def _data(args: argparse.Namespace) -> int:
     """Estimate from recorded data what its channels suffice for, with bands and verdicts."""
-    from apu_casadi.core import results
-    from apu_casadi.core.files import save_figure, write_text
     from estimators.apu.recorded_estimate import estimate
     from estimators.apu.sensorfile import read_sensors
-    from scenarios import registry
     from scenarios.figures.recordedplot import plot_recorded
     from scenarios.shell import progress
 
@@ -124,22 +122,9 @@ def _data(args: argparse.Namespace) -> int:
         ambient=readingoptions.day(args, m),
         prior=args.prior,
     )
-    report = e.report() | {"files": args.files, **given.own(args), **given.assumed(args)}
-    made = []
-    if args.out is not None:
-        folder = registry.prepare(args.out)
-        made = [results.save(d, folder / f"estimate_{n}.nc") for n, d in e.datasets().items()]
-        made.append(write_text(folder / "estimate.json", jsontext.dumps(report) + "\n"))
-        if args.figures:
-            note = f"{', '.join(args.files)}; {given.program(args)}."
-            made.append(save_figure(plot_recorded(e, note), folder / "estimate.png"))
-    if args.json:
-        jsontext.show(report)
-        return 0
-    print(e.summary())
-    if made and not args.quiet:
-        given.written(made)
-    return 0
+    data = {f"estimate_{n}": d for n, d in e.datasets().items()}
+    drawn = partial(plot_recorded, e)
+    return given.report(args, "estimate", e.report(), e.summary, drawn, data)
 
 
 # ------------------------------------------------------------------------------ joint

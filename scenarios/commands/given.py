@@ -282,6 +282,47 @@ def written(paths: Iterable[object]) -> None:
     print("\nwritten:", *(f"  {path}" for path in paths), sep="\n")
 
 
+def report(
+    args: Namespace,
+    name: str,
+    made_of: Mapping[str, Any],
+    text: Callable[[], str],
+    figure: Callable[[str], Any] | None = None,
+    data: Mapping[str, Any] | None = None,
+) -> int:
+    """End a command on files: keep JSON, figure and data in ``--out``, print; return 0.
+
+    Args:
+        args: of the command: ``files``, ``out``, ``figures``, ``json``, ``quiet``.
+        name: of what is kept.
+        made_of: the report, ready for JSON.
+        text: the same in words.
+        figure: makes the figure of a note for its caption.
+        data: datasets by name.
+    """
+    from apu_casadi.core import results
+    from apu_casadi.core.files import save_figure, write_text
+    from scenarios import registry
+    from scenarios.shell import jsontext
+
+    whole = {**made_of, "files": args.files, **own(args), **assumed(args)}
+    made: list[Any] = []
+    if args.out is not None:
+        folder = registry.prepare(args.out)
+        made = [results.save(d, folder / f"{n}.nc") for n, d in (data or {}).items()]
+        made.append(write_text(folder / f"{name}.json", jsontext.dumps(whole) + "\n"))
+        if args.figures and figure is not None:
+            note = f"{', '.join(args.files)}; {program(args)}."
+            made.append(save_figure(figure(note), folder / f"{name}.png"))
+    if args.json:
+        jsontext.show(whole)
+        return 0
+    print(text())
+    if made and not args.quiet:
+        written(made)
+    return 0
+
+
 def number(text: str, option: str, item: str) -> float:
     """Return a finite number of an option's text.
 

@@ -1,7 +1,8 @@
 """Measure what the multi-rate exchange loses against one model with one solver, and what it saves.
 
 Runs a load step and both faults with exchange steps of 2 to 80 ms, as the paper exchanges and with
-the predicted exchange; takes some minutes.
+the predicted exchange; takes some minutes.  With --events one or all the events are those of one
+machine of two, or these too.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ OPTIONS = """
 --out DIR     | folder for figure and numbers (default results/multirate)
 --json        | print JSON only
 --steps MS,MS | exchange steps in ms, divisors of 80 (default: six)
+--events {both,one,all} | of both machines (default), of one alone, or all of these
 --page FILE   | also write the page, with its figure in images/ beside it
 --quiet       | no progress bar
 """
@@ -37,8 +39,11 @@ def run(args: argparse.Namespace) -> int:
     show = not args.quiet and sys.stderr.isatty()
     if args.page and study.PAPER_STEP not in steps:
         raise ScenarioError("--page needs the paper's 20 ms among --steps")
-    with bar(NAME, study.simulated(steps), show=show) as progress:
-        rows = study.measure(steps=steps, progress=progress)
+    cases = study.CHOSEN[args.events or "both"]
+    if args.page and not set(study.CASES) <= set(cases):
+        raise ScenarioError("--page needs the events of both machines: --events both, or all")
+    with bar(NAME, study.simulated(steps, cases=len(cases)), show=show) as progress:
+        rows = study.measure(steps=steps, cases=cases, progress=progress)
     report = study.report(rows)
     text = jsontext.dumps(report)
     made = [study.write_figure(rows, folder / "multirate_error.png")]

@@ -75,13 +75,24 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _faulty(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+def _faulty(r: dict[str, Any], name: str, form: str) -> str:
+    """Return a number of a phase's stator fault: at its end, or of the worst that was before."""
+    if not r["mu"] and r["worst"]:
+        return f"{r['worst'][name]:{form}} at worst"
+    return format(r[name], form) if r["mu"] else "-"
+
+
+def _mu(r: dict[str, Any]) -> str:
+    if not r["mu"]:
+        worst = r["worst"]
+        return f"0, {100 * worst['mu']:g} at worst" if worst else "healthy"
+    return f"{100 * r['mu']:g}"
 
 
 _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("phase [s]", lambda r: f"{r['start']:g} to {r['end']:g}"),
-    ("load of each", lambda r: r["load"] or "-"),
+    # what it follows is told below the table
+    ("load of each", lambda r: (r["load"] or "-").partition(";")[0]),
     ("shaft speed [r/min]", lambda r: f"{r['N_rpm']:.1f}"),
     ("  lowest", lambda r: f"{r['N_rpm_min']:.1f}"),
     ("  highest", lambda r: f"{r['N_rpm_max']:.1f}"),
@@ -106,11 +117,11 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("fault loss of each [kW]", lambda r: f"{r['P_loss_fault'] / 1e3:.3f}"),
     ("f_eta_c, f_W_c", lambda r: f"{r['f_eta_c']:g}, {r['f_W_c']:g}"),
     ("f_eta_t, f_W_t", lambda r: f"{r['f_eta_t']:g}, {r['f_W_t']:g}"),
-    ("TTSC mu [%]", lambda r: f"{100 * r['mu']:g}" if r["mu"] else "healthy"),
-    ("  phase", lambda r: r["fault_phase"] or "-"),
-    ("  k_rf", lambda r: _faulty(r["k_rf"], "g")),
-    ("  kappa", lambda r: _faulty(r["kappa"], "g")),
-    ("  h = mu/(k_rf + 1 - mu)", lambda r: _faulty(r["h"] or None, ".5f")),
+    ("TTSC mu [%]", lambda r: _mu(r)),
+    ("  phase", lambda r: r["fault_phase"] or (r["worst"] or {}).get("fault_phase") or "-"),
+    ("  k_rf", lambda r: _faulty(r, "k_rf", "g")),
+    ("  kappa", lambda r: _faulty(r, "kappa", "g")),
+    ("  h = mu/(k_rf + 1 - mu)", lambda r: _faulty(r, "h", ".5f")),
 )
 
 

@@ -1,33 +1,39 @@
-"""Find noise by maximum likelihood: Q and R of the gas-path filter from a recording, with bands.
+"""Find noise by maximum likelihood: Q and R of a filter from a recording, with bands.
 
-FILE is read as apu estimate data reads it; several are one recording.  --noise names outputs whose
-noise is found (R), --walk states whose random walk is (Q), --inputs measured inputs; each start is
-what the table of sensors and the filter have.  A band is 95 %; what cannot be told from zero has an
-upper limit.  Whether the model explains the recording at all is said below: noise cannot.
+FILE is read as apu estimate data reads it; several are one recording.  The filter is that of the
+gas path, or with --only electrical that of a generator, in which the three severities and declared
+gain errors are states.  --noise names outputs whose noise is found (R), --walk states whose random
+walk is (Q), --inputs measured inputs; each start is what the table of sensors and the filter have.
+A band is 95 %; what cannot be told from zero has an upper limit.  Whether the model explains the
+recording at all is said below: noise cannot.
 
   apu tune run_gaspath.csv
   apu tune run_gaspath.csv --noise P3,T5 --walk N,f_eta_c --out results/tune
+  apu tune waves.csv --only electrical --inputs v_a,v_b,v_c
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from scenarios.commands import given, readingoptions
-from scenarios.shell import jsontext
 
 if TYPE_CHECKING:
     from estimators.batch.noisefit import NoiseFit
 
+SHORT = 10_000  # samples
 NAME = "tune"
 HELP = "find noise of sensors and model from a recording, by maximum likelihood"
 OPTIONS = f"""
-files FILE + | recorded data of the gas path, CSV, Parquet or netCDF
+files FILE + | recorded data, CSV, Parquet or netCDF
+--only {{gaspath,electrical}} | of which filter (default: of the gas path, if it was measured)
+--machine int N | number of the generator (default: the first that was measured)
 --noise A,B  | outputs whose noise is found (default: all that were measured)
---walk A,B =N | states whose random walk is found (default %(default)s; empty: none)
---inputs A,B = | measured inputs whose noise is found: Wf, PW
+--walk A,B   | states whose random walk is found (default: N of the gas path, else none)
+--inputs A,B = | measured inputs whose noise is found: Wf, PW; v_a, v_b, v_c, V_fd, w_r
 {given.UNIT}
 {readingoptions.OPTIONS.strip()}
 --sensors FILE | what the sensors are (TOML, as apu measure); default: apu estimate sensors
@@ -42,48 +48,43 @@ files FILE + | recorded data of the gas path, CSV, Parquet or netCDF
 
 def run(args: argparse.Namespace) -> int:
     """Read, fit, print; return 0."""
-    from apu_casadi.core.files import save_figure, write_text
     from estimators.apu.gaspath import ITERATED, ITERATIONS
-    from estimators.apu.recorded_estimate import gas_path_data
+    from estimators.apu.recorded_estimate import electrical_data, gas_path_data
     from estimators.apu.sensorfile import read_sensors
     from estimators.batch.noisefit import fit_noise
-    from scenarios import registry
     from scenarios.figures.noiseplot import plot_noise
     from scenarios.shell import progress
 
     apu = given.engine_file(args).unit
     m = readingoptions.recording(args, apu.gas_generator)
-    sensors, day = read_sensors(args.sensors), readingoptions.day(args, m)
-    how: dict[str, Any] = {"sensors": sensors, "ambient": day, "prior": args.prior}
-    filt, data, prior, notes = gas_path_data(m, apu, **how)
-    measured = [n for n in filt.model.y.names if n in m]
+    sensors = read_sensors(args.sensors)
+    waves = args.only == "electrical" or (args.only is None and not m.gaspath)
+    how: dict[str, Any] = {}
+    filt: Any
+    if waves:
+        filt, data, prior, notes = electrical_data(m, apu, machine=args.machine, sensors=sensors)
+        measured = list(filt.model.y.names)
+        # compiling takes longer than all iterations of a recording of a second
+        how = {"backend": "vm"} if data.size <= SHORT else {}
+    else:
+        day = readingoptions.day(args, m)
+        found_by = gas_path_data(m, apu, sensors=sensors, ambient=day, prior=args.prior)
+        filt, data, prior, notes = found_by
+        measured = [n for n in filt.model.y.names if n in m]
+        how = {"iterations": ITERATIONS, "iterated": ITERATED}
     progress.tell(f"fitting noise to {', '.join(m)}", quiet=args.quiet or args.json)
+    walk = "" if waves else "N"
     found = fit_noise(
         filt.model,
         prior,
         data,
         noise=measured if args.noise is None else given.names(args.noise),
-        walk=given.names(args.walk),
+        walk=given.names(walk if args.walk is None else args.walk),
         inputs=[f"w_{n}" for n in given.names(args.inputs)],
-        iterations=ITERATIONS,
-        iterated=ITERATED,
+        **how,
     )
-    report = report_of(found) | {"notes": list(notes), "files": args.files}
-    report |= {**given.own(args), **given.assumed(args)}
-    made = []
-    if args.out is not None:
-        folder = registry.prepare(args.out)
-        made = [write_text(folder / "tune.json", jsontext.dumps(report) + "\n")]
-        if args.figures:
-            note = f"{', '.join(args.files)}; {given.program(args)}."
-            made.append(save_figure(plot_noise(report, note), folder / "tune.png"))
-    if args.json:
-        jsontext.show(report)
-        return 0
-    print(text(report))
-    if made and not args.quiet:
-        given.written(made)
-    return 0
+    report = report_of(found) | {"notes": list(notes)}
+    return given.report(args, "tune", report, partial(text, report), partial(plot_noise, report))
 
 
 def report_of(found: NoiseFit) -> dict[str, Any]:

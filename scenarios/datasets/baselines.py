@@ -28,6 +28,8 @@ from scenarios.datasets.scoring import read_labels
 Progress = Callable[[float, float], None]
 Rows = list[dict[str, Any]]
 _RATIOS = tuple(f"X_s.{n}" for n in GAS_PATH.names)
+FEATURES = len(_RATIOS) + 2 * 5
+"""Number of what :func:`features` returns: five of each generator."""
 _ALARM = 4.0  # robust standard deviations of healthy training runs: a reading that is told
 
 
@@ -118,7 +120,7 @@ def _forest(X: np.ndarray, y: np.ndarray, train: np.ndarray, rng: np.random.Gene
     try:
         ensemble = import_module("sklearn.ensemble")
     except ImportError:
-        raise DataError("forest needs: pip install scikit-learn") from None
+        raise DataError("forest needs: pip install 'apu-casadi[learn]'") from None
     seed = int(rng.integers(2**31))
     model = ensemble.RandomForestClassifier(300, random_state=seed, class_weight="balanced")
     model.fit(X[train], y[train])
@@ -172,7 +174,7 @@ def estimated(run: int, gas: Any, waves: Any) -> dict[str, Any]:
     for n, (v, s) in health.items():
         out |= {n: v, f"{n}_sigma": s}
     k, (phase, h, s) = max(shorts.items(), key=lambda i: i[1][1] / i[1][2], default=(0, ("", 0, 1)))
-    out |= {"h": h, "h_sigma": s} if shorts else {}
+    out |= {"h": h, "h_sigma": s} if shorts and math.isfinite(s) else {}
     short, sick = bool(shorts) and h > _ALARM * s, max(z_health.values(), default=0.0) > _ALARM
     if short:
         out |= {"class": "combined" if sick else "ttsc", "phase": phase, "generator": k}
@@ -221,12 +223,17 @@ def _of_machine(waves: Any, k: int) -> tuple[str, float, float]:
     return phase, *h[phase]
 
 
-def write_predictions(rows: Rows, path: str | Path) -> Path:
-    """Write predictions as the scorer reads them."""
+def predictions_text(rows: Rows) -> str:
+    """Return predictions as the text of a file that the scorer reads."""
     names = list(dict.fromkeys(n for row in rows for n in row))
     assert all(row["class"] in CLASSES for row in rows)
     f = io.StringIO()
     writer = csv.DictWriter(f, names, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return files.write_text(path, f.getvalue())
+    return f.getvalue()
+
+
+def write_predictions(rows: Rows, path: str | Path) -> Path:
+    """Write predictions as the scorer reads them."""
+    return files.write_text(path, predictions_text(rows))

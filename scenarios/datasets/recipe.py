@@ -21,6 +21,7 @@ from apu_casadi.core.sharing import once
 from apu_casadi.core.tomlnumbers import read_toml
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.exchange import EXCHANGES
 from estimators.apu.sensors import GAS_PATH
 
 CLASSES = ("healthy", *HEALTH, "ttsc", "field", "sensor", "combined")
@@ -62,6 +63,7 @@ class Recipe:
     outside: Mapping[str, Any]
     split: Mapping[str, float]
     waveforms: Mapping[str, float]
+    exchange: str = "predicted"
 
     def __post_init__(self) -> None:
         for table, known in _TABLES.items():
@@ -77,6 +79,9 @@ class Recipe:
         lo, hi = self.onset
         if not 0 < lo <= hi < self.duration:
             raise ScenarioError(f"recipe: onset = [{lo:g}, {hi:g}] s is not inside the run")
+        if self.exchange not in EXCHANGES:
+            said = f"{self.exchange!r} {nearest(str(self.exchange), EXCHANGES)}"
+            raise ScenarioError(f"recipe: exchange = {said}")
         if not 0 <= self.growing <= 1:
             raise ScenarioError(f"recipe: growing = {self.growing:g} is outside [0, 1]")
         for table in ("size", "range"):
@@ -94,7 +99,7 @@ class Recipe:
         for key in table:
             if key not in names:
                 raise ScenarioError(f"{where}: unknown key {key!r} {nearest(key, names)}")
-        if missing := [n for n in names if n not in table]:
+        if missing := [n for n in names if n not in (*table, "exchange")]:
             raise ScenarioError(f"{where}: {', '.join(missing)} must be given")
         wrong = [n for n in (*_TABLES, "spread") if not isinstance(table[n], Mapping)]
         if wrong:
@@ -211,7 +216,7 @@ def draw(r: Recipe, unit: int, run: int) -> Drawn:
         "name": f"{r.name}_{unit:05d}_{run:03d}",
         "duration": r.duration,
         "waveform_dt": 1.0 / r.waveforms["rate"] if r.waveforms.get("rate") else 0,
-        "exchange": "predicted",
+        "exchange": r.exchange,
         "ambient": at,
         "parameters": own,
         "phase": phases,

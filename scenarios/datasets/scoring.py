@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -69,15 +70,24 @@ def read_predictions(path: str | Path, labels: Mapping[str, np.ndarray]) -> Pred
         DataError: an unknown column or class, a run that is missing, doubled or not there, no
             number; with line and value.
     """
-    rows = list(csv.reader(io.StringIO(files.read_text(path))))
+    return parsed(path, files.read_text(path), labels)
+
+
+def parsed(path: str | Path, text: str, labels: Mapping[str, np.ndarray]) -> Predictions:
+    """Read predictions out of the text of a file; see :func:`read_predictions`."""
+    rows = list(csv.reader(io.StringIO(text)))
     if not rows:
         raise DataError(f"{path}: empty")
     head = [h.strip() for h in rows[0]]
     for h in head:
         if h not in COLUMNS:
             raise DataError(f"{path}: column {h!r} {nearest(h, COLUMNS)}")
+    if twice := [h for k, h in enumerate(head) if h in head[:k]]:
+        raise DataError(f"{path}: column {twice[0]} is there twice")
     if missing := [n for n in ("run", "class") if n not in head]:
         raise DataError(f"{path}: column {missing[0]} is missing")
+    if alone := [n for n in SEVERITIES if f"{n}_sigma" in head and n not in head]:
+        raise DataError(f"{path}: column {alone[0]} is missing for {alone[0]}_sigma")
     found: dict[int, dict[str, Any]] = {}
     for line, row in enumerate(rows[1:], 2):
         if not any(c.strip() for c in row):
@@ -106,6 +116,8 @@ def _compare(path: str | Path, found: Mapping[int, Any], runs: Sequence[int]) ->
 
 def _cell(path: str | Path, line: int, name: str, text: str) -> Any:
     if name == "class":
+        if not text:
+            raise DataError(f"{path}: line {line}: class {text!r} of a run is missing")
         if text not in CLASSES:
             raise DataError(f"{path}: line {line}: class {text!r} {nearest(text, CLASSES)}")
         return text
@@ -113,14 +125,22 @@ def _cell(path: str | Path, line: int, name: str, text: str) -> Any:
         if text not in ("", "a", "b", "c"):
             raise DataError(f"{path}: line {line}: phase {text!r}: a, b, c or nothing is expected")
         return text
-    if name == "run":
-        if not text.isdecimal():
-            raise DataError(f"{path}: line {line}: run {text!r} is no whole number")
-        return int(text)
+    if name == "run" or (name == "generator" and text):
+        if not re.fullmatch(r"\d+", text) and not (name != "run" and re.fullmatch(r"\d+\.0", text)):
+            raise DataError(f"{path}: line {line}: {name} {text!r} is no whole number")
+        return int(float(text))
     try:
-        return float(text) if text else math.nan
+        value = float(text) if text else math.nan
     except ValueError:
         raise DataError(f"{path}: line {line}: {name} = {text!r} is no number") from None
+    if text and not math.isfinite(value):
+        raise DataError(
+            f"{path}: line {line}: {name} = {text!r} is no finite number: leave the cell empty "
+            "where nothing is said"
+        )
+    if name.endswith("_sigma") and value <= 0:
+        raise DataError(f"{path}: line {line}: {name} = {text!r} must be > 0")
+    return value
 
 
 # ------------------------------------------------------------------------------ scores
@@ -132,14 +152,15 @@ def score(p: Predictions, labels: Mapping[str, np.ndarray]) -> dict[str, Any]:
     parts = {"all": np.ones(split.size, dtype=bool)}
     parts |= {s: split == s for s in SPLITS if (split == s).any()}
     return {
-        name: _score(
+        name: score_of(
             {n: v[mask] for n, v in p.values.items()}, {n: v[mask] for n, v in labels.items()}
         )
         for name, mask in parts.items()
     }
 
 
-def _score(p: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def score_of(p: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return the scores of some runs, predictions and labels by column."""
     true, said = y["class"], p["class"]
     ill = true != "healthy"
     out: dict[str, Any] = {

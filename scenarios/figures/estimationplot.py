@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from scenarios.figures import figstyle as fs
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot_gain_of_a_sensor"]
+__all__ = ["plot_alarms", "plot_gain_of_a_sensor"]
 
 
 def plot_gain_of_a_sensor(
@@ -86,3 +86,53 @@ def plot_gain_of_a_sensor(
         right.legend(frameon=False, fontsize=8.5, loc="upper left")
         fs.caption(fig, note)
     return fig
+
+
+def plot_alarms(groups: Mapping[str, Sequence[Mapping[str, Any]]], note: str) -> Figure:
+    """Draw the rate of true alarms, with its 95 % interval, over the latency, by fault and size.
+
+    Args:
+        groups: rows by axis label; of each ``kind``, ``value``, ``share``, ``low``, ``high`` and
+            ``late`` (s, None where there was no alarm).
+        note: the caption.
+    """
+    with fs.drawing():
+        fig = fs.new_figure(5.4)
+        axes = fig.subplots(2, len(groups), squeeze=False)
+        place = fs.margins(fig, top=0.35, bottom=1.0)
+        fig.subplots_adjust(left=0.07, right=0.985, hspace=0.12, wspace=0.22, **place)
+        for (label, rows), (rate, late) in zip(groups.items(), axes.T, strict=True):
+            kinds = list(dict.fromkeys(x["kind"] for x in rows))
+            for k, kind in enumerate(kinds):
+                own = [x for x in rows if x["kind"] == kind]
+                look = {"color": fs.LINE_INK[k % 4], "marker": fs.MARKS[k % 4], "ms": 5, "lw": 1.6}
+                # side by side, so that those of one size are told apart
+                at = np.array([x["value"] for x in own]) * (1 + 0.04 * (k - (len(kinds) - 1) / 2))
+                share = np.array([100 * x["share"] for x in own])
+                ends = np.array([[100 * x["low"], 100 * x["high"]] for x in own]).T
+                rate.errorbar(
+                    at, share, np.abs(ends - share), capsize=2, elinewidth=0.8, label=kind, **look
+                )
+                ms = [np.nan if x["late"] is None else 1e3 * x["late"] for x in own]
+                late.plot(at, ms, **look)
+            for ax in (rate, late):
+                ax.set_xscale("log")
+            values = sorted({x["value"] for x in rows})
+            late.set_xlim(0.75 * values[0], 1.33 * values[-1])
+            rate.set_xlim(late.get_xlim())
+            rate.set_xticks(values, [""] * len(values))
+            late.set_xticks(values, [f"{v:g}" for v in values])
+            for ax in (rate, late):
+                ax.minorticks_off()
+            rate.set_ylim(-4, 104)
+            late.set_ylim(bottom=0)
+            late.set_xlabel(f"{label} [{_unit(rows)}]")
+            fs.legend(rate, "lower right")
+        fs.title(axes[0, 0], "True alarms [% of runs]")
+        fs.title(axes[1, 0], "Latency, median [ms]")
+        fs.caption(fig, note)
+    return fig
+
+
+def _unit(rows: Sequence[Mapping[str, Any]]) -> str:
+    return "A" if any(x["value"] >= 1 for x in rows) else "-"

@@ -16,6 +16,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+WORDS = {
+    "altitude": "Altitude",
+    "Mach": "Mach number",
+    "power_kW": "power",
+    "power_factor": "power factor",
+    "mu": "$\\mu$",
+    "k_rf": "$k_{rf}$",
+    "kappa": "$\\kappa$",
+}
+"""What stands at the axes for names of profiles; other names stand themselves."""
+
+
 def given_profiles(ds: xr.Dataset) -> list[dict[str, Any]]:
     """Return the profiles of a run, each place once, as the run records them; [] without any."""
     try:
@@ -38,12 +50,13 @@ def _held(ds: xr.Dataset, row: dict[str, Any]) -> tuple[str, np.ndarray] | None:
             mu = own["mu"].values
             h = severity_h(mu, own["k_rf"].values)
             return f"Fault $h${of}", np.where(mu > 0, h, np.nan)
-        return (f"Fault {name}{of}", own[name].values) if name in own else None
+        return (f"Fault {WORDS.get(name, name)}{of}", own[name].values) if name in own else None
     key = name if part != "load" else f"load_{name}" + ("" if number is None else f"_{number}")
     if key not in ds:
         return None
     unit = ds[key].attrs["units"]
-    words = f"Load {name}{of}" if part == "load" else name
+    words = WORDS.get(name, name)
+    words = f"Load {words}{of}" if part == "load" else words
     return words + ("" if unit in ("", "1") else f" [{unit}]"), ds[key].values
 
 

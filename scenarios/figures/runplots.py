@@ -120,7 +120,9 @@ def _segments(
 
     def instant(i: int) -> float:
         near = starts[int(np.argmin(np.abs(starts - t[i])))]
-        return float(near if abs(near - t[i]) <= slack else t[i])
+        # what a sample tells holds since the one before
+        there = t[i] if i in (0, t.size - 1) else t[i - 1]
+        return float(near if abs(near - t[i]) <= slack else there)
 
     return [
         (instant(a), instant(b), a, max(b - 1, a) if b < t.size - 1 else b)
@@ -169,15 +171,20 @@ def _load_words(x: dict[str, Any], n: int) -> str:
         "series": "series R-L",
         "constant_power": "constant power",
         "open": "open circuit",
+        "open_phase": f"phase {x.get('phase', 'a')} open",
     }.get(kind, str(kind))
     if x.get("unbalance") and len(set(x["unbalance"])) > 1:
         words += ", unbalanced"
     if any(isinstance(v, dict) for v in x.values()):
         words += ", changes"
-    if not isinstance(x.get("power_kW"), int | float):
+    power, times = x.get("power_kW"), f"{n}\u00a0×\u00a0" if n > 1 else ""
+    if isinstance(power, int | float):
+        return f"{times}{power:g}\u00a0kW\n{words}"
+    given = power if isinstance(power, dict) else {}
+    ends = [given[k] for k in ("from", "to", "on", "off") if k in given] or given.get("values", [])
+    if len(ends) < 2:
         return words
-    times = f"{n}\u00a0×\u00a0" if n > 1 else ""
-    return f"{times}{x['power_kW']:g}\u00a0kW\n{words}"
+    return f"{times}{min(ends):g} to {max(ends):g}\u00a0kW\n{words}"
 
 
 def _gas_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]]) -> Lane:
@@ -199,7 +206,7 @@ def _change(first: float, last: float) -> str:
     return ends[0] if first == last else " → ".join(ends)
 
 
-def _stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) -> Lane:
+def stator_lane(ds: xr.Dataset, rows: Sequence[dict[str, Any]], number: int) -> Lane:
     """Return the stretches of the stator fault of a generator."""
     t, lane = ds["time"].values, []
     stator = np.column_stack([ds[f].values for f in SEVERITY])
@@ -254,7 +261,7 @@ def figure_20(ds: xr.Dataset) -> Figure:
         loads[f"Load{of}" if several else "Electrical load"] = [
             (a, b, w, LOADS[i % 2]) for i, (a, b, w) in steps
         ]
-        stators[f"Stator{of}"] = _stator_lane(own, rows, k)
+        stators[f"Stator{of}"] = stator_lane(own, rows, k)
     lanes: dict[str, Lane] = {**loads, "Gas path": _gas_lane(ds, rows), **stators}
     n = int(ds.attrs.get("generators", 2))
     with fs.drawing():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import GENERATOR, generators_of, of_generator
+from apu_casadi.core.results import GENERATOR, generators_of, of_generator, severity_h
 from apu_casadi.machine.faults.ttsc import Ttsc
 from scenarios.figures.figstyle import caption
 
@@ -53,7 +53,8 @@ def fault_phase(ds: xr.Dataset, t: float, number: int = 1) -> str:
 def _loads_of(ds: xr.Dataset, number: int) -> list[str]:
     """Return the loads of a generator in words, of many the first two."""
     rows = [r for r in _rows(ds, "loads") if r.get(GENERATOR, number) == number]
-    loads = list(dict.fromkeys(str(r.get("load")) for r in rows))
+    # of one that follows a profile what it is at first
+    loads = list(dict.fromkeys(str(r.get("load")).partition(";")[0] for r in rows))
     return [*loads[:2], f"{len(loads) - 2} more"] if len(loads) > 3 else loads
 
 
@@ -66,8 +67,9 @@ def made_with(ds: xr.Dataset) -> str:
     by_number = {k: _loads_of(ds, k) for k in numbers}
     alike = all(loads == by_number[numbers[0]] for loads in by_number.values())
     for k, loads in list(by_number.items())[: 1 if alike else None]:
-        of = "each generator" if alike else f"generator {k}"
-        words += [f"Load of {of} {', then '.join(loads)}"] if loads else []
+        of = f"of {'each generator' if alike else f'generator {k}'}"
+        of = of if k > numbers[0] else f"Load {of}"
+        words += [f"{of}: {', then '.join(loads)}"] if loads else []
     followed = {row.get("part") for row in _rows(ds, "profiles")}
     late = " at first" if "ambient" in followed else ""
     try:
@@ -107,12 +109,19 @@ def _note_of(ds: xr.Dataset, number: int, *, of_all: bool) -> str:
     hit = np.flatnonzero(mu > 0)
     if hit.size == 0:
         return ""
-    k = hit[-1]
+    h = severity_h(mu[hit], ds["k_rf"].values[hit])
+    grows = float(np.ptp(h)) > 1e-9 * float(h.max())
+    k = hit[int(np.argmax(h))] if grows else hit[-1]
     m, r, c = (float(ds[n].values[k]) for n in SEVERITY)
     kappa = f"κ = µ = {c:g}" if abs(c - m) < 1e-12 else f"κ = {c:g}"
     where = fault_phase(ds, float(ds["time"].values[k]), number)
     where += "" if of_all else f" of generator {number}"
-    return f"TTSC{where}: µ = {100 * m:g} %, $k_{{rf}}$ = {r:g}, {kappa}."
+    where += ", at most" if grows else ""
+    return f"TTSC{where}: µ = {100 * m:g} %, $k_{{rf}}$ = {r:.4g}, {kappa}."
+
+
+def _count(ds: xr.Dataset) -> int:
+    return int(ds.attrs.get("generators", 2))
 
 
 def caption_of(
@@ -129,6 +138,9 @@ def caption_of(
     name = scenario_of(ds).get("name", "")
     title = FIGURES[key] if number is None else f"{FIGURES[key]} {number}"
     number_of_it = f"Figure {key[3:5]}. " if name == PAPER else ""
+    # one figure for several machines
+    alike = number is None and title.endswith("starter/generator") and _count(ds) > 1
+    title = title.replace("of the starter", "of each starter") if alike else title
     words = [f"{number_of_it}{title}.", f"Scenario “{name}”." if name else ""]
     words += [severity_note(ds) if key != "fig20_phases" else "", more, made_with(ds)]
     caption(fig, " ".join(w for w in words if w))

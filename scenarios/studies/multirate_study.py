@@ -87,6 +87,8 @@ OF_ONE = {
     "TTSC fault of one": Case(KW100, FaultChange(T_EVENT, Ttsc(0.05, 20.0), generator=2), _HEALTH),
 }
 """Events of one generator alone, which are measured where they are asked for."""
+CHOSEN = {"both": (*CASES,), "one": (*OF_ONE,), "all": (*CASES, *OF_ONE)}
+"""Names of cases by what the command calls them."""
 
 
 @dataclass(frozen=True)
@@ -343,18 +345,20 @@ def page(rows: Sequence[Measured]) -> str:
     """Return docs/MULTIRATE.md: one paragraph with the measured numbers, the figure, the tables."""
     cases = list(dict.fromkeys(r.case for r in rows))
     values: dict[str, Any] = {"faster": {}}
+    told = [r for r in rows if r.case in CASES]  # in the text
     for ex in (*COMPARED, *SPLIT):
-        of = [r for r in rows if r.exchange == ex and abs(r.dt - PAPER_STEP) < 1e-9]
+        of = [r for r in told if r.exchange == ex and abs(r.dt - PAPER_STEP) < 1e-9]
         percent = {q: _span([100 * getattr(r, q) for r in of], ".2g") + " %" for q in QUANTITIES}
         values[ex.replace(" ", "_")] = percent
         values["faster"][ex] = _span([_faster(rows, r) for r in of], ".0f")
     for ex in ("paper", "predicted"):
-        slopes = [order(select(rows, c, ex), "N") for c in cases if c != "TTSC fault"]
+        slopes = [order(select(rows, c, ex), "N") for c in CASES if c != "TTSC fault"]
         values[f"order_{ex}"] = _span(slopes, ".1f")
     mode = regulator_mode()
     values |= {**mode._asdict(), "period": 1e3 / mode.frequency, "rtol": _RTOL}
     values |= {"event": T_EVENT, "duration": DURATION, "common": 1e3 * COMMON}
-    values["one"] = max(max(r.N, r.P, r.V, r.E) for r in rows if r.exchange == "one model")
+    values["one"] = max(max(r.N, r.P, r.V, r.E) for r in told if r.exchange == "one model")
+    values["events"] = " --events all" if set(cases) & set(OF_ONE) else ""
     text = fill(TEXT.filled("page", fault=fault_words(), **values))
     for case in cases:
         text += f"\n## {case[0].upper()}{case[1:]}\n\n{TEXT.table('case', _cells(rows, case))}\n"

@@ -5,11 +5,9 @@ a vector of ``lanes`` doubles, by the vector extensions of GCC and Clang.  Lanes
 in one, NaN included, does not change another.
 
 Every operation is the one that CasADi's own C has, in the same order, and without fused
-multiply-add; what has no vector instruction of the same bits (exponentials, sines) calls the C
-library once for each lane.  So results are those of the scalar code to the last bit.
-
-Code is written in two widths: *wide*, on vectors, and *single*, on plain numbers, for a single
-evaluation whose maps are wide inside (:mod:`apu_casadi.core.lanes.lanegraph`).
+multiply-add.  Exponentials and the like are those of :mod:`apu_casadi.core.lanes.vectormath`; for
+other functions the C library is called once for each lane.  So results are those of the scalar
+code to the last bit.
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ from typing import NamedTuple, TypeAlias
 import casadi as ca
 
 from apu_casadi.core.errors import BackendError
+from apu_casadi.core.lanes.vectormath import VECTOR, vector_math
 
 # {p} is the width's prefix, {a} and {b} are the operands
 _UNARY = """
@@ -76,22 +75,23 @@ _PRELUDE = """
 #define L LANES
 typedef double V __attribute__((vector_size(8*L)));
 typedef int64_t M __attribute__((vector_size(8*L)));
-typedef double S;
 #define IN static inline __attribute__((always_inline,unused))
-IN V v_all(double a){V r;for(int l=0;l<L;l++)r[l]=a;return r;}
-IN V v_sel(M m,V a,V b){return (V)((m&(M)a)|(~m&(M)b));}
+/* written out: a loop over lanes is compiled to one insertion for each */
+IN V v_all(double a){return (V){ALL_LANES};}
 IN V v_num(M m){return (V)(m&(M)v_all(1.0));}
-IN int v_any(M m){int64_t r=0;for(int l=0;l<L;l++)r|=m[l];return r!=0;}
-IN S s_all(double a){return a;}
-IN S s_sel(int m,S a,S b){return m?a:b;}
-IN S s_num(int m){return m;}
-IN int s_any(int m){return m;}
-IN S s_sqrt(S a){return sqrt(a);}
-IN S s_fabs(S a){return fabs(a);}
-IN S s_floor(S a){return floor(a);}
-IN S s_ceil(S a){return ceil(a);}
-IN S s_fmin(S a,S b){return fmin(a,b);}
-IN S s_fmax(S a,S b){return fmax(a,b);}
+/* a mask as bits, one for each lane; choice by a mask */
+#if L==8 && defined(__AVX512DQ__)
+IN unsigned v_bits(M m){return _mm512_movepi64_mask((__m512i)m);}
+IN V v_sel(M m,V a,V b){
+return (V)_mm512_mask_blend_pd(_mm512_movepi64_mask((__m512i)m),(__m512d)b,(__m512d)a);}
+#elif L==4 && defined(__AVX__)
+IN unsigned v_bits(M m){return _mm256_movemask_pd((__m256d)m);}
+IN V v_sel(M m,V a,V b){return (V)_mm256_blendv_pd((__m256d)b,(__m256d)a,(__m256d)m);}
+#else
+IN unsigned v_bits(M m){unsigned r=0;for(int l=0;l<L;l++)r|=(unsigned)(m[l]&1)<<l;return r;}
+IN V v_sel(M m,V a,V b){return (V)((m&(M)a)|(~m&(M)b));}
+#endif
+IN int v_any(M m){return v_bits(m)!=0;}
 #if defined(__clang__)
 /* it has code of its own for these, which tells one zero from the other in its own way */
 IN V v_fmin(V a,V b){V r;for(int l=0;l<L;l++)r[l]=fmin(a[l],b[l]);return r;}
@@ -128,7 +128,11 @@ __attribute__((unused)) EACH(ceil)
 
 
 Fixed: TypeAlias = tuple[int, ...]
-Maker: TypeAlias = "Callable[[Writer, ca.Function, bool, str, Fixed], int]"
+Maker: TypeAlias = "Callable[[Writer, ca.Function, str, Fixed], int]"
+
+
+class NoForm(BackendError):  # noqa: N818 - reads as what it tells
+    """Something in a function has no form in lanes."""
 
 
 class Written(NamedTuple):
@@ -144,7 +148,7 @@ class Written(NamedTuple):
 
 
 class Writer:
-    """Writes functions and what they call, each once for each width.
+    """Writes functions and what they call, each once.
 
     Args:
         lanes: points at once.
@@ -153,38 +157,38 @@ class Writer:
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
         self._text: list[str] = []
-        self._known: dict[tuple[int, bool, Fixed], Written] = {}
+        self._known: dict[tuple[int, Fixed], Written] = {}
         self._held: list[ca.Function] = []  # hashes are of objects that live
         self._tables: dict[str, str] = {}
         self._makers: dict[str, Maker] = {}
         self.add("SXFunction", _straight_line)
 
     def add(self, kind: str, make: Maker) -> None:
-        """Say who writes functions of a kind: (writer, function, wide, name, fixed) -> work."""
+        """Say who writes functions of a kind: (writer, function, name, fixed) -> work."""
         self._makers[kind] = make
 
-    def function(self, fun: ca.Function, wide: bool, fixed: Fixed = ()) -> Written:
+    def function(self, fun: ca.Function, fixed: Fixed = ()) -> Written:
         """Write a function, or find it written.
 
         Args:
-            fun, wide: the function, and whether on vectors.
+            fun: the function.
             fixed: inputs of a map that are the same for all its columns, and come once.
 
         Raises:
-            BackendError: it holds something that has no form in lanes; the message names it.
+            NoForm: it holds something that has no form in lanes; the message names it.
         """
-        key = (hash(fun), wide, fixed)
+        key = (hash(fun), fixed)
         if key not in self._known:
             make = self._makers.get(fun.class_name())
             if make is None:
-                raise BackendError(
+                raise NoForm(
                     f"{fun.name()} is of the kind {fun.class_name()}, which has no form in lanes; "
                     "SX and MX functions, their maps and fast_newton have (expand() makes a "
                     "function of scalar operations where that is possible)"
                 )
             self._held.append(fun)
-            name = f"f{len(self._known)}_{len(self._held)}_{'v' if wide else 's'}"
-            self._known[key] = Written(name, make(self, fun, wide, name, fixed))
+            name = f"f{len(self._known)}_{len(self._held)}"
+            self._known[key] = Written(name, make(self, fun, name, fixed))
         return self._known[key]
 
     def put(self, text: str) -> None:
@@ -201,18 +205,17 @@ class Writer:
 
     def source(self) -> str:
         """Return all that was written."""
-        prelude = _PRELUDE.replace("LANES", str(self.lanes))
-        calls = [f"EACH({n})" for n in _CALLS_1]
+        prelude = _PRELUDE.replace("ALL_LANES", ",".join("a" * self.lanes))
+        prelude = prelude.replace("LANES", str(self.lanes))
+        calls = [f"EACH({n})" for n in _CALLS_1 if n not in VECTOR]
         two = "static V v_{0}(V a,V b){{V r;for(int l=0;l<L;l++)r[l]={0}(a[l],b[l]);return r;}}"
-        calls += [two.format(n) for n in _CALLS_2]
-        single = [f"IN S s_{n}(S a){{return {n}(a);}}" for n in _CALLS_1]
-        single += [f"IN S s_{n}(S a,S b){{return {n}(a,b);}}" for n in _CALLS_2]
+        calls += [two.format(n) for n in _CALLS_2 if n not in VECTOR]
         tables = []
         for key, name in self._tables.items():
             kind, body = key.split(" ", 1)
             tables.append(f"static const {kind} {name}{body}")
         unused = [f"__attribute__((unused)) {c}" for c in calls]
-        return "\n".join([prelude, *unused, *single, *tables, *self._text, ""])
+        return "\n".join([prelude, vector_math(self.lanes), *unused, *tables, *self._text, ""])
 
 
 def number(value: float) -> str:
@@ -222,18 +225,18 @@ def number(value: float) -> str:
     return "NAN" if math.isnan(value) else f"{'-' if value < 0 else ''}INFINITY"
 
 
-def refused(fun: ca.Function, op: int) -> BackendError:
+def refused(fun: ca.Function, op: int) -> NoForm:
     """Return the error for an operation that has no form in lanes."""
     name = NAMES.get(op, str(op)).removeprefix("OP_")
-    return BackendError(
+    return NoForm(
         f"{fun.name()}: the operation {name} has no form in lanes; write it by others, or evaluate "
         "this function by map"
     )
 
 
-def _straight_line(writer: Writer, fun: ca.Function, wide: bool, name: str, _: Fixed) -> int:
+def _straight_line(writer: Writer, fun: ca.Function, name: str, _: Fixed) -> int:
     """Write an SX function; it needs no work: compilers choose what stays in registers."""
-    p, T = ("v_", "V") if wide else ("s_", "S")
+    p, T = "v_", "V"
     body = []
     for k in range(fun.n_instructions()):
         op, o, i = fun.instruction_id(k), fun.instruction_output(k), fun.instruction_input(k)

@@ -1,9 +1,8 @@
 """C code in lanes of what is made of several functions: MX graphs, maps, Newton iterations.
 
 An MX function moves blocks of numbers, looks up cells of tables (each lane its own), and calls
-other functions.  A map inside a single evaluation goes over its columns in lanes.  Of solvers there
-is ``fast_newton`` as this package uses it, a loop around a step, with a mask: lanes that have
-converged stay as they are while others go on.
+other functions.  Of solvers there is ``fast_newton`` as this package uses it, a loop around a step,
+with a mask: lanes that have converged stay as they are while others go on.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.errors import BackendError
-from apu_casadi.core.lanes.lanecode import BINARY, UNARY, Fixed, Writer, Written, number, refused
+from apu_casadi.core.lanes.lanecode import BINARY, UNARY, Fixed, NoForm, Writer, number, refused
 
 _MOVES = {ca.OP_RESHAPE, ca.OP_SPARSITY_CAST, ca.OP_TRANSPOSE, ca.OP_PROJECT, ca.OP_GETNONZEROS}
 _MOVES |= {ca.OP_HORZREPMAT}
@@ -38,7 +36,7 @@ _SUMS = {
 def graph_writer(lanes: int) -> Writer:
     """Return a writer of all kinds of functions that have a form in lanes."""
     writer = Writer(lanes)
-    writer.add("MXFunction", lambda *given: _Graph(*given[:4]).write())
+    writer.add("MXFunction", lambda *given: _Graph(*given[:3]).write())
     writer.add("Map", _mapped)
     writer.add("FastNewton", _newton)
     return writer
@@ -64,9 +62,9 @@ def _positions(sparsity: ca.Sparsity) -> ca.DM:
 class _Graph:
     """Writes one MX function; work vectors stand one after the other in w."""
 
-    def __init__(self, writer: Writer, fun: ca.Function, wide: bool, name: str) -> None:
-        self.writer, self.fun, self.wide, self.name = writer, fun, wide, name
-        self.p, self.T = ("v_", "V") if wide else ("s_", "S")
+    def __init__(self, writer: Writer, fun: ca.Function, name: str) -> None:
+        self.writer, self.fun, self.name = writer, fun, name
+        self.p, self.T = "v_", "V"
         self.n = fun.n_instructions()
         self.nodes = [fun.instruction_MX(k) for k in range(self.n)]
         self.op = [fun.instruction_id(k) for k in range(self.n)]
@@ -350,7 +348,7 @@ class _Graph:
         mode = _low_modes(self.fun)[self.op[:k].count(ca.OP_LOW)]
         if table is None or mode == 1:
             what = "a grid that is computed" if table is None else "lookup_mode exact"
-            raise BackendError(f"{self.fun.name()}: LOW with {what} has no form in lanes")
+            raise NoForm(f"{self.fun.name()}: LOW with {what} has no form in lanes")
         n = node.dep(0).nnz()
         to, x = self._w(self.outs[k][0]), self._get(self.ins[k][1])
         # intervals begun, one after the other: what is not a number counts as beyond them all
@@ -364,19 +362,13 @@ class _Graph:
         node, info = self.nodes[k], self.nodes[k].info()
         to, at = self._w(self.outs[k][0]), self._get(self.ins[k][1])
         if "inner" not in info or node.dep(1).nnz() != 1:
-            raise BackendError(
+            raise NoForm(
                 f"{self.fun.name()}: the operation GETNONZEROS_PARAM has a form in lanes only "
                 "where one number tells the place of a slice"
             )
         s, table = info["inner"], self._table_of(k)
         which = f"({s['start']}+k*{s['step']})"
         n = node.nnz()
-        if not self.wide:
-            source = table or self._get(self.ins[k][0])
-            self.body.append(f"{{const int q=(int){at}[0];")
-            self._each(n, f"{to}[k]={source}[q+{which}]")
-            self.body.append("}")
-            return
         source = f"{table}[q+{which}]" if table else f"{self._get(self.ins[k][0])}[q+{which}][l]"
         self._room(1)
         self.body.append(
@@ -390,7 +382,7 @@ class _Graph:
         g, T = self.nodes[k].which_function(), self.T
         made = [self._made_by(k, i) for i in self.ins[k]]
         fixed = tuple(j for j, by in enumerate(made) if by in self.repeated)
-        done = self.writer.function(g, self.wide, fixed)
+        done = self.writer.function(g, fixed)
         unwanted = sum(g.nnz_out(j) for j, o in enumerate(self.outs[k]) if o < 0)
         absent = max((g.nnz_in(j) for j, i in enumerate(self.ins[k]) if i < 0), default=0)
         self._room(absent + unwanted)
@@ -433,12 +425,10 @@ def _columns(fun: ca.Function) -> tuple[ca.Function, int]:
     return inner, next((fun.nnz_out(j) // inner.nnz_out(j) for j in some), 0)
 
 
-def _mapped(writer: Writer, fun: ca.Function, wide: bool, name: str, fixed: Fixed) -> int:
-    """Write a map: column by column, or, in a single evaluation, in lanes."""
+def _mapped(writer: Writer, fun: ca.Function, name: str, fixed: Fixed) -> int:
+    """Write a map, column by column."""
     inner, count = _columns(fun)
-    done = writer.function(inner, True)
-    if not wide:
-        return _map_in_lanes(writer, inner, done, name, count, fixed)
+    done = writer.function(inner)
     steps = [0 if i in fixed else inner.nnz_in(i) for i in range(inner.n_in())]
     args = ",".join(f"a[{i}]+c*{n}" for i, n in enumerate(steps)) or "0"
     results = ",".join(f"r[{j}]+c*{inner.nnz_out(j)}" for j in range(inner.n_out()))
@@ -450,72 +440,38 @@ def _mapped(writer: Writer, fun: ca.Function, wide: bool, name: str, fixed: Fixe
     return done.work
 
 
-def _map_in_lanes(
-    writer: Writer, inner: ca.Function, done: Written, name: str, count: int, fixed: Fixed
-) -> int:
-    """Write a map over numbers: columns go into lanes, the last ones again where some are left."""
-    once, before, after, at = [], [], [], 0
-    args, results = list[str](), list[str]()
-    for i in range(inner.n_in()):
-        n = inner.nnz_in(i)
-        if i in fixed:
-            once.append(f"for(int k=0;k<{n};k++)v[{at}+k]=v_all(a[{i}][k]);")
-        else:
-            before.append(
-                f"for(int l=0;l<L;l++){{const int d=c+l<{count}?c+l:{count - 1};"
-                f"for(int k=0;k<{n};k++)((double*)(v+{at}))[k*L+l]=a[{i}][d*{n}+k];}}"
-            )
-        args.append(f"v+{at}")
-        at += n
-    for j in range(inner.n_out()):
-        n = inner.nnz_out(j)
-        after.append(
-            f"for(int l=0;l<L&&c+l<{count};l++)for(int k=0;k<{n};k++)"
-            f"r[{j}][(c+l)*{n}+k]=((double*)(v+{at}))[k*L+l];"
-        )
-        results.append(f"v+{at}")
-        at += n
-    call = f"const V*const a1[]={{{','.join(args)}}};V*const r1[]={{{','.join(results)}}};"
-    head = f"static void {name}(const S*const*a,S*const*r,S*w){{"
-    aligned = "V*const v=(V*)(((uintptr_t)w+8*L-1)&~(uintptr_t)(8*L-1));"
-    loop = f"for(int c=0;c<{count};c+=L){{"
-    run = f"{call}{done.name}(a1,r1,v+{at});"
-    writer.put("\n".join([head, aligned, *once, loop, *before, run, *after, "}}"]))
-    return (at + done.work + 1) * writer.lanes
-
-
 _NEWTON = """
-static void NAME(const T*const*a,T*const*r,T*w){
-T*const x=w,*const g=w+N,*const J=w+2*N;
+static void NAME(const V*const*a,V*const*r,V*w){
+V*const x=w,*const g=w+N,*const J=w+2*N;
 for(int k=0;k<N;k++)x[k]=a[0][k];
-MASK on=MASKALL;
+M on=~(M){0};
 for(int i=0;i<ITER;i++){
-const T*const a1[]={ARGS};T*const r1[]={J,g};
+const V*const a1[]={ARGS};V*const r1[]={J,g};
 LOOP(a1,r1,J+NNZ);
-T s=p_all(0.0);
-if(ABSTOL>0){for(int k=0;k<N;k++)s=p_fmax(s,p_fabs(g[k]));on=on&~MASKOF(s<=ABSTOL);}
-if(!p_any(on))break;
+V s=v_all(0.0);
+if(ABSTOL>0){for(int k=0;k<N;k++)s=v_fmax(s,v_fabs(g[k]));on=on&~(s<=ABSTOL);}
+if(!v_any(on))break;
 /* the division by a Jacobian of ones is CasADi's, which makes NaN of what is infinite */
-for(int k=0;k<N;k++){g[k]=g[k]-(0.0+g[k])*0.0;x[k]=p_sel(on,x[k]+-1.0*g[k],x[k]);}
-s=p_all(0.0);
-if(STEP>0){for(int k=0;k<N;k++)s=p_fmax(s,p_fabs(g[k]));on=on&~MASKOF(s<=STEP);}
-if(!p_any(on))break;
+for(int k=0;k<N;k++){g[k]=g[k]-(0.0+g[k])*0.0;x[k]=v_sel(on,x[k]+-1.0*g[k],x[k]);}
+s=v_all(0.0);
+if(STEP>0){for(int k=0;k<N;k++)s=v_fmax(s,v_fabs(g[k]));on=on&~(s<=STEP);}
+if(!v_any(on))break;
 }
 for(int k=0;k<N;k++)r[0][k]=x[k];
 }"""
 
 
-def _newton(writer: Writer, fun: ca.Function, wide: bool, name: str, _: Fixed) -> int:
+def _newton(writer: Writer, fun: ca.Function, name: str, _: Fixed) -> int:
     """Write the loop around a step; what has converged in a lane stays as it is."""
     loop = fun.get_function("jac_g_x")
     n: int = fun.nnz_in(0)
     code = _own_code(fun)
     if fun.n_out() != 1 or loop.nnz_out(0) != n or not _is_identity(loop):
-        raise BackendError(
+        raise NoForm(
             f"{fun.name()}: fast_newton has a form in lanes only where its Jacobian is the "
             "identity: let the function be Newton's step itself (jacobian_function)"
         )
-    done = writer.function(loop, wide)
+    done = writer.function(loop)
     found = {
         key: re.search(pattern, code)
         for key, pattern in (
@@ -526,14 +482,12 @@ def _newton(writer: Writer, fun: ca.Function, wide: bool, name: str, _: Fixed) -
     }
     values = {k: m.group(1) for k, m in found.items() if m}
     if len(values) < len(found):
-        raise BackendError(f"{fun.name()}: CasADi's code for fast_newton is not what is expected")
+        raise NoForm(f"{fun.name()}: CasADi's code for fast_newton is not what is expected")
     args = ",".join(["x", *(f"a[{i}]" for i in range(1, fun.n_in()))])
-    mask, every, of = ("M", "~(M){0}", "(") if wide else ("int", "~0", "-(")
-    text = _NEWTON.replace("MASKOF(", of).replace("MASKALL", every).replace("MASK", mask)
+    text = _NEWTON
     words = {"NAME": name, "ARGS": args, "LOOP": done.name, "NNZ": str(n), "N": str(n)}
     for key, value in (words | values).items():
         text = re.sub(rf"\b{key}\b", value, text)
-    text = re.sub(r"\bT\b", "V" if wide else "S", text).replace("p_", "v_" if wide else "s_")
     writer.put(text)
     return 3 * n + done.work
 

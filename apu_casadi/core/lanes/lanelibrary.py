@@ -29,6 +29,7 @@ import logging
 import os
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import casadi as ca
@@ -37,10 +38,11 @@ from apu_casadi.core.backend import Code, backend_in_use, compiled, library, loa
 from apu_casadi.core.cachefolder import say
 from apu_casadi.core.calling import Mapped
 from apu_casadi.core.errors import BackendError
+from apu_casadi.core.lanes.lanecode import NoForm
 from apu_casadi.core.lanes.lanegraph import graph_writer
 from apu_casadi.core.sharing import BUILDING, keep, once
 
-__all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "single", "source", "unsupported"]
+__all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "source", "unsupported"]
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
@@ -117,8 +119,11 @@ def in_lanes(
 
     def make() -> ca.Function:
         made = None
-        if backend_in_use() == "c" and n > 1 and not unsupported(fun):
-            made = library(_code(fun, n, fixed), build=build, level=level)
+        if backend_in_use() == "c" and n > 1:
+            made = library(_code(fun, n, fixed), build=False, level=level)
+            if made is None and build:
+                with suppress(NoForm):
+                    made = library(_written(fun, n, fixed), level=level)
         return _by_map(compiled(fun, build=build, level=level), n, fixed) if made is None else made
 
     if not build:
@@ -144,34 +149,12 @@ def recalled(
         return None
     fixed = tuple(sorted(common))
 
-    def code(fun: ca.Function) -> Code | None:
-        return None if unsupported(fun) else _code(fun, n, fixed)
-
     own = f"{recipe} {n} lanes {fixed} {_digest()}"
-    return load_library(own, build, code, compile_missing=compile_missing)
-
-
-def single(fun: ca.Function, *, build: bool = True, level: int = 1) -> ca.Function:
-    """Return ``fun`` for one point, with the maps inside evaluated in lanes; else as compiled.
-
-    Raises:
-        BackendError: as of :func:`in_lanes`.
-    """
-    n = lanes_in_use()
-    if n > 1 and _has_maps(fun) and not unsupported(fun):
-        made = library(_code(fun, n, (), single=True), build=build, level=level)
-        if made is not None:
-            return made
-    return compiled(fun, build=build, level=level)
-
-
-def _has_maps(fun: ca.Function) -> bool:
-    """Whether a function is a map or calls one, at any depth."""
-    if fun.class_name() != "MXFunction":
-        return bool(fun.class_name() == "Map")
-    calls = [k for k in range(fun.n_instructions()) if fun.instruction_id(k) == ca.OP_CALL]
-    inner = {hash(g): g for g in (fun.instruction_MX(k).which_function() for k in calls)}
-    return any(map(_has_maps, inner.values()))
+    with suppress(NoForm):
+        return load_library(
+            own, build, lambda fun: _written(fun, n, fixed), compile_missing=compile_missing
+        )
+    return None
 
 
 def _by_map(fun: ca.Function, n: int, common: tuple[int, ...]) -> ca.Function:
@@ -186,20 +169,23 @@ def unsupported(fun: ca.Function) -> str:
     def look() -> str:
         try:
             source(fun, 2)
-        except BackendError as error:
-            say(logging.INFO, f"by map: {error}")
+        except NoForm as error:
             return str(error)
         return ""
 
     return keep(fun, "unsupported in lanes", None, look)
 
 
-def _code(fun: ca.Function, n: int, common: tuple[int, ...], *, single: bool = False) -> Code:
-    kind = "single" if single else "wide"
-    content = f"{fun.name()} {n} {common} {kind} {_digest()}\n{fun.serialize()}"
+def _code(fun: ca.Function, n: int, common: tuple[int, ...]) -> Code:
+    content = f"{fun.name()} {n} {common} {_digest()}\n{fun.serialize()}"
     flags = (*(_FLAGS[n] if platform.machine() in _X86 else ()), *_COMMON_FLAGS)
-    name = _name(fun, 1 if single else n)
-    return Code(name, content, lambda: source(fun, n, common, single=single), flags)
+    return Code(_name(fun, n), content, lambda: source(fun, n, common), flags)
+
+
+def _written(fun: ca.Function, n: int, common: tuple[int, ...]) -> Code:
+    """Return the code, written now: what has no form is no failure of the compiler."""
+    text = source(fun, n, common)
+    return _code(fun, n, common)._replace(write=lambda: text)
 
 
 def _name(fun: ca.Function, n: int) -> str:
@@ -228,38 +214,40 @@ EXPORT int NAME(const double**arg,double**res,I*iw,double*w,int mem){
 """
 
 
-def source(
-    fun: ca.Function, lanes: int, common: Sequence[int] = (), *, single: bool = False
-) -> str:
+def source(fun: ca.Function, lanes: int, common: Sequence[int] = ()) -> str:
     """Return the C code of a function for ``lanes`` points at once.
 
     Raises:
-        BackendError: something in it has no form in lanes; the message names it.
+        NoForm: something in it has no form in lanes; the message names it.
     """
     writer = graph_writer(lanes)
-    done = writer.function(fun, not single)
+    try:
+        done = writer.function(fun)
+    except NoForm as error:
+        say(logging.INFO, f"by map: {error}")
+        raise
     n_in, n_out = fun.n_in(), fun.n_out()
-    wide = [1 if single or i in common else lanes for i in range(n_in)]
+    wide = [1 if i in common else lanes for i in range(n_in)]
     inputs = [ca.repmat(fun.sparsity_in(i), 1, wide[i]) for i in range(n_in)]
-    outputs = [ca.repmat(fun.sparsity_out(j), 1, 1 if single else lanes) for j in range(n_out)]
+    outputs = [ca.repmat(fun.sparsity_out(j), 1, lanes) for j in range(n_out)]
     sizes_in, sizes_out = [*map(fun.nnz_in, range(n_in))], [*map(fun.nnz_out, range(n_out))]
     total = sum(sizes_in) + sum(sizes_out) + done.work
     words = {
-        "NAME": _name(fun, 1 if single else lanes),
+        "NAME": _name(fun, lanes),
         "N_IN": str(n_in),
         "N_OUT": str(n_out),
         "NAMES_IN": ",".join(f'"{n}"' for n in fun.name_in()) or '""',
         "NAMES_OUT": ",".join(f'"{n}"' for n in fun.name_out()) or '""',
         "PATTERNS_IN": _patterns(inputs),
         "PATTERNS_OUT": _patterns(outputs),
-        "WORK": str(total if single else (total + 1) * lanes),
+        "WORK": str((total + 1) * lanes),
     }
     text = _FRAME
     for key in sorted(words, key=len, reverse=True):  # NAMES_IN before NAME
         text = text.replace(key, words[key])
-    body = _single_call(sizes_in, sizes_out) if single else _wide_call(sizes_in, sizes_out, wide)
-    call = f"{done.name}(a,r,{'w' if single else 'v'});"
-    return "\n".join([writer.source(), text, *body[0], call, *body[1], "return 0;}", ""])
+    before, after = _wide_call(sizes_in, sizes_out, wide)
+    call = f"{done.name}(a,r,v);"
+    return "\n".join([writer.source(), text, *before, call, *after, "return 0;}", ""])
 
 
 def _patterns(patterns: Sequence[ca.Sparsity]) -> str:
@@ -300,19 +288,6 @@ def _wide_call(
     ]
     before.append(_pointers("V", "b{}", len(n_in), len(n_out)))
     return before, after
-
-
-def _single_call(n_in: Sequence[int], n_out: Sequence[int]) -> tuple[list[str], list[str]]:
-    """Code that takes inputs and outputs where they are, and work for those that are not there."""
-    before = []
-    for k, n in enumerate(n_in):
-        before.append(f"const double*b{k}=arg[{k}];if(!b{k}){{for(int k=0;k<{n};k++)w[k]=0.0;")
-        before.append(f"b{k}=w;}}w+={n};")
-    for j, n in enumerate(n_out):
-        k = j + len(n_in)
-        before.append(f"double*b{k}=res[{j}]?res[{j}]:w;w+={n};")
-    before.append(_pointers("double", "b{}", len(n_in), len(n_out)))
-    return before, []
 
 
 # ------------------------------------------------------------------------------ many points

@@ -22,7 +22,17 @@ from apu_casadi.core.calling import Caller, available_threads
 from apu_casadi.core.errors import BackendError, ScenarioError
 from apu_casadi.core.lanes.lanelibrary import in_lanes
 
-__all__ = ["CHUNK", "Course", "Member", "Question", "Together", "alone", "answer", "ensemble"]
+__all__ = [
+    "CHUNK",
+    "Course",
+    "Member",
+    "Question",
+    "Together",
+    "alone",
+    "answer",
+    "asking",
+    "ensemble",
+]
 
 CHUNK = 64  # members that are under way at once
 T = TypeVar("T")
@@ -82,6 +92,11 @@ class Member:
         if hash(of.of) != hash(function.of):
             raise BackendError(f"asked for {of.fun.name()}, then for {function.fun.name()}")
         return results
+
+
+def asking() -> bool:
+    """Whether calls here are questions of a member of an ensemble."""
+    return _here.get() is not None
 
 
 @contextmanager

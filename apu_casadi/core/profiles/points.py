@@ -17,6 +17,7 @@ import csv
 import itertools
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -200,6 +201,17 @@ def _column(path: Any, row: int, header: list[str], name: str) -> int:
         raise DataError(f"{path}: row {row}: column {name!r} stands {header.count(name)} times")
     if len(header) == 1 and ";" in header[0]:
         raise DataError(f"{path}: row {row}: cells must be separated by commas, not semicolons")
+    if header[0].strip('"').lower().startswith("sep="):
+        raise DataError(
+            f"{path}: row {row}: delete this line, and put commas between the cells if there are "
+            "others"
+        )
+    if own := next((h for h in header if re.fullmatch(rf"{re.escape(name)}\s*[\[({{].*", h)), ""):
+        raise DataError(
+            f"{path}: row {row}: column {own!r} has a unit; profiles are in the unit of the "
+            f"scenario's key: convert the values and name it {name!r}, or give column = {own!r} if "
+            "it is that unit"
+        )
     raise DataError(f"{path}: row {row}: no column {name!r} {nearest(name, header)}")
 
 

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 __all__ = ["TrimBatch", "performance_deck", "trim_batch"]
 
 
-CHUNK = 16384  # points solved at once by a batch
+CHUNK = 4096  # points solved at once by a batch: their results stay in the cache
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def _solve_chunk(
     index = np.flatnonzero(valid)
     if not index.size:
         return
-    p = p[:, index]
+    p = p if index.size == valid.size else p[:, index]
     compile = out.size >= COMPILE_FROM
     w, y, r, _s, count = solver.many("cold", p, n_threads=n_threads, compile=compile)
     residual, reached = norms(r), np.ones(index.size)
@@ -290,14 +290,19 @@ def _solve_chunk(
         a, b = settle(solver, limits, found, p[:, solved], compile=compile)
         w[:, solved], y[:, solved], residual[solved] = a
         out.N_second[first + index[solved]] = b.w[DIRECT["N"]]
-    status[solved] = limit_status(gg, limits, y[:, solved])
-    for j in np.flatnonzero(solved & (status != Status.SOLVED)):
-        out.stop[first + int(index[j])] = (y[:, j].copy(), w[:, j].copy())
-    at = first + index
+    every = bool(solved.all())
+    status[solved] = limit_status(gg, limits, y if every else y[:, solved])
+    broken = np.flatnonzero(solved & (status != Status.SOLVED))
+    stops = zip(y.T[broken], w.T[broken], strict=True)
+    out.stop.update(zip((first + index[broken]).tolist(), stops, strict=True))
+    whole = slice(first, first + valid.size)
+    at = whole if index.size == valid.size else first + index
     out.status[at], out.reached[at], out.iterations[at] = status, reached, count
-    out.residual[at] = np.where(solved, residual, np.inf)
-    out.y[:, at] = np.where(solved, y[out.rows], np.nan)
-    out.w[:, at] = np.where(solved, w, np.nan)
+    out.residual[at] = residual if every else np.where(solved, residual, np.inf)
+    # rows one by one: nothing of this size is made twice
+    for target, source, rows in ((out.y, y, out.rows), (out.w, w, range(NZ + 3))):
+        for k, row in enumerate(rows):
+            target[k, at] = source[row] if every else np.where(solved, source[row], np.nan)
 
 
 def performance_deck(

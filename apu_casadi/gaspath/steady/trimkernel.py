@@ -150,11 +150,13 @@ class TrimKernel(Rebuilt):
         name: str,
         args: Mapping[str, ca.SX],
         outputs: Callable[[System], Mapping[str, Any]],
+        reciprocals: bool = False,
         **at: Any,
     ) -> ca.Function:
         """Make a function of ``args`` that evaluates the equations at s, p, a, c.
 
-        These are arguments, or given as expressions of them.
+        These are arguments, or given as expressions of them; ``reciprocals`` as of
+        :meth:`~apu_casadi.gaspath.cycle.Cycle.function`.
         """
         s, p, a, c = ({**args, **at}[k] for k in "spac")
         w, slope, dPW_dN = self._decode(s, p, c)
@@ -167,7 +169,7 @@ class TrimKernel(Rebuilt):
         def made(e: Assembled) -> Mapping[str, Any]:
             return outputs(self._system(e, p, w, slope, dPW_dN, PW_design))
 
-        return self.cycle.function(name, args, point, made)
+        return self.cycle.function(name, args, point, made, reciprocals=reciprocals)
 
     def _system(
         self,
@@ -257,7 +259,7 @@ class TrimKernel(Rebuilt):
             return {"F": ca.vertcat(-d, -_COUNT)}
 
         at = {"s": v[:n], "p": q[:m], "a": q[m:k], "c": q[k:]}
-        F = self._function("trim_step", {"v": v, "q": q}, step, **at)
+        F = self._function("trim_step", {"v": v, "q": q}, step, reciprocals=True, **at)
         x, c = F.mx_in()
         options = {
             "abstol": 0.0,

@@ -9,7 +9,9 @@ healthy             nothing that the filter does not know
 short circuit a     one phase has a severity, which comes with the change (b, c)
 hot winding         field and stator have other resistances
 sensor i_a          that current says nothing from the change on, stuck, biased or noisy (i_b, ...)
-voltage sensors     the same of the voltages, whose errors act as unknown steps
+sensor w_r          the same of the speed, in place of which the voltages' angle stands
+sensor V_fd         the same of the field's voltage, whose error acts as unknown steps
+voltage sensors     the same of the phases' voltages
 harmonics           the currents have harmonics that the voltages have not
 =================== ============================================================================
 
@@ -23,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,10 +33,11 @@ import numpy as np
 
 from apu_casadi.core.errors import ApuError
 from apu_casadi.machine.machinedata import MachineParameters
-from apu_casadi.machine.park import PHASES
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.terminalsignals import JUMP_SIZES, MEASURED
+from estimators.apu.electrical.terminalsignals import JUMP_SIZES, MEASURED, PHASES_V
 from estimators.apu.electrical.tuning import RESET_SIGMA
+from estimators.apu.sensorfailures import failure
 from estimators.apu.sensors import SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
@@ -47,6 +50,7 @@ __all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "probabilities"]
 BEFORE, AFTER = 0.01, 0.03  # s of the piece around the change
 UNKNOWN = 1e4  # A; standard deviation of a reading that says nothing
 VOLTAGE_ERRORS = (10.0, 100.0)  # V
+FIELD_ERRORS = (3.0, 30.0)  # V
 ORDERS = (5, 7, 11)
 #: Prior weights of the hypotheses' kinds; a kind with several members shares its own.
 PRIOR = {
@@ -67,10 +71,13 @@ class Causes:
     Args:
         t: its instant, s.
         probability: of each hypothesis.
+        failure: of sensors by hypothesis, how they failed, with probabilities
+            (:mod:`estimators.apu.sensorfailures`).
     """
 
     t: float
     probability: Mapping[str, float]
+    failure: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def best(self) -> str:
@@ -111,6 +118,7 @@ class _Piece:
     samples: dict[str, np.ndarray]
     change: float
     backend: str | None
+    failed: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def filter(self, **how: Any) -> tuple[ElectricalFilter, Recording]:
         """Return a filter and its recording."""
@@ -160,7 +168,15 @@ class _Piece:
             return replace(data, variance=variance)
 
         r, data = self.run(blind, phases=())
-        at = self.late(data) & np.isfinite(r.innovation[row])
+        shown = np.where(np.isfinite(data.y[row]), r.innovation[row], np.nan)
+        late = self.late(data)
+        name = MEASURED[row]
+        with np.errstate(invalid="ignore"):
+            spread = np.sqrt(np.maximum(r.innovation_variance[row] - UNKNOWN**2, 0.0))
+        spread = np.hypot(spread, self.sensors.sigma(name, 0.0))
+        told = data.t[late], data.y[row, late], shown[late], spread[late]
+        self.failed[f"sensor {name}"] = failure(*told)
+        at = late & np.isfinite(r.innovation[row])
         nu, S = r.innovation[row, at], r.innovation_variance[row, at]
         found = max(float(np.mean(nu**2)), float(np.min(S)) * 1e-9)
         own = -0.5 * (nu**2 / S + np.log(2 * math.pi * S)).sum()
@@ -182,6 +198,29 @@ class _Piece:
 
         best = max(float(self.run(off(s), phases=())[0].loglik) for s in VOLTAGE_ERRORS)
         return best - math.log(len(VOLTAGE_ERRORS))
+
+    def field_off(self) -> float:
+        """Log-likelihood where the field's voltage has errors of the best of a few sizes."""
+        runs = (
+            replace(self, sensors=self.sensors.change(V_fd=s)).run(phases=())[0]
+            for s in FIELD_ERRORS
+        )
+        return max(float(r.loglik) for r in runs) - math.log(len(FIELD_ERRORS))
+
+    def speed_off(self) -> float:
+        """Log-likelihood where the speed after the change is what the voltages' angle says."""
+        a, t = self.samples, self.samples["t"]
+        turn = np.exp(1j * np.array(list(PHASE_ANGLE.values())))
+        v = turn @ np.array([a[n] for n in PHASES_V])
+        late = (t >= self.change - 1e-9) & np.isfinite(v)
+        fit = np.polynomial.Polynomial.fit(t[late], np.unwrap(np.angle(v[late])), 2)
+        said = np.where(t >= self.change - 1e-9, fit.deriv()(t), a["w_r"])
+        known = replace(self, samples=a | {"w_r": said})
+        late, sigma = t >= self.change - 1e-9, self.sensors.sigma("w_r", said)
+        off = a["w_r"] - said
+        self.failed["sensor w_r"] = failure(t[late], a["w_r"][late], off[late], sigma[late])
+        # slope and curvature were found
+        return float(known.run(phases=())[0].loglik) - math.log(max(int(late.sum()), 2))
 
     def harmonics(self, r: FilterResult) -> float:
         """Log-likelihood of a healthy machine whose currents have harmonics of their own."""
@@ -235,8 +274,11 @@ def causes_of_change(
     judge("hot winding", lambda: piece.run(phases=(), free=warm)[0].loglik)
     for k, n in enumerate(MEASURED):
         judge(f"sensor {n}", lambda k=k: piece.without(k))  # type: ignore[misc]
+    judge("sensor w_r", piece.speed_off)
+    judge("sensor V_fd", piece.field_off)
     judge("voltage sensors", piece.voltages_off)
     judge("harmonics", lambda: piece.harmonics(piece.healthy))
     if not any(math.isfinite(v) for v in found.values()):
         return None
-    return Causes(change, probabilities(found))
+    failed = {n: f for n, f in piece.failed.items() if f}
+    return Causes(change, probabilities(found), failed)

@@ -12,7 +12,7 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, last, of_family, remade
-from apu_casadi.machine.machinedata import MachineParameters, require_linear
+from apu_casadi.machine.machinedata import MACHINE, MachineParameters, require_linear
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from apu_casadi.machine.terminals import (
     FLUXES,
@@ -29,6 +29,7 @@ from estimators.apu.electrical.machinemodel import electrical_model
 from estimators.apu.electrical.sequences import fitted
 from estimators.apu.electrical.terminalsignals import (
     ADMITTANCE,
+    DELAY,
     GAIN_SENSORS,
     JUMP_SIZES,
     MEASURED,
@@ -38,9 +39,11 @@ from estimators.apu.electrical.terminalsignals import (
 )
 from estimators.apu.electrical.tuning import (
     ANGLE_WALK_CONSIDERED,
+    DELAY_SIGMA,
     FLUX_WALK,
     FREE_SIGMA,
     H_BALANCED,
+    H_BALANCED_CONSIDERED,
     H_SIGMA,
     H_WALK,
     H_WALK_GAINS,
@@ -59,7 +62,14 @@ from estimators.filters.belief import Belief
 from estimators.models.filtermodel import FilterModel, Unknown, augment
 from estimators.models.recording import SAME_TIME, Recording, plain_numbers
 
-__all__ = ["GAINS", "ElectricalFilter", "electrical_filter", "jump_floor", "window_starts"]
+__all__ = [
+    "GAINS",
+    "ElectricalFilter",
+    "considering",
+    "electrical_filter",
+    "jump_floor",
+    "window_starts",
+]
 
 #: Harmonics that each channel consists of, for what is missing of it.
 HARMONICS_OF: dict[str, tuple[int, ...]] = dict.fromkeys((*PHASES_V, *PHASES_I), (1, 3))
@@ -218,6 +228,7 @@ class ElectricalFilter(Parametric):
         spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
         spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
         spread |= {f"gain_{n}": self.sensors[n].gain for n in GAIN_SENSORS}
+        spread[DELAY.name] = DELAY_SIGMA
         own = self.machine.held("machine")
         means |= {n: v for n, v in own.items() if n in means}
         spread |= {n: FREE_SIGMA * abs(v) for n, v in own.items()}
@@ -229,7 +240,8 @@ class ElectricalFilter(Parametric):
         if set(SHUNTS.names) <= set(means) and not set(SHUNTS.names) & set(sigma or {}):
             # that all three are faulty looks like another rotor angle
             rows = np.ix_(*[self.model.x.indices(SHUNTS.names)] * 2)
-            prior.cov[rows] -= (H_SIGMA**2 - H_BALANCED**2) / 3
+            common = H_BALANCED_CONSIDERED if self.gains == "consider" else H_BALANCED
+            prior.cov[rows] -= (H_SIGMA**2 - common**2) / 3
         e = 1e-6
         # of a parameter the same share of it
         size = dict.fromkeys(means, 1.0) | {n: abs(v) for n, v in own.items() if n in means}
@@ -237,6 +249,8 @@ class ElectricalFilter(Parametric):
         moved |= {"g_shunt": self._start(first, Y=Y_START + e)}
         moved |= {"b_shunt": self._start(first, Y=Y_START - 1j * e)}
         moved |= {f"gain_{n}": self._start(first, {n: -e}) for n in GAIN_SENSORS}
+        moved[DELAY.name] = self._start(first, delay=e * DELAY.nominal)
+        size[DELAY.name] = DELAY.nominal
         for n in own.keys() & means.keys():
             more = self.machine.symbolic(**{n.partition(".")[2]: own[n] + e * size[n]})
             moved[n] = dataclasses.replace(self, machine=more)._start(first)
@@ -257,13 +271,14 @@ class ElectricalFilter(Parametric):
         *,
         h: float = 0.0,
         Y: complex = Y_START,
+        delay: float = 0.0,
     ) -> dict[str, float]:
-        """Return the start with some readings taken for more by a share of them, a fault."""
+        """Return the start with some readings taken for more by a share, a fault, late currents."""
         p, turn = self.machine, TURN
         by = [1 + (share or {}).get(n, 0.0) for n in (*PHASES_V, *PHASES_I, "i_fd")]
         v, i = (complex(x * k @ turn) / 3 for x, k in ((first.v, by[:3]), (first.i, by[3:6])))
         i_0 = float((first.i * by[3:6]).sum().real) / 3
-        i += h * v / (3 * p.r_s)
+        i = i * np.exp(1j * first.w * delay) + h * v / (3 * p.r_s)
         i_shunt = 0.0
         if self.kappa is not None:
             k = PHASES.index(str(self.phase))
@@ -371,8 +386,9 @@ def electrical_filter(
             Estimated, they make h drift by a standard deviation in a second (the angle's error is
             in the derivatives and in the innovations alike) and suit recordings of that length; a
             second pass, :func:`estimators.batch.relinearised.relinearised_filter`, halves that, and
-            errors are then what is claimed. Considered, nothing drifts, and the NIS, which then
-            holds constant offsets, is no test; the angle then walks by ``ANGLE_WALK_CONSIDERED``.
+            errors are then what is claimed. From a reset on :func:`~.tracking.track` considers
+            them. Considered, nothing drifts, and the NIS, which then holds constant offsets, is no
+            test; the angle then walks by ``ANGLE_WALK_CONSIDERED``.
         power: add the state ``energy``, for :func:`~.tracking.window_power`.
         phases: phases with an h; none of them makes the healthy machine's filter.
         kappa: leakage partition; None is full coupling (kappa = mu).  With a number the states are
@@ -380,7 +396,9 @@ def electrical_filter(
             :func:`~.faults.leaky_fault` gives mu and k_rf.
         phase: the faulty phase, with ``kappa`` only.
         free: parameters of the machine that are states, by name (``machine.r_s``); their prior
-            means are those of ``machine``, their standard deviations ``FREE_SIGMA`` of them.
+            means are those of ``machine``, their standard deviations ``FREE_SIGMA`` of them. With
+            gains also ``delay_i``, by which currents are read later than voltages
+            (``DELAY_SIGMA``).
 
     Raises:
         ParameterError: unknown choice, kappa without phase or the other way round.
@@ -405,6 +423,17 @@ def electrical_filter(
     return _filter(
         machine, sensors, h_walk, flux_walk, gains, power, phases, kappa, phase, unknowns
     )
+
+
+def considering(filt: ElectricalFilter) -> ElectricalFilter:
+    """Return a filter of the same states that considers the gains instead of estimating them."""
+    m = filt.model
+    free = {n: Unknown(consider=n in m.consider) for n in m.x.names if n in MACHINE.names}
+    if DELAY.name in m.x.names:
+        free[DELAY.name] = Unknown(consider=DELAY.name in m.consider)
+    phases = tuple(k for k in PHASES if f"h_{k}" in m.x.names)
+    how: dict[str, Any] = {"sensors": filt.sensors, "power": filt.power, "phases": phases}
+    return electrical_filter(filt.machine, gains="consider", free=free, **how)
 
 
 @remade

@@ -1,16 +1,16 @@
 """What the electrical filters of one machine hand to the gas path: power, and what is uncertain.
 
-* The healthy machine's filter gives the mean power of each 20 ms without a short circuit.  Gain
-  errors are noise in it, so that it learns nothing false; their share is added.
-* The filter with the three severities considers the gain errors: what it claims of severities and
-  power holds them, however long it runs.  By its joint beliefs at the ends of the windows power is
-  the mean over a healthy machine and a short circuit in each phase (:mod:`.hypotheses`).
+* The filter with the three severities considers the gain errors, the delay of the currents and
+  what else is not known (:mod:`estimators.apu.unknowns`): what it claims of severities and power
+  holds them, however long it runs.  By its joint beliefs at the ends of the windows power is the
+  mean over a healthy machine and a short circuit in each phase (:mod:`.hypotheses`).
 * Where a phase is found faulty, a filter with that phase's h alone runs again from the beginning,
   or from the last reset: severities of half a per cent and more are far from linear.
 
-Errors of the power are of three kinds: noise, new in each window; gain errors, a constant share;
-and the loss of a short circuit that may be there or whose severity is not known better, the same
-power in all windows.  The gas-path filter has a state for each of the latter two.  When a phase is
+Errors of the power are of three kinds: noise, new in each window; errors of gains, delay and the
+like, a constant share; and the loss of a short circuit that may be there or whose severity is not
+known better, the same power in all windows.  The gas-path filter has a state for each of the latter
+two.  The efficiency is of the second kind, and on top: nothing here tells it.  When a phase is
 found, what was handed over before is known better as well: a :class:`View` is the whole course as
 known from one window on.
 """
@@ -30,19 +30,35 @@ from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
-from estimators.apu.electrical.hypotheses import Hypotheses
+from estimators.apu.electrical.hypotheses import Hypotheses, SeverityPrior, loose_in_common
+from estimators.apu.electrical.terminalsignals import DELAY, PHASES_I, PHASES_V
 from estimators.apu.electrical.tracking import track, window_power
-from estimators.apu.electrical.tuning import FAULT_LEVEL, H_SIGMA, RELEASE_LEVEL
+from estimators.apu.electrical.tuning import (
+    FAULT_LEVEL,
+    H_SIGMA,
+    H_WALK_CONSIDERED,
+    RELEASE_LEVEL,
+)
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.sensors import SensorSet
-from estimators.apu.unknowns import Knowledge, filter_unknowns, of_parameter, usual
+from estimators.apu.unknowns import EFFICIENCY, Knowledge, filter_unknowns, of_parameter, usual
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, StepMaker, run
 from estimators.models.recording import Recording
 
-__all__ = ["GAIN_SHARE", "ElectricalSide", "View", "electrical_side", "loosened"]
+__all__ = [
+    "GAIN_SHARE",
+    "SETTLED",
+    "Beliefs",
+    "ElectricalSide",
+    "View",
+    "electrical_side",
+    "loosened",
+]
 
+PEAK = {"v": 325.0, "i": 461.0, "V_fd": 40.0, "i_fd": 590.0}  # at rated load, V and A
 FIELD = 0.04  # s, over which field voltage and current give the field resistance
+SETTLED = 5  # windows after which the filters have settled
 # gain errors of 0.5 % of three voltages and three currents in the power of three phases
 GAIN_SHARE = 0.005 * math.sqrt(2 / 3)
 
@@ -53,15 +69,24 @@ class View:
 
     Args:
         start: window from which on it is known.
-        P: mean mechanical power of both generators over each window, W, (K - 1,).
+        P, variance: mean mechanical power of both generators over each window, W, and its variance
+            but for the efficiency, W^2, (K - 1,).
         noise, loss: variances of what is new in each window, and of what a short circuit takes more
-            or less in all of them, W^2, (K - 1,).  The share of gain errors comes on top.
+            or less in all of them, W^2, (K - 1,).
     """
 
     start: int
     P: np.ndarray
+    variance: np.ndarray
     noise: np.ndarray
     loss: np.ndarray
+
+    @classmethod
+    def of(
+        cls, start: int, P: np.ndarray, variance: np.ndarray, noise: np.ndarray, share: float
+    ) -> View:
+        """Take for loss what neither noise nor a share of the power explains."""
+        return cls(start, P, variance, noise, (variance - noise - (share * P) ** 2).clip(0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +96,8 @@ class ElectricalSide:
     Args:
         t: the instants, s.
         views: courses of the power, each known from its ``start`` on; the first from 0.
-        share: relative standard deviation of the power by gain errors.
+        share: relative standard deviation of the power by errors of gains and delay.
+        eta: the same by the efficiency.
         severities: h and its standard deviation by phase, (2, 3, K).
         probability: that the machine has a short circuit, (K,).
         phase: found faulty, 0 for none, (K,).
@@ -80,17 +106,20 @@ class ElectricalSide:
         resets: instants, s, at which the machine changed.
         result: of the filter with the three h, at every sample; without them, of the healthy
             machine's; see ``judged`` of :func:`electrical_side`.
+        beliefs: of the filter with the three h at the ends of the windows; None without it.
     """
 
     t: np.ndarray
     views: tuple[View, ...]
     share: float
+    eta: float
     severities: np.ndarray
     probability: np.ndarray
     phase: np.ndarray
     misfit: np.ndarray
     resets: tuple[float, ...]
     result: FilterResult
+    beliefs: Beliefs | None = None
 
     def _causal(self, name: str) -> np.ndarray:
         out = np.array(getattr(self.views[0], name))
@@ -105,9 +134,13 @@ class ElectricalSide:
 
     @property
     def variance(self) -> np.ndarray:
-        """Variance of P, W^2: noise, short circuit, gain errors."""
-        variance: np.ndarray = self._causal("noise") + self._causal("loss")
-        return variance + (self.share * self.P) ** 2
+        """Variance of P, W^2: noise, short circuit, gain errors and the like, efficiency."""
+        return self.given_efficiency + (self.eta * self.P) ** 2
+
+    @property
+    def given_efficiency(self) -> np.ndarray:
+        """The same if the efficiency is known."""
+        return self._causal("variance")
 
 
 def loosened(sensors: SensorSet) -> SensorSet:
@@ -116,22 +149,39 @@ def loosened(sensors: SensorSet) -> SensorSet:
     A filter that estimates the gains from 10 kHz samples learns them within a second to better than
     its model is; one that takes them for noise learns nothing false.
     """
-    rated = {"v": 325.0, "i": 461.0, "V_fd": 40.0, "i_fd": 590.0}  # peak values, V and A
     noise = {}
     for s in sensors.sensors:
-        size = rated.get(s.name, rated.get(s.name[0])) if s.name != "w_r" else 0.0
+        size = PEAK.get(s.name, PEAK.get(s.name[0])) if s.name != "w_r" else 0.0
         gain = s.unsure("gain") * float(size or 0.0) / math.sqrt(2)
         noise[s.name] = math.hypot(s.noise, gain, s.unsure("bias"))
     return sensors.change(**noise)
 
 
+class Beliefs(NamedTuple):
+    """Joint beliefs at the ends of n windows.
+
+    Args:
+        names: severities ``h_a``, mean power ``P``, W, and errors that the filter considers.
+        mean, cov: of these, (n, m) and (n, m, m).
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    cov: np.ndarray
+
+
 class _Windows(NamedTuple):
-    """Ends of windows: beliefs of the severities and the mean power there."""
+    """Ends of windows: beliefs of severities, mean power and considered errors there."""
 
     mean: np.ndarray
     cov: np.ndarray
     result: FilterResult
     resets: list[float]
+    names: tuple[str, ...]
+
+    @property
+    def beliefs(self) -> Beliefs:
+        return Beliefs(self.names, self.mean, self.cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,10 +208,14 @@ class _Filters:
         A ``plain`` one takes gain errors for noise, as the healthy machine's does.
         """
         healthy = self.gain_errors and (plain or not phases)
+        three = phases == PHASES and self.gain_errors and not plain
         free = {n: how for n, (how, _) in filter_unknowns(self.unknowns).items()}
+        if plain:  # a model without gains has no delay
+            free.pop(DELAY.name, None)
         return electrical_filter(
             self.machine,
             sensors=loosened(self.sensors) if healthy else self.sensors,
+            h_walk=H_WALK_CONSIDERED if three else None,
             gains="consider" if self.gain_errors and not healthy else "none",
             power=True,
             phases=phases,
@@ -171,11 +225,12 @@ class _Filters:
     def spread(self) -> dict[str, float]:
         """Standard deviations of the parameters that are states, at the start."""
         value = self.machine.held("machine")
-        return {n: s * abs(value[n]) for n, (_, s) in filter_unknowns(self.unknowns).items()}
+        of = filter_unknowns(self.unknowns).items()
+        return {n: s * abs(value.get(n, 1.0)) for n, (_, s) in of}
 
-    def checked(self, ends: np.ndarray, begin: float) -> None:
+    def checked(self, ends: np.ndarray, begin: float, end: float = math.inf) -> None:
         """Refuse waveforms that do not cover the windows."""
-        t = self.t
+        t = self.t[self.t <= end + 1e-9]
         if not np.allclose(ends, t[t > begin + 1e-9][: ends.size]) or ends[-1] < t[-1] - 1e-6:
             raise DataError(
                 f"{t.size - 1} windows of shaft power expected, the waveforms give {ends.size}"
@@ -192,7 +247,8 @@ class _Filters:
     def plain(self, base: Recording) -> FilterResult:
         """Innovations of the three severities' filter that takes gain errors for noise."""
         of = self.of(PHASES, plain=True)
-        data, prior = self.recording(of, base), of.prior(self.measured, sigma=self.spread())
+        sigma = {n: s for n, s in self.spread().items() if n in of.model.x.names}
+        data, prior = self.recording(of, base), of.prior(self.measured, sigma=sigma)
         return track(of, prior, data, step=self.step, backend=self.backend, own_level=True)[0]
 
     def healthy(self, base: Recording) -> tuple[FilterResult, Any, Any]:
@@ -204,11 +260,31 @@ class _Filters:
         self.checked(ends, float(self.t[0]))
         return r, P, var
 
-    def windows(self, phases: tuple[str, ...], base: Recording, begin: float) -> _Windows:
-        """Beliefs of a filter with severities, from an instant on."""
+    def split(self, may: Hypotheses) -> tuple[float, np.ndarray]:
+        """Share of a healthy machine's power that errors in all windows make, and what is noise.
+
+        Noise is that of the sensors, and what more a step of load leaves in its window.
+        """
+        P, variance = may.healthy
+        if not self.gain_errors:
+            return 0.0, variance
+        n = DT / float(np.median(np.diff(self.measured["t"])))
+        pairs = zip(PHASES_V, PHASES_I, strict=True)
+        of = [PEAK[v[0]] * self.sensors.sigma(i, 0.0) for v, i in pairs]
+        of += [PEAK["i"] * self.sensors.sigma(v, 0.0) for v in PHASES_V]
+        white = 2 * sum(s**2 for s in of) / n / self.machine.eta_sg**2
+        k = min(SETTLED, P.size - 1)
+        least = 0.02 * self.machine.P_rated  # of a machine without a load a share says nothing
+        share = math.sqrt(max(float(variance[k]) - white, 0.0)) / max(abs(float(P[k])), least)
+        return share, white + (variance - white - (share * P) ** 2).clip(0.0)
+
+    def windows(
+        self, phases: tuple[str, ...], base: Recording, begin: float, end: float = math.inf
+    ) -> _Windows:
+        """Beliefs of a filter with severities, from an instant on, up to one."""
         of = self.of(phases)
         own = {n: v[self.measured["t"] >= begin - 1e-9] for n, v in self.measured.items()}
-        part = base.part(int(np.searchsorted(base.t, begin - 1e-9)), base.size)
+        part = base.part(*np.searchsorted(base.t, [begin - 1e-9, end + 1e-9]))
         u = part.u.copy()
         u[of.model.u.index("dt_last"), 0] = 0.0
         data = dataclasses.replace(part, u=u, p=of.model.p.pack({}))
@@ -222,14 +298,17 @@ class _Filters:
             own_level=self.gain_errors or None,
             cov_at=starts[1:],
         )
-        self.checked(data.t[starts[1:]], begin)
-        rows = [r.x.index(n) for n in (*(f"h_{k}" for k in phases), "energy")]
+        self.checked(data.t[starts[1:]], begin, end)
+        names = (*(f"h_{k}" for k in phases), "energy", *of.model.consider)
+        rows = [r.x.index(n) for n in names]
         # the energy of a window is that of the first instant of the next
         length = np.diff(data.t[starts])[:, None]
-        scale = np.hstack([np.ones((length.size, len(phases))), 1 / length])
+        scale = np.ones((length.size, len(rows)))
+        scale[:, [len(phases)]] = 1 / length
         assert r.some_cov is not None
         cov = r.some_cov[:, rows][:, :, rows] * scale[:, :, None] * scale[:, None, :]
-        return _Windows(r.mean[rows][:, starts[1:]].T * scale, cov, r, resets)
+        told = tuple("P" if n == "energy" else n for n in names)
+        return _Windows(r.mean[rows][:, starts[1:]].T * scale, cov, r, resets, told)
 
 
 def electrical_side(
@@ -241,6 +320,8 @@ def electrical_side(
     ttsc: bool = True,
     gain_errors: bool = True,
     unknowns: Mapping[str, Knowledge] | None = None,
+    prior: SeverityPrior | None = None,
+    efficiency_error: float = 0.0,
     judged: bool = False,
     step: StepMaker = ekf_step,
     backend: str | None = None,
@@ -254,6 +335,8 @@ def electrical_side(
         t: ends of the windows of the mean power, among the instants of the samples.
         unknowns: parameters that are estimated or considered, by name, see
             :mod:`estimators.apu.unknowns`.
+        prior: of a short circuit that may be there.
+        efficiency_error: actual relative error of the efficiency, of a run that is measured.
         judged: whether the innovations are to be judged: ``result`` is then that of a filter with
             the three h which takes gain errors for noise, and so leaves their offsets alone.
         ttsc, gain_errors, step, backend: as for :func:`estimators.apu.joint.estimate_joint`.
@@ -262,23 +345,24 @@ def electrical_side(
         DataError, EstimationError: as the filter; windows that the waveforms do not cover.
     """
     machine, unknowns = apu.generator.machine, usual(unknowns, gain_errors)
+    machine = dataclasses.replace(machine, eta_sg=machine.eta_sg / (1 + efficiency_error))
     if of_parameter(unknowns, "machine.r_fd").how != "known":
         machine = _with_field(machine, measured, float(t[0]))
     filters = _Filters(machine, sensors, measured, t, unknowns, gain_errors, step, backend)
     three, begin, K = filters.of(PHASES), float(t[0]), t.size
+    eta = of_parameter(unknowns, EFFICIENCY).sigma
     # the inputs are the same for all: made once
     base = three.recording(measured, window=DT, start=begin)
-    healthy, P, noise = filters.healthy(base)
-    share = GAIN_SHARE if gain_errors else 0.0
     if not ttsc:
-        views = (View(0, P, noise, np.zeros_like(P)),)
+        share = GAIN_SHARE if gain_errors else 0.0
+        healthy, P, noise = filters.healthy(base)
+        views = (View(0, P, noise + (share * P) ** 2, noise, np.zeros_like(P)),)
         none = np.zeros((2, 3, K)), np.zeros(K), np.zeros(K, dtype=int), np.zeros(K)
-        return ElectricalSide(t, views, share, *none, (), healthy)
+        return ElectricalSide(t, views, share, eta, *none, (), healthy)
     w = filters.windows(PHASES, base, begin)
-    may = Hypotheses.of(w.mean, w.cov)
-    mean, variance = may.power(P, noise + (share * P) ** 2)
-    loss = np.maximum(variance - noise - (share * mean) ** 2, 0.0)
-    courses = [View(0, mean, noise, loss)]
+    may = Hypotheses.of(w.mean, loose_in_common(w.cov) if gain_errors else w.cov, prior)
+    share, noise = filters.split(may)
+    courses = [View.of(0, *may.power(), noise, share)]
     start = np.array([np.zeros((3, 1)), np.full((3, 1), H_SIGMA)])
     severities = np.concatenate([start, may.severities()], axis=2)
     probability = np.append(may.probability[:, 0] @ [0, 1, 1, 1], may.probability[1:].sum(0))
@@ -288,28 +372,25 @@ def electrical_side(
         begin = max([v for v in w.resets if v <= t[k] + 1e-9] + [float(t[0])])
         # whole windows: from the beginning of the one in which the machine changed
         first = min(int(np.floor((begin - t[0]) / DT + 1e-6)), k - 1)
-        i = phase[k] - 1
-        one = filters.windows((PHASES[i],), base, float(t[first]))
-        last = k
+        i, last = phase[k] - 1, k
         while last + 1 < K and phase[last + 1] == phase[k]:
             last += 1
+        one = filters.windows((PHASES[i],), base, float(t[first]), float(t[last]))
         known = slice(first, last)
-        here = slice(0, last - first)
-        course = [np.array(getattr(courses[-1], n)) for n in ("P", "noise", "loss")]
-        course[0][known] = one.mean[here, 1]
-        more = one.cov[here, 1, 1] - noise[known] - (share * one.mean[here, 1]) ** 2
-        course[2][known] = np.maximum(more, 0.0)
-        courses.append(View(k - 1, *course))
-        severities[0, i, k : last + 1] = one.mean[k - 1 - first : last - first, 0]
-        severities[1, i, k : last + 1] = np.sqrt(one.cov[k - 1 - first : last - first, 0, 0])
+        P, variance = courses[-1].P.copy(), courses[-1].variance.copy()
+        P[known], variance[known] = one.mean[:, 1], one.cov[:, 1, 1]
+        courses.append(View.of(k - 1, P, variance, noise, share))
+        said = slice(k - 1 - first, last - first)
+        severities[0, i, k : last + 1] = one.mean[said, 0]
+        severities[1, i, k : last + 1] = np.sqrt(one.cov[said, 0, 0])
     severities[1] = np.hypot(
         severities[1], of_parameter(unknowns, "machine.r_s").sigma * severities[0]
     )
     # severities far from zero are not linear by a share of a few per cent
     misfit = np.append(0.0, may.misfit / (1 + 1e-3 * may.statistic.max(0)))
     result = filters.plain(base) if judged and gain_errors else w.result
-    told = severities, probability, phase, misfit, tuple(w.resets), result
-    return ElectricalSide(t, tuple(courses), share, *told)
+    told = severities, probability, phase, misfit, tuple(w.resets), result, w.beliefs
+    return ElectricalSide(t, tuple(courses), share, eta, *told)
 
 
 def _with_field(

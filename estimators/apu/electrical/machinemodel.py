@@ -56,12 +56,14 @@ from apu_casadi.machine.terminals import (
     Terminals,
     advance,
     middle_weight,
+    shunt_currents,
     terminal_equations,
     voltage_weight,
 )
 from apu_casadi.machine.wrsg import Windings, currents, flux_rates
 from estimators.apu.electrical.terminalsignals import (
     ADMITTANCE,
+    DELAY,
     DT_LAST,
     ENERGY,
     GAIN_SENSORS,
@@ -149,7 +151,7 @@ def _signals(
     W = [Signal(f"w_{n}", "1", what.format(n)) for n in (*VOLTAGES, "w_r")]
     what = "unknown course of a jump of the voltage, {} axis"
     W += [Signal(f"w_jump_{n}", "1", what.format(n)) for n in "qd0"]
-    par = [*(ADMITTANCE if leaky else SHUNTS), *gain]
+    par = [*(ADMITTANCE if leaky else SHUNTS), *gain, *([DELAY] if with_gains else [])]
     return (Signals(X), Signals([*U, *(PREDICTED if with_gains else ())]), Signals(par), Signals(W))
 
 
@@ -251,6 +253,18 @@ class _Branch:
         return decay * i - dt * self.per_volt * driven
 
 
+def _slopes(p: MachineParameters, x: Mapping[str, Any], at: Terminals, h: Mapping[str, Any]) -> Abc:
+    """Rates of the terminal currents, A/s, of sinusoids that turn with the rotor."""
+
+    def turned(v: Qd0) -> Abc:
+        return qd0_to_abc(x["theta_e"], Qd0(v.d, -v.q, 0.0))
+
+    i = turned(currents(p, Windings(*(x[n] for n in FLUXES.names))).stator)
+    v = turned(abc_to_qd0(x["theta_e"], at.v))
+    own = shunt_currents(p, ibar=i, v=v, h=Abc(*(h[n] for n in SHUNTS.names)))
+    return Abc(*(at.w_r * k for k in own))
+
+
 @remade
 def electrical_model(
     p: MachineParameters,
@@ -319,9 +333,11 @@ def _family(
         first = equations(xv, seen.predicted)[1]
         i_more = currents(p, more)
         extra = [*qd0_to_abc(seen.reference, i_more.stator), i_more.fd]
+        slope = _slopes(p, X.unpack(xv), seen.predicted, fault)
+        late = [*(par["delay_i"] * s for s in slope), 0.0]
         read = [
-            first[n] + e + (1.0 - seen.factor[n]) * u[f"{n}_smooth"]
-            for n, e in zip(MEASURED, extra, strict=True)
+            first[n] + e + (1.0 - seen.factor[n]) * u[f"{n}_smooth"] - back
+            for n, e, back in zip(MEASURED, extra, late, strict=True)
         ]
     if power:
         # by the trapezoidal rule: with a fault power swings by all of its loss in half a cycle, and

@@ -10,6 +10,7 @@ from apu_casadi.machine.terminals import INPUTS, OUTPUTS
 
 __all__ = [
     "ADMITTANCE",
+    "DELAY",
     "DT_LAST",
     "ENERGY",
     "GAIN_SENSORS",
@@ -67,6 +68,7 @@ ADMITTANCE = Signals(
     ]
 )
 I_SHUNT = Signal("i_shunt", "A", "current of the fault's branch, mu i_fault", nominal=10.0)
+DELAY = Signal("delay_i", "s", "by which currents are read later than voltages", 0.0, 1e-5)
 DT_LAST = Signal("dt_last", "s", "step before this sample; 0 at the first", nominal=1e-4)
 KEEP = Signal("keep", "1", "0 at the start of a window of the mean power, else 1", default=1.0)
 ENERGY = Signal(

@@ -30,5 +30,6 @@ against its members by having more freedom.
 - :mod:`estimators.apu.isolation.classifiers`: ``glr`` and ``bank``
 - :mod:`estimators.apu.isolation.scores`: confusion matrix, Cohen's kappa
 - :mod:`estimators.apu.isolation.limit`: Bayes' rule in the linear problem
+- :mod:`estimators.apu.isolation.sklearnbank`: the classifiers as one of scikit-learn
 - :mod:`scenarios.studies.estimation.isolation`: fresh windows of every class
 """

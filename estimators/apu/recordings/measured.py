@@ -207,7 +207,7 @@ def _tables(
     how: dict[str, Any] = {"reading": reading, "notes": notes}
     if isinstance(source, str | Path):
         path = Path(source)
-        if path.suffix.lower() not in (".nc", ".cdf") or not path.is_file():
+        if path.suffix.lower() not in (".nc", ".nc4", ".cdf", ".mat") or not path.is_file():
             return [read_table(path, mapping, **how)]
         data, name = load(path), path.name
     elif hasattr(source, "data_vars"):

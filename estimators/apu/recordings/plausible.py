@@ -20,7 +20,7 @@ from apu_casadi.core.units import UNITS
 from apu_casadi.gaspath.conditions import RANGES as CONDITIONS
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.park import PHASES
-from estimators.apu.sensors import ELECTRICAL, KNOWN, RANGES
+from estimators.apu.sensors import ELECTRICAL, KNOWN, RANGES, plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -85,12 +85,6 @@ _SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
 _CODES = (*_SENTINELS, -40.0, -1.0, 255.0, 850.0, 888.0, 1023.0, 4095.0, 8888.0, 32767.0, 65535.0)
 _NINES = (99.0, 99.9, 99.99, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0)
 _RUN = 8  # equal readings in a row, while others change, that look stuck
-
-
-def plain(name: str) -> str:
-    """Return a quantity of a generator without the machine's number: ``v_a`` of ``v_a_2``."""
-    head, _, machine = name.rpartition("_")
-    return head if machine in ["1", "2", "3", "4"] and head in ELECTRICAL else name
 
 
 def si_of(name: str) -> str | None:

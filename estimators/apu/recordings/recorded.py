@@ -399,7 +399,7 @@ def read_table(
     notes: list[str] | None = None,
     dim: str | None = None,
 ) -> Table:
-    """Read a file; the ending tells the kind: .csv, .txt, .tsv, .parquet, .nc.
+    """Read a file; the ending tells the kind: .csv, .txt, .tsv, .parquet, .nc, .mat.
 
     Args:
         path, mapping: the file; names of the model -> (column, unit or None).
@@ -420,8 +420,8 @@ def read_table(
         raise DataError(f"{path}: no such file")
     if kind not in _KINDS:
         raise DataError(
-            f"{path}: unknown kind of file {kind!r} {nearest(kind, _KINDS)}; CSV, Parquet and "
-            "netCDF are read"
+            f"{path}: unknown kind of file {kind!r} {nearest(kind, _KINDS)}; CSV, Parquet, "
+            "netCDF and MAT are read"
         )
 
     def tell(what: str) -> None:
@@ -524,5 +524,5 @@ def _fits(own: tuple[str, str], taken: Sequence[str], mapping: Mapping[str, Any]
 _KINDS = {
     **dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".asc"), "text"),
     **dict.fromkeys((".parquet", ".pq"), "parquet"),
-    **dict.fromkeys((".nc", ".cdf"), "netcdf"),
+    **dict.fromkeys((".nc", ".nc4", ".cdf", ".mat"), "netcdf"),
 }

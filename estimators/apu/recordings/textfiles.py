@@ -34,6 +34,7 @@ __all__ = ["text_columns"]
 Row = tuple[int, list[str]]
 #: Anything but numbers with a point or a comma.
 _ODD = re.compile(r"[^0-9+\-.,eE\n]")
+_MINUS = re.compile(r"\u2212(?=[\d.,])")
 _COMMENT = re.compile(r"^\s*(#|%|//|;|!|')+\s*")
 
 
@@ -50,6 +51,9 @@ def text_columns(
         DataError: says line, column and cell.
     """
     text = _decoded(path, tell, reading.encoding)
+    if _MINUS.search(text):
+        tell(f"{path}: the typographic minus sign (U+2212) is read as a minus")
+        text = _MINUS.sub("-", text)
     lines = re.split(r"\r\n|\r|\n", text)
     first = re.fullmatch(r'\s*"?sep=(.)"?\s*', lines[0], re.IGNORECASE) if lines else None
     comments = [(i + 1, x) for i, x in enumerate(lines) if x.startswith("#")]

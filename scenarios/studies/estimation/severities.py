@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,10 +103,11 @@ CELLS = tuple(_cell(line) for line in TABLE.split("\n") if line)
 STUDY = Study(
     "severities",
     order=85,
+    seed0=10_000,
     title="Short circuits of any size, at any load",
     goal="Health is wrongly reported in at most 2 % of the runs; error over sigma is at most 1.5 "
     "for severity, health and power; a short circuit of 3e-4 that appears is found in 0.5 s.",
-    tuned="tuned as the two filters are; looked at with seeds 0 to 59",
+    tuned="looked at with seeds 0 to 2504",
     modules={
         "electrical": ("estimators.apu.electrical",),
         "gaspath": ("estimators.apu.gaspath",),
@@ -116,8 +118,9 @@ STUDY = Study(
 @intro
 Runs of 1.6 s at loads from 10 to 225 kW, healthy or with a short circuit of h = 1e-4 to 2e-2 from
 the start or from 0.6 s on, in any phase of both machines or of one, half of them with a compressor
-2 % less efficient from 1 s on. They are measured with gain errors of all sensors and estimated by
-the joint estimate. Scored at the end.
+2 % less efficient from 1 s on. They are measured with gain errors of all sensors and late currents,
+and estimated by the joint estimate of a unit whose efficiency and stator resistance are others: all
+drawn as the filters believe. Scored at the end.
 
 @claim wrong
 joint | health wrongly reported | <= 2 % | {wrong} of {runs} | {low:.1%} to {high:.1%} | {when}
@@ -136,8 +139,10 @@ joint | claimed sigma of the power over its RMS error, all rows | 0.8 to 1.2 | {
 | rows {least:.2f} to {most:.2f} | {when} | {worst}
 
 @table
-RMS of error over claimed sigma at the end of each row's runs (1 is right); *false*: runs with a
-change of health reported that is not there; *found*: short circuits found, and the median delay.
+RMS of error over claimed sigma at the end of each row's runs (1 is right), and claimed sigma over
+RMS error of the power; *false*: runs with a change of health reported that is not there; *found*:
+short circuits found within 0.5 s, and the median delay. Efficiency makes nine tenths of the power's
+sigma, so that with few seeds its columns scatter as few draws of one number do.
 """,
 )
 
@@ -170,8 +175,7 @@ def estimated(cell: Cell, seed: int, **options: Any) -> dict[str, Any]:
         healthy machine, or in another phase.
     """
     ds, case = _truth(cell), joint_case(seed, machines=2 if cell.machine else 1)
-    gains: dict[str, Any] = {"gas_gains": case.gas_gains, "electrical_gains": case.electrical_gains}
-    e = estimate_joint(ds, seed, **gains, **options)
+    e = estimate_joint(ds, seed, **{"apu": case.unit(Apu()), **case.errors(), **options})
     t = e["time"].values
 
     def score(n: str) -> float:
@@ -203,19 +207,21 @@ def estimated(cell: Cell, seed: int, **options: Any) -> dict[str, Any]:
     }
 
 
-@STUDY.part("cells", start=250, each=1.2)
-def _cells(n: int, seed0: int, tell: Tell) -> Any:
-    seeds = {cell: range(seed0 + i, seed0 + n, len(CELLS)) for i, cell in enumerate(CELLS)}
-    rows, done = [], 0
-    for cell, of in seeds.items():
-        runs = []
-        for seed in of:
-            runs.append(estimated(cell, seed))
-            done += 1
-            tell(done, n)
-        if runs:
-            rows.append({"cell": list(cell), "runs": runs})
-    return rows
+def _row(cell: Cell, n: int, seed0: int, tell: Tell) -> Any:
+    runs = []
+    for k in range(n):  # of each row its own: the efficiency that is drawn makes most of an error
+        runs.append(estimated(cell, seed0 + CELLS.index(cell) + len(CELLS) * k))
+        tell(k + 1, n)
+    return {"cell": list(cell), "runs": runs}
+
+
+for _c in CELLS:
+    STUDY.part(_c.words, start=3.0, each=0.7 / len(CELLS), share=1 / len(CELLS))(partial(_row, _c))
+
+
+def _rows(r: Results) -> list[dict[str, Any]]:
+    """Scores of the rows that were run."""
+    return [_scores(r[c.words]) for c in CELLS if c.words in r]
 
 
 def _rms(x: Any) -> float:
@@ -239,9 +245,10 @@ def _scores(row: Mapping[str, Any]) -> dict[str, Any]:
 @STUDY.claims
 def claims(r: Results) -> list[Claim]:
     """Claim what was asked of every row together, and of the worst."""
-    if "cells" not in r:
+    rows = _rows(r)
+    if not rows:
         return []
-    rows, when = [_scores(row) for row in r["cells"]], r.seeds_from("cells")
+    when = f"{r.seeds_from(rows[0]['cell'].words)} in the first row, and so on"
 
     def share(block: str, key: str, of: list[dict[str, Any]], met: Any, least: bool) -> Claim:
         k, n = sum(v[key] for v in of), sum(v["n"] for v in of)
@@ -270,13 +277,15 @@ def claims(r: Results) -> list[Claim]:
 @STUDY.section
 def section(r: Results) -> list[str]:
     """Show every row."""
-    if "cells" not in r:
+    rows = _rows(r)
+    if not rows:
         return []
-    head = ["row", "seeds", "severity", "health", "power", "false", "found", "delay"]
+    head = ["row", "seeds", "severity", "health", "power", "sigma/error", "false", "found", "delay"]
     lines = []
-    for v in (_scores(row) for row in r["cells"]):
+    for v in rows:
         found = f"{v['soon']}" if v["cell"].h else "-"
         delay = f"{1e3 * v['delay']:.0f} ms" if v["cell"].h and np.isfinite(v["delay"]) else "-"
         ratios = [f"{v[k]:.2f}" for k in ("h", "health", "power")]
+        ratios.append(f"{v['sigma'] / v['error']:.2f}")
         lines.append([v["cell"].words, f"{v['n']}", *ratios, f"{v['wrong']}", found, delay])
     return [STUDY.template.text("table"), numbers(head, lines)]

@@ -97,8 +97,10 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
 
     t, false = ds["time"].values, 0
     if e.gaspath is not None:
+        # a recording whose fuel flow ends has no estimate beyond
+        end = int(np.searchsorted(t, e.gaspath["time"].values[-1] + 1e-7)) - 1
         for n in ("N", *HEALTH):
-            put(n, e.gaspath, float(ds[n].values[-1]))
+            put(n, e.gaspath, float(ds[n].values[end]))
         changed = any(ds[n].values[-1] != ds[n].values[0] for n in HEALTH)
         found = json.loads(e.gaspath.attrs["alarms"])
         false += sum(not (changed and a > ONSET - SETTLED) for a in found)

@@ -1,0 +1,136 @@
+"""Many steps of a filter as one function, and recordings made ready for it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+
+from apu_casadi.core.backend import compiled
+from apu_casadi.core.sharing import kept
+from estimators.models.filtermodel import FilterModel
+from estimators.models.recording import Recording
+
+__all__ = ["BLOCK", "CHAIN", "PADDED", "ROOT_OUT", "block_function", "block_of", "padded"]
+
+CHAIN = 10  # a block is this many chains of this many steps
+BLOCK = CHAIN**2  # samples in one call
+STEP_IN = ["m", "P", "u", "p", "y", "R", "dt"]
+STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
+"""Of a step: belief before the sample, inputs, parameters, sample, variances (< 0: not measured),
+step to the next sample; then the predicted belief at the next sample, the filtered belief, the
+cross-covariance of filtered state and next state, innovation, its covariance, and ``STATS``."""
+ROOT_OUT = ["Y", "Z", "Lf"]
+"""What a step in square-root form may give beside: roots for the smoother, see
+:mod:`estimators.filters.rootfilter`."""
+PADDED = -2.0  # variance of what is not measured in a sample that fills a block up
+
+
+class Step(Protocol):
+    """What a block is made of; see :class:`estimators.filters.filtering.FilterStep`."""
+
+    @property
+    def model(self) -> FilterModel: ...
+
+    @property
+    def function(self) -> ca.Function: ...
+
+    @property
+    def gives_roots(self) -> bool: ...
+
+
+def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
+    """Call ``f`` n times, as one function.
+
+    The first ``carried`` outputs go to the inputs of the same place in the next call; the last
+    input is the same for all calls, the others stand side by side, as do the last ``kept`` outputs;
+    of the others only the last are returned.
+
+    The same as ``mapaccum``, which takes a hundred times as long to build in CasADi 3.8.
+    """
+    ins = [ca.MX.sym(f.name_in(i), f.size1_in(i), f.size2_in(i)) for i in range(f.n_in())]
+    # a symbol without elements has no name to ask for
+    wide = [
+        ca.MX.sym(f.name_in(carried + i), s.shape[0], s.shape[1] * n)
+        for i, s in enumerate(ins[carried:-1])
+    ]
+    split = [ca.horzsplit(w, s.shape[1]) for w, s in zip(wide, ins[carried:-1], strict=True)]
+    now, results = ins[:carried], []
+    for k in range(n):
+        out = f(*now, *(s[k] for s in split), ins[-1])
+        now = out[:carried]
+        results.append(out)
+    first = f.n_out() - kept
+    out = [
+        *results[-1][:first],
+        *(ca.horzcat(*(r[i] for r in results)) for i in range(first, f.n_out())),
+    ]
+    return ca.Function(name, [*ins[:carried], *wide, ins[-1]], out)
+
+
+def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) -> ca.Function:
+    """Return ``BLOCK`` calls of a step as one function.
+
+    Args:
+        one: step; its first ``carried`` outputs are those inputs of the next call, its last input
+            is the same in all calls.
+        name: of the result, which takes the other inputs and gives the other outputs side by side.
+        carried: number of inputs that are handed on; of these outputs the last is returned.
+        short: ``CHAIN`` calls only, for steps that take long.
+    """
+    kept = one.n_out() - carried
+    chain = _chained(one, CHAIN, f"{name}_chain", carried, kept)
+    return chain if short else _chained(chain, CHAIN, f"{name}_block", carried, kept)
+
+
+@kept
+def block_function(
+    step: Step, full: bool, short: bool, backend: str | None, _in_use: str
+) -> tuple[ca.Function, ca.Function]:
+    """``BLOCK`` steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
+
+    (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
+    before each sample and C, S; matrices as columns.
+
+    If ``short``, (m, P, P_f, u, y, R, dt, p) -> (m1, P1, P_f, m_f, diag P_f, nu, diag S, stats),
+    where the first P_f is that of the last sample which is not padded: a tenth of the numbers.
+    """
+    nx, nu, np_, _, ny = step.model.sizes
+    s = [
+        ca.MX.sym(n, *shape)
+        for n, shape in zip(
+            STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
+        )
+    ]
+    m, P, u, p, y, R, dt = s
+    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
+    P_f = ca.diag(o["P_f"]) if short else ca.vec(o["P_f"])
+    kept = [o["m_f"], P_f, o["nu"], ca.diag(o["S"]), o["stats"]]
+    if full:
+        kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
+    if step.gives_roots:
+        kept += [ca.vec(o[n]) for n in (ROOT_OUT if full else ROOT_OUT[-1:])]
+    name = f"{step.function.name()}{'_full' if full else '_short' if short else ''}"
+    carried, now = [m, P], [o["m1"], o["P1"]]
+    if short:
+        carried.append(ca.MX.sym("P_last", nx, nx))
+        now.append(ca.if_else(R[0] == PADDED, carried[-1], o["P_f"]))
+    out = [*now, *(ca.densify(k) for k in kept)]
+    one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
+    block = block_of(one, name, len(carried))
+    return compiled(block, backend=backend), block
+
+
+def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:
+    """Return (y, R, u, dt) as a step takes them, ``pad`` samples longer, one column a sample.
+
+    A padded sample measures nothing and lasts no time; what comes out of it is dropped.
+    """
+    missing = np.isnan(data.y)
+    K, n = data.size, data.size + pad
+    y, R = np.zeros((data.y.shape[0], n)), np.full((data.y.shape[0], n), PADDED)
+    y[:, :K], R[:, :K] = np.where(missing, 0.0, data.y), np.where(missing, -1.0, data.variance)
+    u, dt = np.empty((data.u.shape[0], n)), np.zeros((1, n))
+    u[:, :K], u[:, K:], dt[0, :K] = data.u, data.u[:, -1:], data.dt
+    return y, R, u, dt

@@ -1,0 +1,57 @@
+"""Rows of blocks of exchange steps: as far as each is right, and as if one by one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from apu_casadi.core.errors import NotApplicable
+from apu_casadi.unit.jointstep import BLOCK, JointBlock
+
+LIMIT = 1e-5
+
+
+def block_that_counts(wrong_from):
+    """Blocks that add one to each of two states; errors grow from a number of calls on."""
+    buffers = [np.zeros(4), *(np.zeros((n, BLOCK)) for n in (3, 1, 2, 2))]  # reused, as CasADi's
+    calls = []
+
+    def call(carry, step):
+        calls.append(step)
+        last, y, _, means, checks = buffers
+        last[:], y[:], means[:] = carry + 1, carry[0], carry[1]
+        checks[:] = [[LIMIT * (len(calls) > wrong_from) * 2] * BLOCK, [2500.0 + carry[0]] * BLOCK]
+        return tuple(buffers)
+
+    block = object.__new__(JointBlock)
+    machine = SimpleNamespace(limits=np.array([LIMIT]), valid=lambda w: w < 2600.0)
+    machine.ss = SimpleNamespace(name="stub")
+    block.machines, block._sampled, block._n_gov, block._n_x = (machine,), [False], 1, [1]
+    block._call = call
+    return block, calls
+
+
+def followed(block, n):
+    one = np.array([1.0])
+    return block.followed(one, one, (1.0,), [one], ([k] for k in range(n)))
+
+
+def test_a_row_of_blocks_ends_before_the_first_that_is_wrong():
+    block, calls = block_that_counts(3)
+    done = followed(block, 5)
+    assert calls == [0, 1, 2, 3]  # no more are tried
+    assert done.y.shape == (3, 3 * BLOCK)
+    assert done.N == 4.0
+    assert done.governor == (4.0,)
+    assert done.machines[0].x == 4.0
+    # what the first gave is not overwritten by those after it
+    assert done.y[0, ::BLOCK].tolist() == [1.0, 2.0, 3.0]
+    assert done.machines[0].means[0, ::BLOCK].tolist() == [1.0, 2.0, 3.0]
+    assert done.machines[0].w_r[::BLOCK].tolist() == [2501.0, 2502.0, 2503.0]
+
+
+def test_a_row_whose_first_block_is_wrong_is_refused():
+    block, calls = block_that_counts(0)
+    with pytest.raises(NotApplicable, match="stub: a step of the block is not right"):
+        followed(block, 5)
+    assert calls == [0]
