@@ -173,6 +173,8 @@ def _flat(data: Mapping[str, object]) -> dict[str, object]:
     """Tables by name, those of parameters as ``machine.r_s``."""
     out: dict[str, object] = {}
     for name, row in data.items():
-        inner = isinstance(row, dict) and row and all(isinstance(v, dict) for v in row.values())
-        out |= {f"{name}.{n}": v for n, v in row.items()} if inner else {name: row}  # type: ignore
+        if isinstance(row, dict) and row and all(isinstance(v, dict) for v in row.values()):
+            out |= {f"{name}.{n}": v for n, v in row.items()}
+        else:
+            out[name] = row
     return out

@@ -31,13 +31,16 @@ class Step(Protocol):
     """What a block is made of; see :class:`estimators.filters.filtering.FilterStep`."""
 
     @property
-    def model(self) -> FilterModel: ...
+    def model(self) -> FilterModel:
+        """The model that is filtered."""
 
     @property
-    def function(self) -> ca.Function: ...
+    def function(self) -> ca.Function:
+        """The step as a function; its signature is the filter's."""
 
     @property
-    def gives_roots(self) -> bool: ...
+    def gives_roots(self) -> bool:
+        """Whether the step hands roots of covariances on."""
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
