@@ -188,7 +188,7 @@ def test_tables_are_made_once_for_all_runs(monkeypatch):
 
 def test_pieces_of_unequal_harmonics_go_on_by_single_steps(monkeypatch):
     """Two pieces of one layout whose tables have more or fewer harmonics: no block of both."""
-    fast = SimpleNamespace(layout=("same",), smooth=1.0)
+    fast = SimpleNamespace(layout=("same",), smooth=1.0, spike=1.0)
     pieces = {k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), *np.zeros((3, 2))) for k in (0, 1)}
     course = object.__new__(Course)
     course._only, course.ss = None, SimpleNamespace(name="model")

@@ -10,6 +10,7 @@ to ``TOL``; it is never laid across a jump or a bend of a profile.
 A run holds all numbers over an exchange step.  The windings see a small jump at its beginning, and
 what follows it within microseconds falls between the samples of propagation; ``smooth`` of what
 propagates bounds the jump; beyond it steps are left to an adaptive integrator, as after a switch.
+``spike`` bounds what the terminal voltage shows for a moment and the regulator takes for true.
 """
 
 from __future__ import annotations
@@ -210,6 +211,12 @@ class Course(Generic[F]):
                 f"{self.ss.name}: load or fault change by {jump:.1e} of the transition matrices "
                 f"in a step, {fast.smooth:g} at most"
             )
+        spike = self._spike(pieces, s, float(first))
+        if spike > fast.spike:
+            raise NotApplicable(
+                f"{self.ss.name}: the fault's resistance changes by a voltage of {spike:.1e} of "
+                f"the phase's in a step, {fast.spike:g} at most"
+            )
         if alone:
             one = pieces[0].near(float(s.min()), float(s.max())) if s.size > width else pieces[0]
             pieces = [one] * s.size
@@ -237,6 +244,23 @@ class Course(Generic[F]):
         moved[1:] -= s[:-1]
         rates = (np.interp(s, p.nodes, p.rates) for p in (pieces[0], pieces[-1]))
         return float((np.maximum(*rates) * np.abs(moved)).max())
+
+    def _spike(self, pieces: list[Piece[F]], s: np.ndarray, first: float) -> float:
+        """Return the largest jump of a fault loop's voltage from step to step, of the phase's.
+
+        Where the loop's current is a state of its own the terminal voltage shows it, until the
+        current has followed: within L/R, which no sample of the exciter's input resolves.
+        """
+        if "i_fault" not in self.ss.x or not isinstance(self.fault, Varying):
+            return 0.0
+        names = list(self.fault.at(0.0).severity)
+        each = pieces if len(pieces) > 1 else pieces * s.size
+        at = np.append(first, s)
+        both = zip((each[0], *each), at[:, None], strict=True)
+        rows = [p.at(v)[-len(names) :, 0].copy() for p, v in both]
+        mu, k_rf = (np.array(rows)[:, names.index(n)] for n in ("mu", "k_rf"))
+        R = k_rf + 1 - mu  # of r_s: the fault's, and that of the turns
+        return float((mu[1:] * np.abs(np.diff(R)) / R[1:]).max())
 
     def _piece(self, s: float) -> Piece[F]:
         """Return the polynomials around a value of the coordinate, made when first asked for."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -350,6 +350,9 @@ class MeanStep(Rebuilt):
     def smooth(self) -> float:
         """Largest change of transition matrices from step to step, nominal units."""
         return SMOOTH["constant" if self.constant else "periodic"]
+
+    #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
+    spike: ClassVar[float] = 1e-4
 
     @property
     def vector(self) -> np.ndarray:
