@@ -87,8 +87,7 @@ class Piece(Generic[F]):
 
         The next call for as many steps overwrites them: new memory costs as much as the sums.
         """
-        x = np.clip((s - self.middle) / self.half, -1.0, 1.0)
-        basis = np.cos(np.arccos(x)[:, None] * np.arange(self.powers.shape[0]))
+        basis = self._basis(s)
         if s.size not in self.buffers:
             self.buffers[s.size] = np.empty((s.size, self.powers.shape[1]))
         made = self.buffers[s.size]
@@ -96,6 +95,17 @@ class Piece(Generic[F]):
         for k in range(0, made.shape[1], size):
             np.matmul(basis, self.powers[:, k : k + size], out=made[:, k : k + size])
         return made.T
+
+    def some(self, s: np.ndarray, columns: list[int]) -> np.ndarray:
+        """Return some of the numbers at values of the coordinate, (steps, columns)."""
+        made: np.ndarray = self._basis(s) @ self.powers[:, columns]
+        return made
+
+    def _basis(self, s: np.ndarray) -> np.ndarray:
+        """Chebyshev polynomials at values of the coordinate, (steps, degree + 1)."""
+        x = np.clip((s - self.middle) / self.half, -1.0, 1.0)
+        made: np.ndarray = np.cos(np.arccos(x)[:, None] * np.arange(self.powers.shape[0]))
+        return made
 
     def near(self, low: float, high: float) -> Piece[F]:
         """Return polynomials of a low degree over a part of the interval, or itself.
@@ -253,12 +263,15 @@ class Course(Generic[F]):
         """
         if "i_fault" not in self.ss.x or not isinstance(self.fault, Varying):
             return 0.0
-        names = list(self.fault.at(0.0).severity)
-        each = pieces if len(pieces) > 1 else pieces * s.size
+        names = list(self._made(self.fault, float(s[0])).severity)
+        columns = [names.index(n) - len(names) for n in ("mu", "k_rf")]
         at = np.append(first, s)
-        both = zip((each[0], *each), at[:, None], strict=True)
-        rows = [p.at(v)[-len(names) :, 0].copy() for p, v in both]
-        mu, k_rf = (np.array(rows)[:, names.index(n)] for n in ("mu", "k_rf"))
+        if len(pieces) == 1:
+            rows = pieces[0].some(at, columns)
+        else:
+            each: list[Piece[F]] = [pieces[0], *pieces]
+            rows = np.array([p.some(v, columns)[0] for p, v in zip(each, at[:, None], strict=True)])
+        mu, k_rf = rows.T
         R = k_rf + 1 - mu  # of r_s: the fault's, and that of the turns
         return float((mu[1:] * np.abs(np.diff(R)) / R[1:]).max())
 
