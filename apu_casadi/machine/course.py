@@ -269,7 +269,7 @@ class Course(Generic[F]):
         if len(pieces) == 1:
             rows = pieces[0].some(at, columns)
         else:
-            each: list[Piece[F]] = [pieces[0], *pieces]
+            each = pieces[:1] + pieces
             rows = np.array([p.some(v, columns)[0] for p, v in zip(each, at[:, None], strict=True)])
         mu, k_rf = rows.T
         R = k_rf + 1 - mu  # of r_s: the fault's, and that of the turns
