@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
-from functools import cache
 from importlib.resources import files
 
 __all__ = ["VECTOR", "vector_math"]
@@ -30,7 +29,6 @@ LOG_STEPS, LOG_FIRST = 16, 0x3FE6555555555555
 PI = "3.14159265358979323846264338327950288419716939937510582097494459230781640628620899"
 
 
-@cache
 def vector_math(lanes: int) -> str:
     """Return the C code of ``v_exp``, ``v_log``, ``v_pow``, ``v_sin``, ``v_cos``."""
     with localcontext() as context:

@@ -52,6 +52,7 @@ UNKNOWN = 1e4  # A; standard deviation of a reading that says nothing
 VOLTAGE_ERRORS = (10.0, 100.0)  # V
 FIELD_ERRORS = (3.0, 30.0)  # V
 ORDERS = (5, 7, 11)
+SPEED_MISSES = 4.0  # deviations of the speed readings, from which their sensor may have failed
 #: Prior weights of the hypotheses' kinds; a kind with several members shares its own.
 PRIOR = {
     "healthy": 1.0,
@@ -219,6 +220,12 @@ class _Piece:
         late, sigma = t >= self.change - 1e-9, self.sensors.sigma("w_r", said)
         off = a["w_r"] - said
         self.failed["sensor w_r"] = failure(t[late], a["w_r"][late], off[late], sigma[late])
+        z = (off / sigma)[late & np.isfinite(off)]
+        # the angle is less noisy than any speed: it fits better where the sensor is right, too
+        n = max(z.size, 1)
+        misses = max((z @ z / n - 1) * math.sqrt(n / 2), abs(z.sum()) / math.sqrt(n))
+        if misses < SPEED_MISSES:
+            return -math.inf
         # slope and curvature were found
         return float(known.run(phases=())[0].loglik) - math.log(max(int(late.sum()), 2))
 
