@@ -224,19 +224,24 @@ def estimate(
     if e is None and not sides and not found:
         why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
         raise DataError(f"nothing can be estimated: {why}")
-    if apu.alike and 0 < len(sides) < (n := len(apu.machines)):
-        some, rest = (
-            who(ks).replace("generator", "machine")
-            for ks in (tuple(sides), [k for k in range(1, n + 1) if k not in sides])
-        )
-        notes.append(
-            f"only {some} {'is' if len(sides) == 1 else 'are'} estimated, not {rest}; power is "
-            f"that of {n} equal ones"
-        )
+    if apu.alike and 0 < len(sides) < len(apu.machines):
+        notes.append(_some_of(tuple(sides), len(apu.machines)))
     machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
     end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
     return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
+
+
+def _some_of(numbers: tuple[int, ...], n: int) -> str:
+    """Say which of n equal machines are estimated, and what is taken for the others."""
+    some, rest = (
+        who(ks).replace("generator", "machine")
+        for ks in (numbers, [k for k in range(1, n + 1) if k not in numbers])
+    )
+    return (
+        f"only {some} {'is' if len(numbers) == 1 else 'are'} estimated, not {rest}; power is "
+        f"that of {n} equal ones"
+    )
 
 
 def gas_path_data(
