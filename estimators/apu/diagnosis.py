@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from estimators.apu import gascauses
 from estimators.apu.electrical import causes
-from estimators.apu.electrical.causes import Causes
+from estimators.apu.electrical.causes import Causes, kind_of
 
 __all__ = ["COINCIDENCE", "GAS", "Diagnosis", "diagnoses"]
 
@@ -103,7 +103,7 @@ def _one(t: float, seen: Mapping[str, Causes]) -> Diagnosis:
 def _sees(c: Causes, here: str, place: str, what: str) -> float:
     """Likelihood of what one filter saw if a hypothesis of another one holds."""
     prior = gascauses.PRIOR if here == GAS else causes.PRIOR
-    likely = {n: max(p, LEAST) / prior[_kind(n, prior)] for n, p in c.probability.items()}
+    likely = {n: max(p, LEAST) / prior[kind_of(n, prior)] for n, p in c.probability.items()}
     return max(likely[n] for n in _expected(here, place, what, likely))
 
 
@@ -114,7 +114,3 @@ def _expected(here: str, place: str, what: str, known: Mapping[str, float]) -> I
         yield from (n for n in ("shaft power",) if n in known)
         if what == "sensor w_r":
             yield from (n for n in ("sensor N",) if n in known)
-
-
-def _kind(name: str, prior: Mapping[str, float]) -> str:
-    return next(k for k in prior if name == k or name.startswith(f"{k} "))

@@ -24,7 +24,7 @@ logarithm of the number of readings is taken off for each (Schwarz 1978, Annals 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -45,7 +45,7 @@ from estimators.filters.filtering import FilterResult, run
 from estimators.models.filtermodel import Unknown
 from estimators.models.recording import Recording
 
-__all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "probabilities"]
+__all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "kind_of", "probabilities"]
 
 BEFORE, AFTER = 0.01, 0.03  # s of the piece around the change
 UNKNOWN = 1e4  # A; standard deviation of a reading that says nothing
@@ -86,6 +86,11 @@ class Causes:
         return max(self.probability, key=lambda n: self.probability[n])
 
 
+def kind_of(name: str, kinds: Iterable[str]) -> str:
+    """Return which of some kinds a hypothesis ``"KIND"`` or ``"KIND member"`` is of."""
+    return next(k for k in kinds if name == k or name.startswith(f"{k} "))
+
+
 def probabilities(
     loglik: Mapping[str, float], prior: Mapping[str, float] = PRIOR
 ) -> dict[str, float]:
@@ -95,11 +100,7 @@ def probabilities(
         loglik: logarithm of each one's likelihood; NaN and -inf: impossible.
         prior: weights by kind.
     """
-
-    def kind(name: str) -> str:
-        return next(k for k in prior if name == k or name.startswith(f"{k} "))
-
-    members = [kind(n) for n in loglik]
+    members = [kind_of(n, prior) for n in loglik]
     score = {
         n: v + math.log(prior[k] / members.count(k)) if math.isfinite(v) else -math.inf
         for (n, v), k in zip(loglik.items(), members, strict=True)
