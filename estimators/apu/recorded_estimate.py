@@ -186,7 +186,6 @@ def estimate(
     apu, start = _known(engine, prior)
     how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
     how |= {"efficiency_error": efficiency_error, "backend": backend}
-    lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
     notes = [*m.notes, *ready.notes]
@@ -194,10 +193,7 @@ def estimate(
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     causes: dict[str, tuple[Causes, ...]] = {}
-    reason = _no_gas_path(m, table) if only != "electrical" else "it was not asked for"
-    gas = reason is None
-    if only != "electrical" and reason is not None and (m.gaspath or only):
-        lacking["gas path"] = reason
+    gas, lacking = _beforehand(m, table, only)
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     for k in machines_in(m) if only != "gaspath" and m.electrical else ():
         own = electrical_sensors.machine(k)
@@ -206,8 +202,6 @@ def estimate(
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
             sides[k] = side
-    if only == "electrical" and not m.electrical:
-        lacking["generators"] = "nothing of them was measured"
     found_by, e = None, None
     fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
@@ -222,14 +216,26 @@ def estimate(
     compared, alike = compared_sides(sides)[1:]
     doubts += alike
     if e is None and not sides and not found:
-        why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
-        raise DataError(f"nothing can be estimated: {why}")
+        raise DataError(f"nothing can be estimated: {_why(lacking)}")
     if apu.alike and 0 < len(sides) < len(apu.machines):
         notes.append(_some_of(tuple(sides), len(apu.machines)))
-    machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
     end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
+    machines = {k: side_dataset(s) for k, s in sides.items()}
     return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
+
+
+def _beforehand(m: Measurements, table: SensorSet, only: str | None) -> tuple[bool, dict[str, str]]:
+    """Say whether there is a gas-path estimate, and what is lacking for what was asked for."""
+    if only == "electrical":
+        return False, {} if m.electrical else {"generators": "nothing of them was measured"}
+    reason = _no_gas_path(m, table)
+    return reason is None, {"gas path": reason} if reason and (m.gaspath or only) else {}
+
+
+def _why(lacking: Mapping[str, str]) -> str:
+    """Say why each part is not estimated."""
+    return "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
 
 
 def _some_of(numbers: tuple[int, ...], n: int) -> str:
