@@ -208,18 +208,21 @@ class JointBlock(Rebuilt):
     def _row(self, blocks: int, carry: np.ndarray, held: Sequence[Any]) -> BlockResult:
         """Advance by a row of blocks, one question to the ensemble, up to the first not right."""
         last, *out = self._call.in_a_row(blocks, carry, *held)
+
+        def part(first: int, end: int) -> list[np.ndarray]:
+            """Outputs of some blocks, which have one column a step, or one a sample."""
+            widths = (a.shape[1] // blocks for a in out)
+            return [a[:, first * n : end * n] for a, n in zip(out, widths, strict=True)]
+
         right, wrong = blocks, self._wrong(last, *out)
         if wrong:
-            each = (
-                self._wrong(last[:, i], *(a[:, i * BLOCK : (i + 1) * BLOCK] for a in out))
-                for i in range(blocks)
-            )
+            each = (self._wrong(last[:, i], *part(i, i + 1)) for i in range(blocks))
             right, wrong = next(((i, w) for i, w in enumerate(each) if w), (blocks, ""))
         # a row of which nothing can be taken costs as much as one that is right
         self._likely = 1 if wrong else 2 * self._likely
         if not right:
             raise NotApplicable(wrong)
-        return self._parted(last[:, right - 1].copy(), [a[:, : right * BLOCK] for a in out])
+        return self._parted(last[:, right - 1].copy(), part(0, right))
 
     def followed(
         self,
