@@ -16,6 +16,7 @@ from estimators.apu.electrical.hypotheses import (
     loose_in_common,
 )
 from estimators.apu.unknowns import COPPER, Knowledge, filter_unknowns
+from estimators.information.posterior import named_posterior, posterior
 
 TRUE_P, SLOPE = 200e3, 2e7
 
@@ -150,3 +151,12 @@ def test_what_severities_have_in_common_counts_for_little():
     before, after = (Hypotheses.of(m[None], of) for m in (mean, mean - 1e-4 * g))
     tight = [Hypotheses.of(m[None], C[None]).misfit[0] for m in (mean, mean - 1e-4 * g)]
     assert abs(after.misfit[0] - before.misfit[0]) < 0.3 * abs(tight[1] - tight[0])
+
+
+def test_probabilities_of_hypotheses_from_logarithms():
+    """Of any size, also where nothing but one is possible."""
+    log = np.log([0.1, 0.7, 0.2])
+    assert_allclose(posterior(log - 1e6), [0.1, 0.7, 0.2], rtol=1e-9)
+    assert_allclose(posterior(np.array([[0.0, -np.inf], [0.0, 5.0]])), [[0.5, 0.0], [0.5, 1.0]])
+    found = named_posterior({"a": float(np.log(3.0)), "b": 0.0, "c": np.nan, "d": -np.inf})
+    assert found == pytest.approx({"a": 0.75, "b": 0.25, "c": 0.0, "d": 0.0})

@@ -40,6 +40,7 @@ from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalside import Beliefs, ElectricalSide
 from estimators.apu.electrical.hypotheses import FAULTY, H_SCALE
 from estimators.apu.machinepowers import on_common_windows
+from estimators.information.posterior import posterior
 
 __all__ = ["BALANCED", "COMMON", "Compared", "compare", "compared_sides"]
 
@@ -158,9 +159,7 @@ def compare(
         worst = NONLINEAR * np.abs(own - np.median(own, axis=1)[:, None]).max(1)
         R[:, at, at] += b.cov[:, :3, :3] + worst[:, None, None] ** 2 * np.eye(3)
     each = [_Hypothesis(f, n, faulty, scale, h, R) for f in _sets(n)]
-    log = np.array([x.log for x in each])
-    share = np.exp(log - log.max(0))
-    share /= share.sum(0)
+    share = posterior(np.array([x.log for x in each]))
     probability, several = np.zeros((n, 4, h.shape[0])), np.zeros(h.shape[0])
     for x, w in zip(each, share, strict=True):
         found = dict(x.faults)
