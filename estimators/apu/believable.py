@@ -14,6 +14,7 @@ linearisation  beyond what the filters were tried on
 maps           an operating point off the component maps
 power          of the two sides, or of the short circuit that may be there
 time           rate and order of the samples
+lost           a filter that its model does not fit: there is no estimate
 ============== =================================================================================
 
 The thresholds come from :data:`LEVEL`, the probability that a group of tests doubts an estimate
@@ -39,6 +40,7 @@ from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
+from estimators.apu.trust import Doubt, part_of, severity
 from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
@@ -53,11 +55,11 @@ if TYPE_CHECKING:
 __all__ = [
     "KINDS",
     "LEVEL",
-    "Doubt",
     "channel_doubts",
     "fit_doubts",
     "gas_causes",
     "gas_doubts",
+    "lost",
     "machine_causes",
     "machine_doubts",
     "standing_still",
@@ -65,7 +67,7 @@ __all__ = [
 
 KINDS = (
     *("innovations", "colour", "wild", "sensor", "prior", "machine"),
-    *("harmonics", "linearisation", "maps", "power", "time"),
+    *("harmonics", "linearisation", "maps", "power", "time", "lost"),
 )
 #: Probability that a group of tests doubts an estimate whose model holds: of a recording the gas
 #: path is one group, and each generator two.
@@ -88,25 +90,6 @@ SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
 
 
-class Doubt(str):
-    """One sentence that speaks against an estimate; ``kind`` is one of ``KINDS``."""
-
-    kind: str
-
-    def __new__(cls, kind: str, text: str) -> Doubt:
-        """Make a sentence of a kind."""
-        made = super().__new__(cls, text)
-        made.kind = kind
-        return made
-
-    def of(self, what: str) -> Doubt:
-        """Return the same of a part: ``"machine 1, ..."``."""
-        return Doubt(self.kind, f"{what}, {self}")
-
-    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
-        return self.kind, str(self)
-
-
 # ------------------------------------------------------------------------------ channels
 
 
@@ -126,7 +109,8 @@ def channel_doubts(
         rows = None if n in coarse else standing_still(c.values, others)
         if rows is not None:
             a, b = (c.t[k] for k in rows)
-            yield Doubt("sensor", f"{c.source}: {n} stands still from {a:g} to {b:g} s")
+            text = f"{c.source}: {n} stands still from {a:g} to {b:g} s"
+            yield Doubt("sensor", text, part_of(n, m.electrical))
 
 
 def standing_still(
@@ -238,6 +222,7 @@ def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
         yield Doubt(
             "linearisation",
             f"h_{PHASES[best]} = {h[best, -1]:.2e} is larger than any that the filter was tried on",
+            severity(PHASES[best]),
         )
 
 
@@ -275,7 +260,27 @@ def machine_causes(
         if found is None:
             continue
         what = f"what is reported as a {said} at {t:g} s"
-        yield found, _rather(found, said, what) if said else None
+        yield found, _rather(found, said, what) if said else _unsaid(found)
+
+
+def _unsaid(found: Causes) -> Doubt | None:
+    """The doubt that a change raises which no filter knows, and which is no short circuit."""
+    best = found.best
+    if best.partition(" ")[0] in ("healthy", "short") or found.probability[best] < SURELY:
+        return None
+    return Doubt(
+        "sensor",
+        f"the change at {found.t:g} s is rather: {best} ({100 * found.probability[best]:.0f} %), "
+        "of which the filter knows nothing",
+    )
+
+
+def lost(why: Exception, first: Causes | None = None) -> Doubt:
+    """The doubt about a machine whose filter is lost; ``first``: what its first change is."""
+    text = f"its filter is lost, and nothing is estimated: {why}"
+    if first is not None:
+        text += f"; the first change is {first.best} ({100 * first.probability[first.best]:.0f} %)"
+    return Doubt("lost", text)
 
 
 def _rather(found: Causes, said: str, what: str) -> Doubt | None:

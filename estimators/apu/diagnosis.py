@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 from estimators.apu import gascauses
 from estimators.apu.electrical import causes
 from estimators.apu.electrical.causes import Causes, kind_of
+from estimators.apu.trust import GAS
 from estimators.information.posterior import named_posterior
 
-__all__ = ["COINCIDENCE", "GAS", "Diagnosis", "diagnoses"]
+__all__ = ["COINCIDENCE", "Diagnosis", "diagnoses"]
 
-GAS = "gas path"
 TOGETHER = 0.2  # s; the gas path sees a change later than the waveforms do
 COINCIDENCE = 1e-3
 LEAST = 1e-9  # probability that is no less

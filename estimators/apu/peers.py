@@ -40,6 +40,7 @@ from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalside import Beliefs, ElectricalSide
 from estimators.apu.electrical.hypotheses import FAULTY, H_SCALE
 from estimators.apu.machinepowers import on_common_windows
+from estimators.apu.trust import Doubt, machine, severity
 from estimators.information.posterior import posterior
 
 __all__ = ["BALANCED", "COMMON", "Compared", "compare", "compared_sides"]
@@ -116,12 +117,14 @@ def compared_sides(
             continue
         mean, sigma = found.alike[:, own - 1, -1]
         if mean > 3 * sigma:
-            doubts.append(
-                f"machine {number}: all machines show the same severity in phase "
+            text = (
+                f"{machine(number)}: all machines show the same severity in phase "
                 f"{PHASES[own - 1]}, {mean:.1e} beyond the other phases: an error that they share, "
                 "of sensors or speed, or the same short circuit in all of them; compared with the "
                 f"others it has one with a probability of {found.faulty[k, -1]:.2f}"
             )
+            part = f"{machine(number)}: {severity(PHASES[own - 1])}"
+            doubts.append(Doubt("machine", text, part))
     return found, found.report([*sides]), doubts
 
 

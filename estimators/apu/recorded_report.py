@@ -16,6 +16,7 @@ from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
 from estimators.apu.joint import ElectricalSide
+from estimators.apu.trust import in_words
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -182,4 +183,4 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"read: {n}" for n in r["notes"])
     yield from (f"doubt: {d}" for d in r["doubts"])
     if not r["believable"]:
-        yield "NOT TO BE BELIEVED as it stands, for the doubts above"
+        yield f"NOT TO BE BELIEVED as it stands, for the doubts above{in_words(r['belief'])}"
