@@ -15,7 +15,7 @@ from estimators.apu.electrical.hypotheses import (
     SeverityPrior,
     loose_in_common,
 )
-from estimators.apu.unknowns import COPPER, Knowledge, filter_unknowns
+from estimators.apu.unknowns import COPPER, UNKNOWNS, Knowledge, filter_unknowns
 from estimators.information.posterior import named_posterior, posterior
 
 TRUE_P, SLOPE = 200e3, 2e7
@@ -116,6 +116,11 @@ def test_one_faulty_phase_leaves_no_misfit_and_two_do():
 
 def test_what_is_known_of_parameters():
     assert Knowledge.temperature(20.0).sigma == pytest.approx(20 * COPPER)
+    # a stator at the limit of its class, known as at 20 C, is within four deviations
+    stator = UNKNOWNS["machine.r_s"]
+    assert stator.how == "considered"
+    assert stator.sigma == pytest.approx(COPPER * 160 / np.sqrt(12))
+    assert 4 * stator.sigma > 160 * COPPER
     of = filter_unknowns({"machine.L_md": Knowledge("considered", 0.05), "J": Knowledge("known")})
     assert of["machine.L_md"][0].consider and of["machine.L_md"][1] == 0.05 and len(of) == 1
 

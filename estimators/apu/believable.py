@@ -30,17 +30,18 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
-from estimators.apu.gascauses import causes_of_alarms
+from estimators.apu.gascauses import causes_of_alarms, jumps_of
 from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
-from estimators.apu.trust import Doubt, part_of, severity
+from estimators.apu.trust import GAS, Doubt, part_of, severity
+from estimators.detection.signatures import linearised
 from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
+FEWEST_INNOVATIONS = 8  # samples in which a drift is looked for
 RECENT = 0.1  # s, before a report, in which a reset is its own
 SETTLED = 0.1  # s after a report, in which its innovations are explained
 SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
@@ -299,6 +301,7 @@ _GAS = {
     "wild": "its reading at {t:g} s is {v:+.1f} sigma from what model and stated noise explain",
     "mean": "its innovations have a mean of {v:+.2f} sigma",
     "drift": "its innovations drift by {v:+.1f} sigma along the recording",
+    "creep": "it drifts by {v:+.1%} along the recording, against all that was measured besides",
     "colour": "its innovations are not white, neighbours are correlated by {v:+.2f}: a lag?",
 }
 _GAS_KIND = {"size": "innovations", "window": "innovations", "wild": "wild"}
@@ -328,6 +331,7 @@ def gas_doubts(
         *r.x.names
     }:  # freer than a load moves: innovations alternate, sigma is large
         found = [f for f in found if f.test != "colour" or f.value > 0]
+    found += _creeping(filt, tracked, quiet)
     for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
@@ -349,6 +353,27 @@ def gas_doubts(
         abs(v - 1) > SURE * float(r[n][1][-1]) for n, v in x.items()
     )
     yield from (d for side in sides if changed for d in _hidden(side))
+
+
+def _creeping(filt: GasPathFilter, tracked: Tracked, quiet: np.ndarray) -> list[Finding]:
+    """Test whether a sensor, or the shaft power, drifts against all others.
+
+    What that would leave in the innovations of all sensors is known, so that a drift is found which
+    hardly shows in any one of them, and still moves the estimates by several sigmas.
+    """
+    r = tracked.result
+    jumps, of = jumps_of(filt)
+    names = {n: own for n, (own, _) in of.items() if n != GAS}
+    if quiet.sum() < FEWEST_INNOVATIONS:
+        return []
+    f = linearised(filt.model, r, tracked.data, [j for j in jumps if j.name not in HEALTH])
+    size, sigma = f.ramps(r.t).evidence(quiet)
+    z = {n: abs(size[k] / sigma[k]) for n, (own,) in names.items() for k in f.columns([own])}
+    # others share a part of its signature: the most striking one alone is told
+    most = max(z, key=lambda n: z[n])
+    chance = float(2 * ndtr(-z[most] / math.sqrt(MARGIN))) * len(z)
+    (k,) = f.columns(names[most])
+    return [Finding(most.removeprefix("sensor "), "creep", chance, float(size[k]))]
 
 
 def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

@@ -86,7 +86,7 @@ def recorded(entry: Imperfection, size: float, seed: int, fault: str) -> tuple[A
 
 
 def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, Any]:
-    """Return errors over sigmas at the end, by quantity, and alarms that are false, all and by part.
+    """Return errors over sigmas at the end, by quantity, and false alarms, all and by part.
 
     A report of what did happen, not before it did, is no false one.
     """
@@ -158,7 +158,8 @@ def mismatch(
         count["runs"] += 1
         tell(k + 1, n)
         try:
-            e = estimate(read_recording(r.gaspath, r.electrical), Apu(), backend=backend)
+            given = (r.gaspath,) if entry.only == "gaspath" else (r.gaspath, r.electrical)
+            e = estimate(read_recording(*given), Apu(), backend=backend)
         except ApuError:
             count["refused"] += 1
             continue
