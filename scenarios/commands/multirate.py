@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
         rows = study.measure(steps=steps, cases=cases, progress=progress)
     report = study.report(rows)
     text = jsontext.dumps(report)
-    made = [study.write_figure(rows, folder / "multirate_error.png")]
-    made.append(markdown.write_text(folder / "multirate.json", text + "\n"))
+    made = [markdown.write_text(folder / "multirate.json", text + "\n")]  # before all that may fail
+    made.append(study.write_figure(rows, folder / "multirate_error.png"))
     if args.page:
         page = Path(args.page)
         registry.prepare(page.parent / "images")
