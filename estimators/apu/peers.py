@@ -10,7 +10,8 @@ machines the estimates, one below the other, are
 
     h_hat = h + U c + e,   c ~ N(0, I),   e ~ N(0, blockdiag(P)),
 
-c being the common errors: of each considered one ``COMMON`` times what a single machine's may be,
+c being the common errors: of the considered ones those that ``COMMON`` names, so many times what a
+single machine's may be,
 and one that looks like a severity in all three phases at once, which is what wrong speeds,
 frequencies and hot fields do.  A hypothesis says which machines, at most
 ``TOGETHER`` of them, have a short circuit in which phase; such a severity is half-normal.  With its
@@ -45,8 +46,18 @@ from estimators.information.posterior import posterior
 
 __all__ = ["BALANCED", "COMMON", "Compared", "compare", "compared_sides"]
 
-COMMON = 10.0
-"""Standard deviation of a common error over that of one machine's own: 5 % of a gain."""
+COMMON = {"gain_": 10.0, "delay_": 4.0, "machine.": 1.0}
+"""Standard deviation of what all machines share of a considered error, over that of one machine's
+own, by the beginning of its name:
+
+* gains, 5 %: sensors of one type, calibrated together or read with the same wrong ratio;
+* delays, 20 us: one acquisition unit with one kind of filter, whose lag nobody declared;
+* inductances and the like of the machine: one design, of which the same is not known; what differs
+  between specimens is each one's own.
+
+Winding temperatures are no errors in common: each machine has its own, and so has its efficiency,
+which moves no severity.
+"""
 BALANCED = 1e-3
 """The same of a common severity in all three phases: half a per cent of the speed looks so."""
 TOGETHER = 2  # machines that have a short circuit at once, at most
@@ -131,7 +142,7 @@ def compared_sides(
 def compare(
     beliefs: Sequence[Beliefs],
     *,
-    common: float = COMMON,
+    common: Mapping[str, float] = COMMON,
     balanced: float = BALANCED,
     faulty: float = FAULTY,
     scale: float = H_SCALE,
@@ -140,7 +151,8 @@ def compare(
 
     Args:
         beliefs: of each machine, of the same windows.
-        common: standard deviation of a common error over that of a machine's own; 0: none.
+        common: standard deviation of a common error over that of a machine's own, by the beginning
+            of its name; what is not named is not common.
         balanced: that of a common severity in all phases.
         faulty: probability that a machine has a short circuit.
         scale: of its severity.
@@ -182,16 +194,17 @@ def compare(
     )
 
 
-def _common(beliefs: Sequence[Beliefs], common: float, balanced: float) -> np.ndarray:
+def _common(beliefs: Sequence[Beliefs], common: Mapping[str, float], balanced: float) -> np.ndarray:
     """Return what common errors of unit variance do to all severities, (K, 3 n, c)."""
     n, K = len(beliefs), beliefs[0].mean.shape[0]
-    of = [x for x in beliefs[0].names[3:] if x != "P" and all(x in b.names for b in beliefs)]
+    factor = {x: v for x in beliefs[0].names for n, v in common.items() if x.startswith(n)}
+    of = [x for x in factor if all(x in b.names for b in beliefs)]
     U = np.zeros((K, 3 * n, len(of) + 1))
     U[:, :, -1] = balanced
     for j, x in enumerate(of):
         at = [b.names.index(x) for b in beliefs]
         own = [b.cov[:, i, i] for i, b in zip(at, beliefs, strict=True)]
-        size = common * np.sqrt(np.max(own, axis=0))
+        size = factor[x] * np.sqrt(np.max(own, axis=0))
         for k, (i, b) in enumerate(zip(at, beliefs, strict=True)):
             slope = -b.cov[:, :3, i] / own[k].clip(1e-300)[:, None]
             U[:, 3 * k : 3 * k + 3, j] = slope * size[:, None]

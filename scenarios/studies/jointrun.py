@@ -28,6 +28,7 @@ from estimators.apu.gaspathmodel import DT
 from estimators.apu.joint import beside_truth
 from estimators.apu.measuring import drawn_gains, measure_run, write_recording
 from estimators.apu.recorded_estimate import estimate as recorded_estimate
+from estimators.apu.recorded_report import compared_words
 from estimators.apu.recordings.measured import read_recording
 from estimators.apu.sensorfile import SensorFile, read_sensors
 from estimators.apu.trust import in_words, verdict
@@ -274,6 +275,8 @@ def report(e: xr.Dataset) -> dict[str, Any]:
     doubts = json.loads(e.attrs.get("doubts", "[]"))
     belief = json.loads(e.attrs.get("belief", "{}"))
     about |= {"believable": not doubts, "doubts": doubts, "belief": belief}
+    if compared := json.loads(e.attrs.get("compared", "{}")):
+        about["compared"] = compared
     out = {**about, "seed": e.attrs["seed"], **made_with(e), "phases": rows, **found_out}
     return {**out, "cross_talk": _cross_talk(e)}
 
@@ -424,6 +427,7 @@ def words(r: Mapping[str, Any]) -> list[str]:
     for c in talk["health_on_h"]:
         n = max(c["change"], key=lambda n: abs(c["change"][n]))
         out.append(TEXT.text("h moved", name=n, of_n=c["change"][n], sigma_n=c["sigma"][n], **c))
+    out += [f"{s[:1].upper()}{s[1:]}." for s in compared_words(r.get("compared"))]
     out += [TEXT.text("doubt", why=d) for d in r.get("doubts", ())]
     parts = in_words(r.get("belief", {})) if r.get("doubts") else ""
     return [*out, TEXT.text("parts", parts=parts)] if parts else out
