@@ -13,12 +13,14 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange
 from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.believable import gas_doubts
 from estimators.apu.electrical.causes import causes_of_change
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.healthjumps import Tracked
 from estimators.apu.measuring import measure_run
 from estimators.apu.sensors import ELECTRICAL
+from estimators.apu.unknowns import ETA_SIGMA
 
 # each runs a dozen filters that are made for it
 pytestmark = pytest.mark.ci
@@ -101,6 +103,20 @@ def gas():
     filt = gas_path_filter()
     lost = HealthChange(1.0, {"f_eta_c": 0.97})
     return filt, run(duration=2.0), run(lost, duration=2.0)
+
+
+def test_a_shaft_power_that_drifts(gas):
+    """By 5 % in 2 s: named with its size, though hardly an innovation is too large."""
+    filt, quiet = gas_path_filter(eta=ETA_SIGMA, consider_eta=False), gas[1]
+    for seed in range(3):
+        data = filt.recording(quiet, seed)
+        r = filt.run(data, backend="vm")
+        assert not [*gas_doubts(filt, Tracked(r, (), (), data))]
+        u = data.u.copy()
+        u[filt.model.u.index("PW")] *= 1 + 0.05 * data.t / data.t[-1]
+        off = dataclasses.replace(data, u=u)
+        found = [*gas_doubts(filt, Tracked(filt.run(off, backend="vm"), (), (), off))]
+        assert any(d.startswith("shaft power: it drifts by +") for d in found), found
 
 
 def told(filt, data, k=55):

@@ -25,7 +25,7 @@ from estimators.detection.signatures import Jump, linearised
 from estimators.filters.belief import Belief
 from estimators.models.recording import Recording
 
-__all__ = ["PRIOR", "causes_of_alarms"]
+__all__ = ["PRIOR", "causes_of_alarms", "jumps_of"]
 
 BACK, ON = 40, 50  # samples before and after an alarm that are looked at
 SIZE = 0.05  # standard deviation of a jump of a sensor's gain, of the reading
@@ -35,8 +35,8 @@ N_SIZE = 0.02  # the same of the speed's sensor
 PRIOR = {"none": 1.0, "gas path": 1.0, "sensor": 0.3, "shaft power": 0.3}
 
 
-def _jumps(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str], list[float]]]]:
-    """Jumps that may be, and by hypothesis the names and standard deviations of its own."""
+def jumps_of(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str], list[float]]]]:
+    """Return jumps that may be, and by hypothesis the names and standard deviations of its own."""
     jumps = [Jump("state", n) for n in HEALTH]
     of = {"gas path": (list(HEALTH), [JUMP] * len(HEALTH))}
     for n in (n for n in filt.model.y.names if n not in LAGGING):
@@ -106,7 +106,7 @@ def _part(data: Recording, stop: int) -> Recording:
 def _weighed(
     filt: GasPathFilter, data: Recording, k: int, prior: Belief | None, backend: str | None
 ) -> dict[str, float]:
-    jumps, of = _jumps(filt)
+    jumps, of = jumps_of(filt)
     r = filt.run(data, prior=prior, backend=backend)
     f = linearised(filt.model, r, data, jumps, backend=backend)
     g = glr(f, np.arange(max(k - BACK, 1), k + 1))

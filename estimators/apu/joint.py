@@ -63,6 +63,7 @@ from estimators.apu.gaspath import (
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, spliced, track_jumps
 from estimators.apu.machinepowers import shaft_courses
+from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior
 from estimators.apu.sensorchain import interpolated
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
@@ -283,7 +284,8 @@ def estimate_joint(
         to 3: a to c), ``nis`` of the gas-path filter.  P_total is the mean of the window that ends
         at the instant.  ``ttsc_probability`` is that of a short circuit, found or not.  Of
         generators that differ, names have endings, ``h_a_2``.  Attributes: ``resets`` of the
-        electrical filters, ``alarms`` and ``onsets`` of health jumps, s, as JSON.
+        electrical filters, ``alarms`` and ``onsets`` of health jumps, s, and what machines that
+        differ say ``compared`` with each other (:mod:`estimators.apu.peers`), as JSON.
 
     Raises:
         DataError, EstimationError: as the two filters.
@@ -498,6 +500,7 @@ def beside_truth(
         "resets": sorted({v for s in known.values() for v in s.resets}),
         "alarms": [float(r.t[i]) for i in tracked.alarms],
         "onsets": [float(r.t[i]) for i in tracked.onsets],
+        "compared": compared_sides(known)[1],
     }
     attrs = {n: json.dumps(v) for n, v in found.items()}
     return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)
