@@ -114,7 +114,7 @@ class _Leaps:
     def __call__(self, *columns: np.ndarray) -> np.ndarray:
         """Return the matrices after ``steps``, one in each column; see :func:`_radau_function`."""
         size = columns[0].shape[1]
-        self._asked += size
+        self._asked += size * self.steps
         if not self._compiled and self._asked > COMPILE_FROM:
             self._calls, self._compiled = self._batches(build=True), True
         made: np.ndarray = self._calls[size > FEWEST](*columns)[0]
