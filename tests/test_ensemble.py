@@ -24,6 +24,7 @@ def members():
         {"load": SeriesLoad.from_power(99e3), "health": {"f_W_c": 0.98}, "events": [drop]},
         {"load": LOAD, "apu": Apu().change({"machine.r_s": 0.0079})},
         {"load": LOAD, "noise": Noise(N=0.01), "seed": 3, "duration": 0.1},
+        {"load": LOAD, "waveform_dt": 1e-4, "duration": 0.21},
     ]
 
 
