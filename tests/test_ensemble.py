@@ -6,6 +6,7 @@ import pytest
 from apu_casadi import Apu, FaultChange, HealthChange, LoadChange, SeriesLoad, Ttsc, simulate_joint
 from apu_casadi.core.backend import find_compiler
 from apu_casadi.core.errors import BackendError, OperatingPointError, ScenarioError, SimulationError
+from apu_casadi.core.lanes import together
 from apu_casadi.core.lanes.together import Member, Question, Together, answer, ensemble
 from apu_casadi.unit.ensemble import simulate_ensemble
 from apu_casadi.unit.noise import Noise
@@ -49,8 +50,9 @@ def test_members_are_the_single_runs(alone):
 @pytest.mark.compiled
 @pytest.mark.ci
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler found")
-def test_members_are_the_single_runs_in_lanes():
+def test_members_are_the_single_runs_in_lanes(monkeypatch):
     """The blocks of all members in compiled lanes, also on threads: the bits of compiled runs."""
+    monkeypatch.setattr(together, "OFTEN", 0)
     fault = FaultChange(t=0.05, fault=Ttsc(mu=0.05, k_rf=20.0))
     some = [*members()[:3], {"load": LOAD, "events": [fault]}]
     single = [simulate_joint(**{"apu": Apu(), **COMMON, **m}) for m in some]
