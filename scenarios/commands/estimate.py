@@ -133,6 +133,7 @@ def _data(args: argparse.Namespace) -> int:
 def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi.core import results
+    from apu_casadi.core.cf import described
     from apu_casadi.core.errors import ScenarioError
     from apu_casadi.core.files import write_text
     from estimators.apu.sensorfile import read_sensors
@@ -153,7 +154,8 @@ def _joint(args: argparse.Namespace) -> int:
     e = jointrun.estimate(truth, args.seed, sensors=sensors, folder=folder)
     report = jointrun.report(e) | given.assumed(args)
     notices.tell(report["warnings"] or [])
-    made = [results.save(e, folder / f"estimate_{s.name}.nc")]
+    named = described(e, f"estimate: {s.title or s.name}")
+    made = [results.save(named, folder / f"estimate_{s.name}.nc")]
     text = jsontext.dumps(report)
     made.append(write_text(folder / "estimate.json", text + "\n"))
     if args.figures:

@@ -301,6 +301,7 @@ def report(
         data: datasets by name.
     """
     from apu_casadi.core import results
+    from apu_casadi.core.cf import described
     from apu_casadi.core.files import save_figure, write_text
     from scenarios import registry
     from scenarios.shell import jsontext
@@ -309,7 +310,9 @@ def report(
     made: list[Any] = []
     if args.out is not None:
         folder = registry.prepare(args.out)
-        made = [results.save(d, folder / f"{n}.nc") for n, d in (data or {}).items()]
+        for n, d in (data or {}).items():
+            title = f"{n} of {', '.join(args.files)}"
+            made.append(results.save(described(d, title), folder / f"{n}.nc"))
         made.append(write_text(folder / f"{name}.json", jsontext.dumps(whole) + "\n"))
         if args.figures and figure is not None:
             note = f"{', '.join(args.files)}; {program(args)}."
