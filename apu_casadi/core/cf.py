@@ -1,9 +1,10 @@
 """What a file says of itself, after the CF and ACDD conventions: the one place for it.
 
-Every netCDF or MAT file goes through :func:`described`.  A variable has the ``standard_name`` of CF
-where there is one, and a ``long_name``.  No institution or creator is made up, and there is no
-place on earth that a file would be of.  ``SOURCE_DATE_EPOCH`` [s] in the environment fixes
-``date_created``, so that files can be made again byte by byte.
+Every netCDF or MAT file goes through :func:`described`.  A variable has a ``long_name``, and the
+``standard_name`` of CF where there is one; the time of a run has none, because CF's ``time`` needs
+a date to count from.  No institution or creator is made up, and there is no place on earth that a
+file would be of.  ``SOURCE_DATE_EPOCH`` [s] in the environment fixes ``date_created``, so that
+files can be made again byte by byte.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import os
 import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from apu_casadi.core.version import installed
 
@@ -75,6 +78,12 @@ def described(ds: xr.Dataset, title: str = "") -> xr.Dataset:
         v.attrs.setdefault("long_name", str(name).replace("_", " "))
         if name in STANDARD_NAMES:
             v.attrs.setdefault("standard_name", STANDARD_NAMES[str(name)])
+        if name == "altitude":
+            v.attrs.setdefault("positive", "up")
+        if "flag_values" in v.attrs:
+            v.attrs["flag_values"] = np.asarray(v.attrs["flag_values"], v.dtype)
+        if name in made.coords:
+            v.encoding["_FillValue"] = None  # CF: none of a coordinate
     named = any("standard_name" in v.attrs for v in made.variables.values())
     told = {
         "title": title or "result of apu-casadi",

@@ -71,7 +71,6 @@ def _netcdf4(ds: xr.Dataset, path: Path) -> list[Path]:
     encoding: dict[Any, dict[str, Any]] = {
         n: packed | ({"dtype": "float32"} if WAVEFORMS in v.dims else {}) for n, v in ds.items()
     }
-    encoding |= {n: {"_FillValue": None} for n in ds.coords}  # CF: none of a coordinate
     told = cf.described(ds)
     if WAVEFORMS in ds.dims:
         told.attrs["precision"] = PRECISION

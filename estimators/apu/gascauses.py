@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from apu_casadi.core.backend import rarely
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.electrical.causes import Causes, probabilities
 from estimators.apu.gaspath import JUMP, GasPathFilter
@@ -60,13 +61,14 @@ def jumps_of(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str]
 
 
 def causes_of_alarms(
-    filt: GasPathFilter, tracked: Tracked, *, backend: str | None = "vm"
+    filt: GasPathFilter, tracked: Tracked, *, backend: str | None = None
 ) -> list[Causes]:
     """Tell of each reported change of health what it is.
 
     Args:
         filt, tracked: the filter and what it said.
-        backend: see :func:`apu_casadi.core.backend.compiled`.
+        backend: see :func:`apu_casadi.core.backend.compiled`; by default as for what is done
+            :func:`~apu_casadi.core.backend.rarely`.
     """
     out = []
     row = filt.model.u.index("jump")
@@ -76,10 +78,9 @@ def causes_of_alarms(
         u[row, onset:] = 0.0
         stop = min(k + ON, tracked.data.size)
         data = _part(replace(tracked.data, u=u), stop)
-        weighed = _weighed(filt, data, k, tracked.prior, backend)
-        failed = _failed(
-            filt, data, onset, max(weighed, key=lambda n: weighed[n]), tracked, backend
-        )
+        how = backend or rarely("causes of an alarm")
+        weighed = _weighed(filt, data, k, tracked.prior, how)
+        failed = _failed(filt, data, onset, max(weighed, key=lambda n: weighed[n]), tracked, how)
         out.append(Causes(float(data.t[k]), weighed, failed))
     return out
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from apu_casadi.core.errors import EstimationError
 from apu_casadi.machine.terminals import SHUNTS
@@ -180,10 +181,13 @@ def _usual(share: np.ndarray, first: int) -> np.ndarray:
     Their offsets stay in the innovations, so a unit has its own level: the median of up to 20
     windows before, four at least.
     """
-    out = np.full(share.size - first, math.inf)
-    for k in range(max(first, 4), share.size):
-        out[k - first] = max(float(len(MEASURED)), float(np.median(share[max(k - 20, 1) : k])))
-    return out
+    out = np.full(share.size, math.inf)
+    for k in range(max(first, 4), min(share.size, 21)):
+        out[k] = np.median(share[1:k])
+    if share.size > 21:
+        out[21:] = np.median(sliding_window_view(share[1:-1], 20), axis=1)
+    made: np.ndarray = np.fmax(out[first:], len(MEASURED))
+    return made
 
 
 _COURSES = ("t", "mean", "variance", "innovation", "innovation_variance", "nis", "measured")
