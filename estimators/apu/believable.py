@@ -38,6 +38,7 @@ from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms, jumps_of
+from estimators.apu.gaspath import MODEL_ERROR
 from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.apu.trust import GAS, Doubt, part_of, severity
@@ -368,6 +369,8 @@ def _creeping(filt: GasPathFilter, tracked: Tracked, quiet: np.ndarray) -> list[
         return []
     f = linearised(filt.model, r, tracked.data, [j for j in jumps if j.name not in HEALTH])
     size, sigma = f.ramps(r.t).evidence(quiet)
+    # in ten minutes a drift by what the model is off is significant, and says nothing
+    sigma = np.hypot(sigma, MODEL_ERROR)
     z = {n: abs(size[k] / sigma[k]) for n, (own,) in names.items() for k in f.columns([own])}
     # others share a part of its signature: the most striking one alone is told
     most = max(z, key=lambda n: z[n])
