@@ -36,28 +36,66 @@ def _powers(polynomials: np.ndarray, s: Any) -> list[Any]:
     return values
 
 
-def _matrices(pairs: int, angles: int, *, odd: bool) -> ca.Function:
-    """Function (coefficients of an entry, relative speed, first angle) -> it at some angles.
+def _sums(cosines: dict[int, Any], sines: dict[int, Any], n: int) -> tuple[list[Any], list[Any]]:
+    """Sums of c_q cos x and of s_q sin x, x = q pi m/n, at m = 0, ..., n.
 
-    One entry of a :class:`Table`: shape (2 pairs, 4) -> (angles,); the angles are a stride apart.
+    Those at m and n - m differ in the signs of terms only: each is added up once.
     """
-    c, s, a = ca.SX.sym("c", 2 * pairs, 4), ca.SX.sym("s"), ca.SX.sym("trig", 2 * pairs, angles)
-    now = ((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0]
-    return ca.Function(f"entry_{odd}", [ca.vec(c), s, ca.vec(a)], [ca.mtimes(a.T, now)])
+    parts = []
+    for series, function in ((cosines, math.cos), (sines, math.sin)):
+        rows = []
+        for m in range(n // 2 + 1):
+            even, odd = ca.SX(0), ca.SX(0)
+            for q, c in series.items():
+                by = function(math.pi * q * m / n)
+                term = c * by if abs(by) > 1e-15 else 0  # exactly zero but for rounding
+                even, odd = (even, odd + term) if q % 2 else (even + term, odd)
+            rows.append((even, odd))
+        mirror = 1 if function is math.cos else -1
+        mirrored = [mirror * (even - odd) for even, odd in rows[(n - 1) // 2 :: -1]]
+        parts.append([even + odd for even, odd in rows] + mirrored)
+    return parts[0], parts[1]
 
 
-def _trig(pairs: int, angles: int, *, odd: bool) -> ca.Function:
-    """Function (first angle) -> cos k theta, sin k theta in turn, k = 0, 2, ... or 1, 3, ..."""
-    first, columns = ca.SX.sym("theta"), []
-    for k in range(angles):
-        theta = first + 2 * math.pi / STRIDES * k
-        cos, sin = ca.cos(theta), ca.sin(theta)
-        cos2, sin2 = cos * cos - sin * sin, 2 * cos * sin
-        p, q = (cos, sin) if odd else (ca.SX(1), ca.SX(0))
-        for _ in range(pairs):
-            columns += [p, q]
-            p, q = p * cos2 - q * sin2, q * cos2 + p * sin2
-    return ca.Function("trig", [first], [ca.vertcat(*columns)], {"cse": True})
+def _matrices(pairs: int, *, odd: bool) -> ca.Function:
+    """Function (coefficients of an entry, relative speed, cos q theta, sin q theta in turn) -> it.
+
+    One entry of a :class:`Table`, shape (2 pairs, 4), at the ``STRIDES / 2`` angles from theta on
+    that lie a stride apart.  There, q and ``STRIDES`` - q are the same harmonic, which leaves a
+    discrete Fourier transform whose sums mirror each other.
+    """
+    n = STRIDES // 2
+    c, s, trig = ca.SX.sym("c", 2 * pairs, 4), ca.SX.sym("s"), ca.SX.sym("trig", 2 * pairs)
+    now = ca.vertsplit(((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0])
+    cosines, sines = dict[int, Any](), dict[int, Any]()
+    for k in range(pairs):
+        (a, b), (cos, sin) = now[2 * k : 2 * k + 2], ca.vertsplit(trig[2 * k : 2 * k + 2])
+        q, sign = (2 * k + odd) % STRIDES, 1
+        if q > n:
+            q, sign = STRIDES - q, -1
+        cosines[q] = cosines.get(q, 0) + (a * cos + b * sin)
+        sines[q] = sines.get(q, 0) + sign * (b * cos - a * sin)
+    if odd:
+        even_part, odd_part = (part[: n // 2 + 1] for part in _sums(cosines, sines, n))
+    else:  # harmonics of half a turn
+        halved = [{q // 2: v for q, v in part.items()} for part in (cosines, sines)]
+        even_part, odd_part = _sums(halved[0], halved[1], n // 2)
+    mirror = -1 if odd else 1
+    values = [a + b for a, b in zip(even_part, odd_part, strict=True)]
+    values += [mirror * (even_part[m] - odd_part[m]) for m in range((n - 1) // 2, 0, -1)]
+    return ca.Function(f"entry_{odd}", [ca.vec(c), s, trig], [ca.vertcat(*values)], {"cse": True})
+
+
+def _trig(pairs: int, *, odd: bool) -> ca.Function:
+    """Function theta -> cos q theta, sin q theta in turn, q = 0, 2, ... or 1, 3, ..."""
+    theta, column = ca.SX.sym("theta"), []
+    cos, sin = ca.cos(theta), ca.sin(theta)
+    cos2, sin2 = cos * cos - sin * sin, 2 * cos * sin
+    p, q = (cos, sin) if odd else (ca.SX(1), ca.SX(0))
+    for _ in range(pairs):
+        column += [p, q]
+        p, q = p * cos2 - q * sin2, q * cos2 + p * sin2
+    return ca.Function("trig", [theta], [ca.vertcat(*column)], {"cse": True})
 
 
 class Turn(NamedTuple):
@@ -128,83 +166,58 @@ def _signs(ss: GeneratorModel) -> np.ndarray:
     return sign
 
 
-def _half_turn(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
-    """Half a turn, after which the phases are reversed instead of the angle going on.
+class _Pair:
+    """Two strides and what is averaged over them: one step of the exciter.
 
-    First: (x, V, even and odd entries, d) -> (x, V, x at the strides).  Second: (u, theta, length
-    of a stride, angle at the start) -> d, the same for every half turn.
-    """
-    nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
-    step, _ = leap(ss, PACE, False, chained=True)
-    x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
-    P = [ca.SX.sym("P", part.size, STRIDES // 2) for part in (kinds.even, kinds.odd)]
-    h, theta0, at = ca.SX.sym("h"), ca.SX.sym("theta0"), ss.x.index("theta_e")
-    xk, Vk, states = ca.SX(x), V, []
-    xk[at] = theta0
-    for k in range(0, STRIDES // 2, PACE):
-        these = [ca.vec(p[:, k : k + PACE]) for p in P]
-        X, Vk = step(xk, Vk, ca.vertcat(*these), u, th, h)
-        xk = X[:, -1]
-        states.append(X)
-    xk = xk * _signs(ss)
-    xk[at] = theta0
-    outputs = [xk, Vk, ca.horzcat(*states)]
-    return hoisted("half", [x, V, *P], ca.vertcat(u, th, h, theta0), outputs)
-
-
-class _Sampled:
-    """What is averaged, at the samples of a step, and their means.
-
-    The angles of the samples are the same in every half turn: what follows from them is computed
-    once for each, and harmonics are taken out of the sums over the half turns.
+    All pairs of a step are one small function: seven unrolled to half a turn would not stay in the
+    processor's cache of instructions, and compile longer.  The angles of the samples are the same
+    in every half turn: what follows from them is computed once for each, and harmonics are taken
+    out of the sums over the half turns.
     """
 
     def __init__(self, ss: GeneratorModel, quad: Sequence[str]) -> None:
-        nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-        x, u, th = (ca.SX.sym(k, n) for k, n in zip("xut", (nx, nu, nt), strict=True))
-        angle, weight = ca.SX.sym("angle"), ca.SX.sym("weight", 2)
-        x_now = ca.SX(x)
-        x_now[ss.x.index("theta_e")] = angle
-        y = ss.g(x_now, u, th)
+        nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
         self._asked = [Term.of(q) for q in quad]
         #: values and whether they are weighted; harmonics apart
         self._own = list(dict.fromkeys((q.base, q.power, q.weighted) for q in self._asked))
-        terms = [Term(b, n, "", 0, w).value(ss, x_now, y) * weight[int(w)] for b, n, w in self._own]
-        outputs = [ca.vertcat(*terms), y[ss.y.index("V_t")]]
-        fixed = ca.vertcat(u, th, angle)
-        self._values, self._fixed = hoisted("y", [x, weight], fixed, outputs)
+        step, V_of = leap(ss, PACE, False, chained=True)
+        x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
+        P = [ca.SX.sym("P", part.size, PACE) for part in (kinds.even, kinds.odd)]
+        h, angle, weights = ca.SX.sym("h"), ca.SX.sym("angle"), ca.SX.sym("weights", 2, PACE)
+        x_now = ca.SX(x)
+        x_now[ss.x.index("theta_e")] = angle
+        first = self._values(ss, x_now, u, th)
+        self.start = ca.Function("start", [x, u, th, angle], [*first, V_of(x_now, u, th)[0]])
+        X, V_end = step(x_now, V, ca.vertcat(*map(ca.vec, P)), u, th, h)
+        values = [self._values(ss, x_j, u, th) for x_j in ca.horzsplit(X)]
+        terms = [self.weighted(v, weights[:, j]) for j, (v, _) in enumerate(values)]
+        outputs = [X, V_end, ca.horzcat(*terms), ca.horzcat(*(v for _, v in values))]
+        #: (x, V, even and odd entries, weights plain and of weighted means (2, PACE), d) ->
+        #: (x at the strides, V, terms by their weights, terminal voltages); and (u, theta, length
+        #: of a stride, angle at the start) -> d, the same in every half turn
+        fixed = ca.vertcat(u, th, h, angle)
+        self.over, self.before = hoisted("pair", [x, V, *P, weights], fixed, outputs)
 
-    def __call__(self, X: Sequence[Any], weights: Any, fixed: Any, angles: Any) -> tuple[Any, Any]:
-        """Return the means and the terminal voltages of all samples.
+    def _values(self, ss: GeneratorModel, x: Any, u: Any, th: Any) -> tuple[Any, Any]:
+        """Return what is averaged, and the terminal voltage, at a sample."""
+        y = ss.g(x, u, th)
+        terms = [Term(b, n, "", 0, w).value(ss, x, y) for b, n, w in self._own]
+        return ca.vertcat(*terms), y[ss.y.index("V_t")]
 
-        Args:
-            X: states at the start, and at the samples of each half turn.
-            weights: plain ones and those of weighted means, shape (2, samples).
-            fixed: inputs and theta.
-            angles: at the start, and at the samples of a half turn.
-        """
-        n, values = angles.numel(), self._values
-        d = self._fixed.map(n)(ca.vertcat(ca.repmat(fixed, 1, n), angles))
-        first, V = values(X[0], weights[:, 0], d[:, 0])
-        half, total, Vs = values.map(n - 1), ca.MX(0), [V]
-        for k, states in enumerate(X[1:]):
-            at = 1 + k * (n - 1)
-            of_half, V = half(states, weights[:, at : at + n - 1], d[:, 1:])
-            total = total + of_half
-            Vs.append(V)
-        sums = ca.horzcat(first, total)
-        return self._means(n)(sums, angles), ca.horzcat(*Vs)
+    def weighted(self, terms: Any, weights: Any) -> Any:
+        """Return terms of a sample by their weights, plain and of weighted means, (2,)."""
+        return terms * ca.vertcat(*(weights[int(w)] for *_, w in self._own))
 
-    def _means(self, n: int) -> ca.Function:
-        """Function (sums over the half turns, angles) -> the means asked for."""
-        sums, angles = ca.SX.sym("sums", len(self._own), n), ca.SX.sym("angles", 1, n)
+    def means(self, sums: Any, angles: Any) -> Any:
+        """Return the means asked for from sums over the half turns at angles, (terms, angles)."""
+        given = ca.SX.sym("sums", sums.shape), ca.SX.sym("angles", angles.shape)
         found = []
         for q in self._asked:
-            row = sums[self._own.index((q.base, q.power, q.weighted)), :]
+            row = given[0][self._own.index((q.base, q.power, q.weighted)), :]
             if q.trig:
-                row = row * harmonic(q.k, angles)[q.trig == "sin"]
+                row = row * harmonic(q.k, given[1])[q.trig == "sin"]
             found.append(ca.sum2(row))
-        return ca.Function("means", [sums, angles], [ca.vertcat(*found)], {"cse": True})
+        return ca.Function("means", given, [ca.vertcat(*found)], {"cse": True})(sums, angles)
 
 
 def periodic_step(
@@ -213,8 +226,8 @@ def periodic_step(
     """Function (x0, series, u, theta, dt) -> (x, mean, miss) for periodic coefficients."""
     nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
     n_even, n_odd = kinds.even.size, kinds.odd.size
-    pairs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
-    sizes = 4 * 2 * pairs[0] * n_even, 4 * 2 * pairs[1] * n_odd
+    trigs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
+    sizes = 4 * 2 * trigs[0] * n_even, 4 * 2 * trigs[1] * n_odd
     X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
     parameters, DT = ca.MX.sym("series", sum(sizes) + 4), ca.MX.sym("dt")
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
@@ -225,25 +238,36 @@ def periodic_step(
     P = []
     for i, (first, rows) in enumerate(((0, n_even), (sizes[0], n_odd))):
         series = ca.reshape(parameters[first : first + sizes[i]], -1, rows)
-        entry = _matrices(pairs[i], half_turn, odd=bool(i)).map("all", "serial", rows, [1, 2], [])
-        trig = _trig(pairs[i], half_turn, odd=bool(i))(theta0)
+        entry = _matrices(trigs[i], odd=bool(i)).map("all", "serial", rows, [1, 2], [])
+        trig = _trig(trigs[i], odd=bool(i))(theta0)
         P.append(entry(series, s, trig).T)
-    half, before = _half_turn(ss)
-    _, V_of = leap(ss, PACE, False, chained=True)
-    h_now = stride / w
-    x_k, V_k, samples = X0, ca.vertcat(V_of(X0, U, TH)[0], 0, 0), [X0]
-    d = before(ca.vertcat(U, TH, h_now, theta0))
-    for _ in range(turn.halves):
-        x_k, V_k, X = half(x_k, V_k, *P, d)
-        samples.append(X)
+    pair, h_now = _Pair(ss, quad), stride / w
     length = DT / h_now
     weights = _end_weights(turn)(length)
     # beyond the end of the step the weight goes on as the polynomial that it is
     shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
     plain = weights[0, :] / length
-    angles = theta0 + stride * ca.DM(np.arange(half_turn + 1)).T
     both = ca.vertcat(plain, plain * window(shares))
-    mean, V_all = _Sampled(ss, quad)(samples, both, ca.vertcat(U, TH), angles)
+    angles = theta0 + stride * ca.DM(np.arange(half_turn + 1)).T
+    terms, V_first, V_now = pair.start(X0, U, TH, theta0)
+    x_k, V_k, samples, voltages = X0, ca.vertcat(V_now, 0, 0), [X0], [V_first]
+    first, *rest = ca.horzsplit(both, [0, *range(1, turn.samples + 1, PACE)])
+    pairs = half_turn // PACE
+    fixed = ca.vertcat(ca.repmat(ca.vertcat(U, TH, h_now), 1, pairs), angles[:-1:PACE])
+    held = list(zip(*(ca.horzsplit(p, PACE) for p in P), strict=True))
+    d = ca.horzsplit(pair.before.map(pairs)(fixed))
+    sums = [ca.MX(0)] * pairs
+    for k, own in enumerate(rest):
+        at_pair = k % pairs
+        X, V_k, its, V = pair.over(x_k, V_k, *held[at_pair], own, d[at_pair])
+        x_k = X[:, -1]
+        if at_pair == pairs - 1:
+            x_k = x_k * _signs(ss)
+        sums[at_pair] = sums[at_pair] + its
+        samples.append(X)
+        voltages.append(V)
+    mean = pair.means(ca.horzcat(pair.weighted(terms, first), *sums), angles)
+    V_all = ca.horzcat(*voltages)
     # the end of the step, with the phases as they are after so many half turns
     tail = np.arange(turn.first, turn.samples)
     turned = np.maximum(0, (tail - 1) // (STRIDES // 2)) % 2 == 1
