@@ -348,9 +348,10 @@ def run_campaign(
             done = _run_all(tasks, done, workers, progress, keep_it)
         _sweep(folder / "runs")  # of processes that were killed meanwhile
         ds = _dataset(scenarios, [done[t.key] for t in tasks], solver)
+        from apu_casadi.core.cf import described
         from apu_casadi.core.results import save
 
-        save(ds, folder / DATASET)
+        save(described(ds, f"campaign of {ds.sizes['run']} runs"), folder / DATASET)
     return ds
 
 

@@ -132,6 +132,23 @@ def test_a_member_asks_and_finds_the_answer():
         g(x)
 
 
+def test_rows_of_calls_are_answered_together_and_whole_packs_first():
+    """Rows of two lengths: each member has its own; what one function is asked more often goes."""
+    f, g, x = doubled(), doubled("other"), np.array([[1.0, 2.0], [3.0, 4.0]])
+    row = np.hstack([2 * x, 4 * x, 8 * x])
+    assert np.array_equal(f.in_a_row(3, x)[0], row)
+    asked = [Member() for _ in range(3)]
+    for m, (h, n) in zip(asked, ((f, 3), (g, 1), (f, 2)), strict=True):
+        with m, pytest.raises(Question):
+            h.in_a_row(n, x)
+    answer(asked, patient=True)
+    answer(asked, patient=True)
+    answer(asked, patient=True)
+    for m, (h, n) in zip(asked, ((f, 3), (g, 1), (f, 2)), strict=True):
+        with m:
+            assert m.asks is None and np.array_equal(h.in_a_row(n, x)[0], row[:, : 2 * n])
+
+
 def test_a_hook_that_simulates_does_so_by_itself(alone):
     """What a member runs inside asks nobody."""
 

@@ -74,7 +74,9 @@ __all__ = [
 log: logging.Logger = logging.getLogger("apu_casadi")
 
 BACKENDS = ("auto", "vm", "c")
-FLAGS = ("-fPIC", "-shared", "-fno-math-errno")  # no -ffast-math, because NaN must survive
+FLAGS: tuple[str, ...] = ("-fPIC", "-shared", "-fno-math-errno")  # NaN must survive
+if platform.machine() not in ("x86_64", "AMD64"):
+    FLAGS += ("-ffp-contract=off",)  # elsewhere compilers fuse products and sums unasked
 LEVELS = (1, 2, 3)  # -O1, -O2, -O3
 COMPILE_TIMEOUT = 900.0  # s
 OFTEN = 50  # calls that are enough for a :class:`Gradual` function to be compiled

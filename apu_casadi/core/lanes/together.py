@@ -34,7 +34,7 @@ __all__ = [
     "ensemble",
 ]
 
-CHUNK = 64  # members that are under way at once
+CHUNK = 128  # members that are under way at once
 T = TypeVar("T")
 
 
