@@ -318,6 +318,22 @@ def test_what_is_called_a_few_times_needs_no_compiler(monkeypatch):
     assert again._call.fun.class_name() == "External"
 
 
+@needs_compiler
+def test_what_is_done_rarely_uses_what_is_there_and_compiles_when_it_is_done_often(monkeypatch):
+    runs, f = count_compilations(monkeypatch), pendulum()
+    monkeypatch.setattr(backend, "_uses", type(backend._uses)())
+    monkeypatch.setattr(backend, "RARELY", 3)
+    hows = [backend.rarely("one thing") for _ in range(4)]
+    assert hows == [backend.READY, backend.READY, None, None]
+    assert backend.rarely("another") == backend.READY
+    assert backend.compiled(f, backend=hows[0]) is f and not runs
+    assert backend.compiled(f, backend=hows[2]).class_name() == "External" and len(runs) == 1
+    assert backend.compiled(pendulum(), backend=hows[0]).class_name() == "External"
+    with backend.use_backend("vm"):
+        assert backend.compiled(f, backend=backend.READY) is f
+    assert len(runs) == 1
+
+
 @pytest.mark.parametrize("n_threads", [1, 2, 3])
 @pytest.mark.parametrize("n", [1, 5, 16, 17, 300])
 def test_mapped_is_the_function_column_by_column(n, n_threads):

@@ -30,7 +30,7 @@ from estimators.apu.electrical.faults import (
 from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.machinemodel import _exponential, leaky_pair
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED
-from estimators.apu.electrical.tracking import track, window_power
+from estimators.apu.electrical.tracking import _usual, track, window_power
 from estimators.apu.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
 from estimators.apu.joint import joint_case
 from estimators.apu.sensors import ELECTRICAL
@@ -146,6 +146,18 @@ def test_a_fault_is_found_at_once_with_its_phase():
     text = describe(POWER, r)
     assert "phase b" in text
     assert "not told apart" in text
+    # what is judged, innovations and resets, does not hang on the power
+    plain, same = track(FILT, FILT.prior(samples), FILT.recording(samples))
+    assert same == resets
+    assert_allclose(plain.innovation, r.innovation, atol=1e-9)
+    assert_allclose(plain.nis, r.nis, rtol=1e-9)
+
+
+def test_the_usual_nis_of_a_window_is_the_median_of_those_before():
+    share = np.random.default_rng(0).chisquare(8, 60)
+    for n, first in ((0, 0), (3, 0), (21, 0), (22, 20), (60, 0), (60, 33)):
+        want = [np.inf if k < 4 else np.median(share[max(k - 20, 1) : k]) for k in range(first, n)]
+        assert (_usual(share[:n], first) == np.maximum(want, len(MEASURED))).all()
 
 
 @pytest.mark.long

@@ -277,6 +277,12 @@ def test_sequences_of_a_known_machine(reverse):
     assert np.sqrt(np.mean(np.abs(error) ** 2) / 2) == pytest.approx(s.sigma.mean(), rel=0.3)
     assert len(s.alarms) == 1 and 5.0 < s.alarms[0] < 5.4
     assert not sequences(t[:5000], x[:, :5000] + rng.standard_normal((3, 5000))).alarms
+    # windows that are fitted together do not hang on each other: a gap changes its own alone
+    x[1, 2510:2520] = np.nan
+    holed, full = sequences(t, x), sequences(t, np.where(np.isnan(x), 0.0, x))
+    others = np.arange(full.t.size) != np.searchsorted(full.t, 2.51)
+    assert_allclose(holed.components[:, others], full.components[:, others], rtol=1e-12)
+    assert (np.abs(holed.components - full.components)[:, ~others] > 0.1).all()
 
 
 def test_what_cannot_be_used_is_refused(readings):

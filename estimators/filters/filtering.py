@@ -508,6 +508,8 @@ def _believable(
     start: int,
 ) -> None:
     """Refuse a block in which a check failed or a number is lost."""
+    if (stats[0] <= CHECK_TOL).all() and (var >= 0).all() and np.isfinite(mean).all():
+        return
     failed = ~(stats[0] <= CHECK_TOL)
     # rounding may leave a tiny negative variance of what is known exactly
     size = np.where(np.isfinite(mean), mean, 0.0)

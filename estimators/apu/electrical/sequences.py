@@ -12,6 +12,7 @@ do an unbalanced load and a wrong gain: it is no severity.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -25,6 +26,7 @@ __all__ = ["WINDOW", "Sequences", "fitted", "sequences"]
 WINDOW = 0.1  # s, but PERIODS periods at least
 PERIODS = 4
 LEAST = 8  # windows of the reference
+TOGETHER = 64  # windows that are fitted at once
 MARGIN = 1.5  # on the threshold: the spread itself is estimated
 TURN = np.exp(2j * math.pi / 3)
 
@@ -78,10 +80,9 @@ def sequences(t: np.ndarray, phases: np.ndarray, *, rate: float = 1.0) -> Sequen
         raise DataError(f"{t[-1] - t[0]:.3g} s hold no window of {length:.3g} s")
     edges = np.searchsorted(t, t[0] + length * np.arange(n + 1) - 1e-9)
     rows = [(i, j) for i, j in pairwise(edges) if _fewest(x[:, i:j]) >= 16]
-    found = [_window(t[i:j], x[:, i:j], f) for i, j in rows]
-    if not found:
+    if not rows:
         raise DataError("no window has 16 samples of all three phases")
-    freq, parts, sigma = (np.array([v[k] for v in found]) for k in range(3))
+    freq, parts, sigma = _windows(t, x, rows, f)
     ends = np.array([t[j - 1] for _, j in rows])
     ratio = parts[:, 1] / parts[:, 0]
     reference, alarms = _changes(ratio, sigma, rate * length / 3600)
@@ -102,16 +103,17 @@ def _frequency(t: np.ndarray, x: np.ndarray) -> float:
     return f
 
 
-def _phasors(t: np.ndarray, x: np.ndarray, f: float) -> tuple[np.ndarray, float]:
-    """Symmetrical components of a sinusoid in each phase, and what it leaves, rms."""
-    w = 2 * math.pi * f * (t - t[0])
-    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+def _phasors(t: np.ndarray, x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Symmetrical components of a sinusoid in each phase, and what it leaves, rms; by window."""
+    w = 2 * math.pi * f[:, None] * (t - t[:, :1])
+    basis = np.stack([np.cos(w), -np.sin(w), np.ones_like(w)], axis=2)
+    turned, y = basis.transpose(0, 2, 1), x.transpose(0, 2, 1)
     if np.isfinite(x).all():  # well conditioned, and faster
-        c = np.linalg.solve(basis.T @ basis, basis.T @ x.T)
+        c = np.linalg.solve(turned @ basis, turned @ y)
     else:
-        c = fitted(basis, x.T)
-    parts = np.array(fortescue(c[0] + 1j * c[1]))
-    return parts, float(np.sqrt(np.nanmean((x.T - basis @ c) ** 2)))
+        c = np.array([fitted(b, v) for b, v in zip(basis, y, strict=True)])
+    parts = np.array(fortescue((c[:, 0] + 1j * c[:, 1]).T)).T
+    return parts, np.asarray(np.sqrt(np.nanmean((y - basis @ c) ** 2, axis=(1, 2))))
 
 
 def _share(t: np.ndarray, x: np.ndarray, f: float) -> float:
@@ -141,18 +143,41 @@ def _fewest(x: np.ndarray) -> int:
     return int(np.isfinite(x).sum(axis=1).min())
 
 
-def _window(t: np.ndarray, x: np.ndarray, f: float) -> tuple[float, np.ndarray, float]:
-    """Frequency, symmetrical components and noise of X_2/X_1 of one window."""
-    half = t.size // 2
-    for _ in range(2 if min(_fewest(x[:, :half]), _fewest(x[:, half:])) >= 4 else 0):
-        first, second = (_phasors(t[s], x[:, s], f)[0] for s in (np.s_[:half], np.s_[half:]))
-        k = int(np.abs(first[:2]).argmax())  # the order of the phases may be the other one
-        turned = second[k] / first[k] * np.exp(-2j * math.pi * f * (t[half] - t[0]))
-        f += float(np.angle(turned)) / (2 * math.pi * (t[half] - t[0]))
+def _windows(
+    t: np.ndarray, x: np.ndarray, rows: Sequence[tuple[int, int]], f: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frequency, symmetrical components and noise of X_2/X_1 of all windows.
+
+    Those of one length that lack nothing go together, each with a gap for itself.
+    """
+    freq, parts, sigma = np.empty(len(rows)), np.empty((len(rows), 3), complex), np.empty(len(rows))
+    groups: dict[tuple[int, int], list[int]] = {}
+    for k, (i, j) in enumerate(rows):
+        alone = k // TOGETHER if np.isfinite(x[:, i:j]).all() else -1 - k
+        groups.setdefault((j - i, alone), []).append(k)
+    for (n, _), group in groups.items():
+        at = np.array([rows[k][0] for k in group])[:, None] + np.arange(n)
+        freq[group], parts[group], sigma[group] = _window(t[at], x[:, at].swapaxes(0, 1), f)
+    return freq, parts, sigma
+
+
+def _window(
+    t: np.ndarray, x: np.ndarray, begin: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Do what :func:`_windows` does for some of one length, (W, K) and (W, 3, K)."""
+    W, K = t.shape
+    half, f, every = K // 2, np.full(W, begin), np.arange(W)
+    span = t[:, half] - t[:, 0]
+    for _ in range(2 if min(_fewest(v) for v in (*x[..., :half], *x[..., half:])) >= 4 else 0):
+        first, second = (_phasors(t[:, s], x[..., s], f)[0] for s in (np.s_[:half], np.s_[half:]))
+        k = np.abs(first[:, :2]).argmax(1)  # the order of the phases may be the other one
+        turned = second[every, k] / first[every, k] * np.exp(-2j * math.pi * f * span)
+        f = f + np.angle(turned) / (2 * math.pi * span)
     parts, rest = _phasors(t, x, f)
-    if abs(parts[1]) > abs(parts[0]):
-        parts = parts[[1, 0, 2]]
-    return f, parts, rest * _share(t, x, f) / max(abs(parts[0]), 1e-300)
+    other = np.abs(parts[:, 1]) > np.abs(parts[:, 0])
+    parts[other] = parts[other][:, [1, 0, 2]]
+    share = np.array([_share(*own) for own in zip(t, x, f, strict=True)])
+    return f, parts, rest * share / np.maximum(np.abs(parts[:, 0]), 1e-300)
 
 
 def _changes(ratio: np.ndarray, sigma: np.ndarray, allowed: float) -> tuple[int, list[int]]:
