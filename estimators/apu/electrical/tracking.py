@@ -15,6 +15,7 @@ from estimators.apu.electrical.electricalfilter import ElectricalFilter, conside
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import (
     H_BALANCED_CONSIDERED,
+    ONSET_LEVEL,
     RESET_LEVEL,
     RESET_SIGMA,
     RESET_WINDOW,
@@ -102,7 +103,7 @@ def track(
                 "does not fit these data: a fault branch with leakage of its own, which "
                 "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults",
             )
-        cut = at + (int(bad[0]) - judged) * RESET_WINDOW
+        cut = at + _onset(r.nis, (int(bad[0]) - judged) * RESET_WINDOW)
         if cut > at:
             r, prior = _filtered(made, prior, data, at, cut, cov_at, backend)
             pieces.append(r)
@@ -114,6 +115,16 @@ def track(
             own = own_level is None or own_level
         share, at = np.zeros(0), cut
     return _joined(pieces), resets
+
+
+def _onset(nis: np.ndarray, start: int) -> int:
+    """The first sample from the window before ``start`` on that no noise makes; else ``start``.
+
+    What is before it says that nothing has changed, and would hold the belief back.
+    """
+    first = max(start - RESET_WINDOW, 0)
+    wild = np.flatnonzero(nis[first : start + RESET_WINDOW] > ONSET_LEVEL)
+    return first + int(wild[0]) if wild.size else start
 
 
 def _opened(filt: ElectricalFilter) -> np.ndarray:
