@@ -45,6 +45,8 @@ from scenarios.shell.workers import LOST, each_task, stoppable
 if TYPE_CHECKING:
     import xarray as xr
 
+    from apu_casadi.core.lanes.together import Course
+
 
 DATASET = "campaign.nc"
 LOCK = "campaign.lock"
@@ -64,6 +66,8 @@ HEALTH_RANGES: Mapping[str, tuple[float, float]] = {
 MU_RANGE, K_RF_RANGE = (0.01, 0.10), (10.0, 200.0)
 SHIFT = 1.0  # s; a fault begins up to this much before or after its time in the base scenario
 H_FIRST = 1e-5  # severity from which a short circuit grows
+# runs that are one ensemble in a process: at least, and at most (they are lost with the process)
+FEW, TOGETHER = 8, 128
 GROWTH = (0.2, 0.9)  # time over which a fault grows, of what is left of the run
 
 
@@ -193,35 +197,85 @@ class _Task:
 
 def _run_one(task: _Task) -> dict[str, Any]:
     """Run one scenario; return its record, whatever happens."""
-    from apu_casadi.core.errors import ApuWarning, OperatingPointError
-    from apu_casadi.core.results import phase_summary, save
-    from apu_casadi.unit.validity import found_in
+    from apu_casadi.core.errors import ApuWarning
 
     t = time.perf_counter()
-    record: dict[str, Any] = {"key": task.key, "name": task.table["name"], "reason": ""}
-    ds = None
     try:
         s = Scenario.from_dict(task.table)
         with warnings.catch_warnings():  # they are kept in the record, one list for each run
             warnings.simplefilter("ignore", ApuWarning)
             ds = registry.run(s, solver=task.solver)
-        record["phases"] = [campaign_records.kept(row) for row in phase_summary(ds)]
-        solver = json.loads(ds.attrs["solver"])
-        record["residual"] = float(solver["residual_max"])
-        record["warnings"] = found_in(ds)
-        record["exchange_error"] = float(ds.attrs["exchange_error"])
-        record["status"] = "done"
-    except ApuError as e:
-        kinds = {OperatingPointError: "refused", SimulationError: "failed"}
-        record["status"] = next((v for k, v in kinds.items() if isinstance(e, k)), "invalid")
-        record["reason"] = " ".join(str(e).split())
+        told = _result(ds)
     except Exception as e:
-        record["status"], record["reason"] = "crashed", f"{type(e).__name__}: {e}"
-    if record["status"] == "done" and task.keep is not None:
+        told, ds = _failure(e), None
+    return _record(task, told, ds) | {"seconds": time.perf_counter() - t}
+
+
+def _run_together(tasks: Sequence[_Task]) -> Generator[dict[str, Any]]:
+    """Run scenarios as one ensemble; yield their records as of :func:`_run_one`.
+
+    The wall time of a run is the mean of those that have ended.
+    """
+    from apu_casadi.core.errors import ApuWarning
+    from apu_casadi.core.lanes.together import ensemble
+
+    def course(task: _Task) -> Course[dict[str, Any]]:
+        try:
+            ds = yield from registry.course(Scenario.from_dict(task.table), solver=task.solver)
+            told = _result(ds)
+        except Exception as e:
+            told, ds = _failure(e), None
+        return _record(task, told, ds)
+
+    t = time.perf_counter()
+    under_way = FEW if any(task.keep is not None for task in tasks) else TOGETHER
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ApuWarning)
+        members = ensemble(map(course, tasks), chunk=under_way)
+        for done, (_, made) in enumerate(members, 1):
+            if isinstance(made, Exception):  # a file that cannot be written
+                raise made
+            yield made | {"seconds": (time.perf_counter() - t) / done}
+
+
+def _run_some(tasks: Sequence[_Task]) -> list[dict[str, Any]]:
+    return [*_run_together(tasks)]
+
+
+def _result(ds: xr.Dataset) -> dict[str, Any]:
+    """Return what the record of a run that was done says."""
+    from apu_casadi.core.results import phase_summary
+    from apu_casadi.unit.validity import found_in
+
+    return {
+        "reason": "",
+        "phases": [campaign_records.kept(row) for row in phase_summary(ds)],
+        "residual": float(json.loads(ds.attrs["solver"])["residual_max"]),
+        "warnings": found_in(ds),
+        "exchange_error": float(ds.attrs["exchange_error"]),
+        "status": "done",
+    }
+
+
+def _failure(e: Exception) -> dict[str, Any]:
+    """Return what the record of a run says that an error ended."""
+    from apu_casadi.core.errors import OperatingPointError
+
+    if not isinstance(e, ApuError):
+        return {"reason": f"{type(e).__name__}: {e}", "status": "crashed"}
+    kinds = {OperatingPointError: "refused", SimulationError: "failed"}
+    status = next((v for k, v in kinds.items() if isinstance(e, k)), "invalid")
+    return {"reason": " ".join(str(e).split()), "status": status}
+
+
+def _record(task: _Task, told: Mapping[str, Any], ds: xr.Dataset | None) -> dict[str, Any]:
+    """Return the record of a run; its dataset is written where that is asked for."""
+    from apu_casadi.core.results import save
+
+    if ds is not None and task.keep is not None:
         # a file that cannot be written is no fault of the run, nor could the next: DataError
         save(ds, Path(task.keep) / f"{task.table['name']}.nc")
-    record["seconds"] = time.perf_counter() - t
-    return record
+    return {"key": task.key, "name": task.table["name"], **told}
 
 
 # ------------------------------------------------------------------------------ many runs
@@ -294,9 +348,10 @@ def run_campaign(
             done = _run_all(tasks, done, workers, progress, keep_it)
         _sweep(folder / "runs")  # of processes that were killed meanwhile
         ds = _dataset(scenarios, [done[t.key] for t in tasks], solver)
+        from apu_casadi.core.cf import described
         from apu_casadi.core.results import save
 
-        save(ds, folder / DATASET)
+        save(described(ds, f"campaign of {ds.sizes['run']} runs"), folder / DATASET)
     return ds
 
 
@@ -355,7 +410,26 @@ def _task(s: Scenario, solver: str, keep: str | None) -> _Task:
 
 
 def _records(tasks: Sequence[_Task], workers: int | None) -> Generator[dict[str, Any]]:
-    """Yield the records of all tasks, in the order in which they end."""
+    """Yield the records of all tasks, in the order in which they end.
+
+    Where there are enough of them, ensembles run in vector lanes in each process.
+    """
+    from apu_casadi.core.calling import available_threads
+
+    n = max(1, available_threads() if workers is None else workers)
+    size = min(TOGETHER, -(-len(tasks) // n))
+    if size < FEW:
+        yield from _one_by_one(tasks, workers)
+    elif n == 1:
+        yield from _run_together(tasks)
+    else:
+        groups = [tasks[i : i + size] for i in range(0, len(tasks), size)]
+        for group, records in each_task(_run_some, groups, workers):
+            # None: one of them takes its process down
+            yield from _one_by_one(group, workers) if records is None else records
+
+
+def _one_by_one(tasks: Sequence[_Task], workers: int | None) -> Generator[dict[str, Any]]:
     for t, record in each_task(_run_one, tasks, workers):
         lost = {"key": t.key, "name": t.table["name"], "status": "crashed", "reason": LOST}
         yield lost | {"seconds": math.nan} if record is None else record

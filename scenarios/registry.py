@@ -26,12 +26,14 @@ from scenarios.units import engine_digest, engine_file, of_scenario
 if TYPE_CHECKING:
     import xarray as xr
 
+    from apu_casadi.core.lanes.together import Course
     from apu_casadi.unit.apu import Apu
     from scenarios.figures.drawnas import DrawnAs
 
 __all__ = [
     "assumed",
     "conditions",
+    "course",
     "engine_digest",
     "engine_file",
     "get",
@@ -125,8 +127,6 @@ def run(
         ScenarioError, ParameterError: a wrong description; OperatingPointError, SimulationError :
             the unit cannot run so; DataError : ``out`` cannot be written.
     """
-    from apu_casadi.unit.departures import name_phases
-
     s = scenario if isinstance(scenario, Scenario) else get(scenario)
     if overrides:
         s = s.change(**overrides)
@@ -137,6 +137,25 @@ def run(
     except ValidityError as error:
         inside = [p["name"] for p in s.phase_table() if p["start"] < error.t + 1e-9]
         raise ValidityError(f"in phase {inside[-1]!r}: {error.words}", error.t) from None
+    _tell(s, ds)
+    if out is not None:
+        write(ds, out)
+    return ds
+
+
+def course(s: Scenario, *, solver: str = "auto") -> Course[xr.Dataset]:
+    """Do what :func:`run` does as a member of an ensemble: pause where others are waited for."""
+    from apu_casadi.unit.ensemble import course_of
+
+    ds = yield from course_of({**joint_arguments(s), "solver": solver})
+    _tell(s, ds)
+    return ds
+
+
+def _tell(s: Scenario, ds: xr.Dataset) -> None:
+    """Let a dataset tell the scenario that made it."""
+    from apu_casadi.unit.departures import name_phases
+
     ds.attrs |= {"title": s.title or s.name, "scenario": s.to_json()}
     ds.attrs["phases"] = json.dumps(s.phase_table(), ensure_ascii=False)
     name_phases(ds)
@@ -144,9 +163,6 @@ def run(
         ds.attrs["implausible"] = json.dumps(strange, ensure_ascii=False)
     if s.engine:
         ds.attrs["assumed"] = json.dumps(assumed(s), ensure_ascii=False)
-    if out is not None:
-        write(ds, out)
-    return ds
 
 
 def unit_for(s: Scenario) -> Apu:

@@ -17,6 +17,8 @@ import pytest
 os.environ.setdefault("APU_OPTIMISE", "1")
 # small matrices: threads of the linear algebra only take the cores from other workers
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# files tell when they were made; here all at one instant
+os.environ.setdefault("SOURCE_DATE_EPOCH", "1700000000")
 PARTS = Path(__file__).with_name("extension_parts.py")
 GIVEN = os.environ.get("APU_BACKEND")
 

@@ -11,7 +11,7 @@ from apu_casadi.core.signals import Signals
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.terminals import OUTPUTS
 from estimators.apu import believable
-from estimators.apu.believable import KINDS, LEVEL, Doubt, standing_still
+from estimators.apu.believable import KINDS, LEVEL, machine_causes, standing_still
 from estimators.apu.diagnosis import diagnoses
 from estimators.apu.electrical import residuals
 from estimators.apu.electrical.causes import PRIOR, Causes, probabilities
@@ -21,6 +21,7 @@ from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.wild import wild_samples
 from estimators.apu.sensorfailures import failure
 from estimators.apu.sensors import ELECTRICAL
+from estimators.apu.trust import Doubt, about, believed, in_words, is_lost, part_of, verdict
 from estimators.filters.filtering import FilterResult
 from estimators.information.innovationtests import findings, least
 
@@ -215,6 +216,70 @@ def test_a_doubt_is_its_sentence_and_its_kind():
     d = Doubt("sensor", "T5 stands still").of("machine 1")
     again = pickle.loads(pickle.dumps(d))
     assert d == again == "machine 1, T5 stands still" and again.kind == d.kind == "sensor"
+    assert again.part == d.part == "machine 1"
+
+
+# ------------------------------------------------------------------------------ part by part
+
+
+def believed_of(*doubts, machines=(1, 2), gas=True, **more):
+    told = believed(doubts, gas=gas, machines=machines, **more)
+    return [n for n, why in told.items() if not why]
+
+
+def test_parts_are_believed_or_not_for_what_is_said_of_them():
+    ALL = [
+        "gas path",
+        *(f"machine {k}{h}" for k in (1, 2) for h in ("", ": h_a", ": h_b", ": h_c")),
+    ]
+    assert believed_of() == ALL
+    assert believed_of("anything") == believed_of(Doubt("time", "anything")) == []
+    (gas,) = about([Doubt("mean", "T5")], "gas path")
+    assert believed_of(gas) == ALL[1:]
+    both = Doubt("sensor", "w_r", part_of("w_r", ["w_r", "i_a_2"]))
+    assert both.part == "machine" and believed_of(both) == ["gas path"]
+    assert part_of("i_a_2", ["i_a_2"]) == "machine 2" and part_of("T5", ["w_r"]) == "gas path"
+    # one severity, and so the machine of which it is, but not the others
+    h = Doubt("linearisation", "h_a is large", "h_a").of("machine 2")
+    assert believed_of(h) == [n for n in ALL if n not in ("machine 2", "machine 2: h_a")]
+    # the power that the gas path has from it
+    assert "gas path" not in believed_of(h, power_of=[1, 2])
+    told = believed([h], gas=True, machines=[1, 2], power_of=[1, 2])
+    assert told["gas path"] == ("its shaft power is that of machine 2, which is doubted",)
+    words = in_words(verdict(told))
+    assert words == (
+        "; doubted: gas path, machine 2, machine 2: h_a"
+        "; believed: machine 1, machine 2: h_b, machine 2: h_c"
+    )
+    assert in_words(verdict(believed([gas], gas=True, machines=[1]))) == (
+        "; doubted: gas path; believed: machine 1"
+    )
+    gone = believable.lost(ValueError("20 resets")).of("machine 1")
+    assert is_lost([gone], 1) and not is_lost([gone], 2) and gone.kind in KINDS
+    assert [n for n in ALL if n.startswith("machine 1")] == [
+        n for n in ALL if n not in believed_of(gone)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("best", "kind"),
+    [
+        ("sensor i_a", "sensor"),
+        ("harmonics", "sensor"),
+        ("healthy", None),
+        ("short circuit b", None),
+    ],
+)
+def test_a_change_that_no_filter_knows_is_doubted_though_nothing_was_reported(
+    monkeypatch, best, kind
+):
+    """A filter that began anew since a current failed goes on with that current."""
+    found = Causes(0.5, {best: 0.9, "hot winding": 0.1})
+    monkeypatch.setattr(believable, "causes_of_change", lambda *_: found)
+    zero = np.zeros(51)
+    side = SimpleNamespace(t=0.02 * np.arange(51), phase=zero, resets=(0.5,))
+    ((told, doubt),) = machine_causes(side, None, ELECTRICAL, {})
+    assert told is found and (doubt.kind if doubt else None) == (kind or None)
 
 
 # ------------------------------------------------------------------------------ one answer

@@ -449,3 +449,25 @@ def test_the_command(base, tmp_path, monkeypatch, capsys):
     assert main([*argv, str(tmp_path / "out")]) == 0
     assert "2 runs in" in capsys.readouterr().out
     assert (tmp_path / "out" / campaigns.DATASET).exists()
+
+
+def test_many_runs_are_one_ensemble_with_the_same_records(base, tmp_path, monkeypatch):
+    """Done, refused and crashed ones; what is done is not done again."""
+    runs = [*random_faults(2, base=base), refused(base)]
+    single = run_campaign(runs, workers=1)
+    monkeypatch.setattr(campaigns, "FEW", 1)
+    monkeypatch.setattr(campaigns, "_run_one", None)
+    right, ran = registry.course, []
+
+    def counted(s, **how):
+        ran.append(s.name)
+        if len(ran) == 2:
+            raise ZeroDivisionError("never mind")
+        return right(s, **how)
+
+    monkeypatch.setattr(registry, "course", counted)
+    ds = run_campaign(runs, workers=1, out=tmp_path)
+    assert counts(ds) == {"done": 1, "refused": 1, "failed": 0, "invalid": 0, "crashed": 1}
+    assert str(ds["reason"].values[1]) == "ZeroDivisionError: never mind"
+    assert same(run_campaign(runs, workers=1, out=tmp_path), single)
+    assert ran[3:] == [runs[1].name]

@@ -5,6 +5,8 @@ import struct
 import pytest
 
 from apu_casadi.core.errors import ParameterError
+from scenarios import cli, commands
+from scenarios.commands import given
 from scenarios.figures import figstyle as fs
 from scenarios.figures.drawnas import DrawnAs, grey
 
@@ -60,3 +62,44 @@ def test_formats_and_resolution(tmp_path):
 def test_what_cannot_be_drawn_is_told_before(given, words):
     with pytest.raises(ParameterError, match=words):
         DrawnAs(**given)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run",
+        "linearise",
+        "maps",
+        "tune",
+        "identify",
+        "fit",
+        "multirate",
+        "validate",
+        "estimate:joint",
+        "estimate:data",
+    ],
+)
+def test_every_command_that_draws_has_the_options(command):
+    """Declared once: ``--dpi`` and ``--style``, and formats where no FILE tells one."""
+    name, _, action = command.partition(":")
+    needed = {"run": ["joint"], "fit": ["a.csv"], "tune": ["a.csv"], "estimate:data": ["a.csv"]}
+    words = [name, *([action] if action else []), *needed.get(command, [])]
+    args = commands.parser().parse_args([*words, "--style", "grey", "--dpi", "90"])
+    assert given.look(args) == DrawnAs(dpi=90, style="grey")
+    if name not in ("identify", "fit", "validate"):
+        args = commands.parser().parse_args([*words, "--style", "grey", "--figures=svg,pdf"])
+        assert given.formatted(args) == DrawnAs(("svg", "pdf"), style="grey")
+
+
+def test_the_switch_of_figures_still_works():
+    parse = commands.parser().parse_args
+    assert given.drawn(parse(["estimate", "joint", "--figures"])) == DrawnAs()
+    assert given.drawn(parse(["estimate", "joint"])) == DrawnAs()
+    assert given.drawn(parse(["estimate", "joint", "--no-figures"])) is None
+
+
+def test_linearise_writes_what_was_asked_for(tmp_path, capsys):
+    how = ["--figures", "svg", "--style", "grey", "--out", str(tmp_path)]
+    assert cli.main(["linearise", "--model", "gas", *how]) == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["eigenvalues.svg"]
+    assert "eigenvalues.svg" in capsys.readouterr().out

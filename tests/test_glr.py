@@ -3,6 +3,7 @@
 The test is that of Willsky and Jones (1976), IEEE Trans. Automatic Control 21, 108-112.
 """
 
+import dataclasses
 import json
 import math
 
@@ -43,6 +44,36 @@ def _data(K=60, seed=0):
 
 def _filter(y):
     return linear_filter(y, A=A, H=H, Q=Q, R=R, P0=np.eye(2), cross=M, **JUMPS)
+
+
+def test_ramps_and_the_size_that_innovations_tell():
+    """Against filters run with and without the ramp; the size of one is found, to the noise."""
+    y, size = _data(), 1.7
+    f, t = _filter(y), np.arange(60.0)
+    ramp = f.ramps(t)
+    for c in range(3):
+        a, extra = np.zeros(2), np.zeros_like(y)
+        for k in range(60):
+            share = t[k] / t[-1]
+            extra[k] = H @ a + size * share * JUMPS["output"][:, c]
+            step = (k < 59) / t[-1]
+            a = A @ a + size * (step * JUMPS["state"][:, c] + share * JUMPS["drift"][:, c])
+        moved = _filter(y + extra).innovation - f.innovation
+        assert_allclose(moved, size * ramp.signature(0)[:, :, c], atol=1e-12)
+        told = dataclasses.replace(ramp, innovation=moved).evidence()
+        assert told[0][c] == pytest.approx(size)
+    drawn = np.array([ramp_of(k).evidence() for k in range(200)])
+    assert_allclose(np.std(drawn[:, 0] / drawn[:, 1], axis=0), 1.0, atol=0.15)
+    none = ramp.evidence(np.zeros(60, bool))
+    assert not none[0].any() and np.isinf(none[1]).all()
+
+
+def ramp_of(seed):
+    """Ramps in a filter whose innovations are as it claims."""
+    f = _filter(np.ones((60, 2)))
+    L = np.linalg.cholesky(f.S)
+    white = np.random.default_rng(seed).standard_normal((60, 2, 1))
+    return dataclasses.replace(f, innovation=(L @ white)[:, :, 0]).ramps(np.arange(60.0))
 
 
 def test_signatures_are_what_a_jump_adds_to_the_innovations():

@@ -15,7 +15,8 @@ from estimators.apu.electrical.hypotheses import (
     SeverityPrior,
     loose_in_common,
 )
-from estimators.apu.unknowns import COPPER, Knowledge, filter_unknowns
+from estimators.apu.unknowns import COPPER, UNKNOWNS, Knowledge, filter_unknowns
+from estimators.information.posterior import named_posterior, posterior
 
 TRUE_P, SLOPE = 200e3, 2e7
 
@@ -115,6 +116,11 @@ def test_one_faulty_phase_leaves_no_misfit_and_two_do():
 
 def test_what_is_known_of_parameters():
     assert Knowledge.temperature(20.0).sigma == pytest.approx(20 * COPPER)
+    # a stator at the limit of its class, known as at 20 C, is within four deviations
+    stator = UNKNOWNS["machine.r_s"]
+    assert stator.how == "considered"
+    assert stator.sigma == pytest.approx(COPPER * 160 / np.sqrt(12))
+    assert 4 * stator.sigma > 160 * COPPER
     of = filter_unknowns({"machine.L_md": Knowledge("considered", 0.05), "J": Knowledge("known")})
     assert of["machine.L_md"][0].consider and of["machine.L_md"][1] == 0.05 and len(of) == 1
 
@@ -150,3 +156,12 @@ def test_what_severities_have_in_common_counts_for_little():
     before, after = (Hypotheses.of(m[None], of) for m in (mean, mean - 1e-4 * g))
     tight = [Hypotheses.of(m[None], C[None]).misfit[0] for m in (mean, mean - 1e-4 * g)]
     assert abs(after.misfit[0] - before.misfit[0]) < 0.3 * abs(tight[1] - tight[0])
+
+
+def test_probabilities_of_hypotheses_from_logarithms():
+    """Of any size, also where nothing but one is possible."""
+    log = np.log([0.1, 0.7, 0.2])
+    assert_allclose(posterior(log - 1e6), [0.1, 0.7, 0.2], rtol=1e-9)
+    assert_allclose(posterior(np.array([[0.0, -np.inf], [0.0, 5.0]])), [[0.5, 0.0], [0.5, 1.0]])
+    found = named_posterior({"a": float(np.log(3.0)), "b": 0.0, "c": np.nan, "d": -np.inf})
+    assert found == pytest.approx({"a": 0.75, "b": 0.25, "c": 0.0, "d": 0.0})

@@ -217,6 +217,9 @@ def test_which_machine_is_found():
     assert list(e["faulty_phase_1"].values) == [0] * 6
     assert list(e["faulty_phase_2"].values) == [0, 0, 0, 2, 2, 2]
     assert e["ttsc_probability_1"].values[-1] < 0.1 < 0.99 < e["ttsc_probability_2"].values[-1]
+    of = json.loads(e.attrs["compared"])["machines"]
+    assert of["1"]["probability"] < 0.05 < 0.98 < of["2"]["probability"]
+    assert of["2"]["likeliest_phase"] == "b"
     assert e.attrs["alarms"] == "[]"
     for n, true in (("h_b_2", H), ("h_b_1", 0.0), ("P_total", e["P_total_true"].values[-1])):
         assert abs(e[n].values[-1] - true) < 4 * e[f"{n}_sigma"].values[-1]

@@ -14,6 +14,7 @@ from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange, LoadChange
+from estimators.apu.trust import believed
 from scenarios.commands import estimate as command
 from scenarios.studies import catalogue
 from scenarios.studies.mismatch import pipeline
@@ -140,6 +141,7 @@ def test_counting(monkeypatch):
             raise ApuError("no")
         made[seed].doubts = ("N: odd",) if seed == 1 else ()
         made[seed].believable = not made[seed].doubts
+        made[seed].belief = believed(made[seed].doubts, gas=True, machines=[1])
         return made[seed]
 
     monkeypatch.setattr(

@@ -12,10 +12,10 @@ from scenarios.cli import main
 from scenarios.studies import multirate_study as study
 
 
-def rows():
+def rows(cases=tuple(study.CASES)):
     """Errors that fall with the first power of the step, or with the second."""
     made = []
-    for case in study.CASES:
+    for case in cases:
         made.append(study.Measured(case, "one model", math.nan, *[1e-8] * 4, cpu=10.0))
         for ex, p in (("paper", 1), ("predicted", 2), ("corrected", 2)):
             made += [study.Measured(case, ex, dt, *[dt**p] * 4, cpu=1.0) for dt in study.STEPS]
@@ -94,13 +94,17 @@ def test_events_of_one_machine_are_chosen_and_leave_the_text_alone(tmp_path, mon
 
 
 def test_figure_has_a_panel_for_each_quantity():
-    """Four logarithmic panels, every exchange in the legend; one step alone is refused."""
+    """Four logarithmic panels, every case and exchange in a legend; one step alone is refused."""
     fig = study.figure(rows())
     assert [ax.get_title() or ax.texts[0].get_text() for ax in fig.axes] == [
         "Speed, of its excursion", "Power", "Voltage", "Energy",
     ]  # fmt: skip
     words = [t.get_text() for t in fig.legends[0].get_texts()]
     assert len(words) == len(study.CASES) + len(study.COMPARED)
+    every = study.figure(rows(study.CHOSEN["all"]))
+    assert [len(x.get_texts()) for x in every.legends] == [5, len(study.COMPARED)]
+    looks = [(line.get_color(), line.get_marker()) for line in every.legends[0].get_lines()]
+    assert len(set(looks)) == 5
     with pytest.raises(ScenarioError, match="two exchange steps"):
         study.figure([r for r in rows() if r.dt == 0.02])
 

@@ -93,12 +93,12 @@ def test_the_phases_that_matter_are_enlarged():
     assert set(chosen.largest(quiet.drop_vars("k_rf"), rows, list(rms), 3)) == {1, 2, 3}
 
 
-def test_only_the_papers_scenario_has_the_papers_numbers(ds):
-    own = ds.copy()
-    own.attrs = {**ds.attrs, "scenario": json.dumps({"name": "mine"})}
-    captions = [[t.get_text() for t in plotting.figure_21(x).texts][-1] for x in (ds, own)]
+def test_only_the_papers_scenario_and_unit_have_the_papers_numbers(ds):
+    scenarios = {"name": "mine"}, {"name": "joint", "engine": "tpe331"}
+    others = [ds.assign_attrs(scenario=json.dumps(s)) for s in scenarios]
+    captions = [[t.get_text() for t in plotting.figure_21(x).texts][-1] for x in (ds, *others)]
     assert captions[0].startswith("Figure 21. Shaft speed")
-    assert captions[1].startswith("Shaft speed")
+    assert [c.startswith("Shaft speed") for c in captions[1:]] == [True, True]
 
 
 def test_tick_labels_of_a_long_run_do_not_touch():

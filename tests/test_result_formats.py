@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from apu_casadi.core import resultformats, results
+from apu_casadi.core import cf, resultformats, results
 from apu_casadi.core.errors import DataError, ParameterError
 from estimators.apu.recordings.measured import read_recording
 from scenarios import cli, registry
@@ -50,7 +50,7 @@ def test_netcdf4_is_small_and_says_its_precision(ds, tmp_path):
     pytest.importorskip("h5netcdf")
     (path,) = resultformats.save_as(ds, tmp_path / "r", "nc4")
     back = results.load(path)
-    assert back.attrs == {**ds.attrs, "precision": resultformats.PRECISION}
+    assert back.attrs == {**cf.described(ds).attrs, "precision": resultformats.PRECISION}
     assert_array_equal(back["T4"], ds["T4"])
     assert_array_equal(back["time_w"], ds["time_w"])
     assert_array_equal(back["v_a"], ds["v_a"].values.astype(np.float32))

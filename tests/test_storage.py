@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 from apu_casadi import Apu, FaultChange, HealthChange, SeriesLoad, Ttsc, simulate_joint
-from apu_casadi.core import netcdf3, results, runstorage
+from apu_casadi.core import cf, netcdf3, results, runstorage
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.filearrays import File, RowFile, lazy
 from apu_casadi.machine.measurement import MeasurementNoise
@@ -51,7 +51,9 @@ def test_a_file_written_in_pieces_is_what_xarray_writes(ds, tmp_path):
     """xarray's own writer, which builds the whole file in memory, is the reference."""
     path = results.save(ds, tmp_path / "ours.nc")
     with xr.open_dataset(
-        io.BytesIO(bytes(ds.to_netcdf(engine="scipy"))), engine="scipy", decode_times=False
+        io.BytesIO(bytes(cf.described(ds).to_netcdf(engine="scipy"))),
+        engine="scipy",
+        decode_times=False,
     ) as f:
         reference = f.load()
     with xr.open_dataset(path, engine="scipy", decode_times=False) as f:

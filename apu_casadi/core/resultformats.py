@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import files
+from apu_casadi.core import cf, files
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.results import GENERATOR, generators_of, of_generator, save
 
@@ -71,8 +71,9 @@ def _netcdf4(ds: xr.Dataset, path: Path) -> list[Path]:
     encoding: dict[Any, dict[str, Any]] = {
         n: packed | ({"dtype": "float32"} if WAVEFORMS in v.dims else {}) for n, v in ds.items()
     }
-    encoding |= {n: {"_FillValue": None} for n in ds.coords}  # CF: none of a coordinate
-    told = ds.assign_attrs(precision=PRECISION) if WAVEFORMS in ds.dims else ds
+    told = cf.described(ds)
+    if WAVEFORMS in ds.dims:
+        told.attrs["precision"] = PRECISION
     with files.whole(target) as part:
         try:
             told.to_netcdf(part, engine="h5netcdf", encoding=encoding)
@@ -87,6 +88,7 @@ def _mat(ds: xr.Dataset, path: Path) -> list[Path]:
     from scipy.io import savemat
 
     target = path.with_name(path.name + ".mat")
+    ds = cf.described(ds)
     values: dict[str, Any] = {str(n): np.asarray(v.values) for n, v in ds.variables.items()}
     values["units"] = {str(n): v.attrs.get("units", "1") for n, v in ds.variables.items()}
     values["about"] = {str(k): v for k, v in ds.attrs.items()}

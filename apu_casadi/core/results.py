@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core import files, netcdf3, netcdf4, tablefiles
+from apu_casadi.core import cf, files, netcdf3, netcdf4, tablefiles
 from apu_casadi.core.errors import DataError, SignalError, nearest
 from apu_casadi.core.filearrays import is_lazy
 
@@ -192,7 +192,7 @@ def of_generator(ds: xr.Dataset, number: int = 1) -> xr.Dataset:
 
 
 def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
-    """Write a dataset as netCDF 3 and return the path; attributes survive.
+    """Write a dataset as netCDF 3 and return the path; attributes survive, those of CF join them.
 
     The file is written under a temporary name beside ``path`` and renamed when it is complete: an
     interrupted write never leaves a damaged file under the final name.  Long variables are written
@@ -203,7 +203,7 @@ def save(ds: xr.Dataset, path: str | os.PathLike[str]) -> Path:
     """
     path = Path(path)
     with files.whole(path) as target, target.open("wb") as f:
-        netcdf3.write(ds, f)
+        netcdf3.write(cf.described(ds), f)
     return path
 
 

@@ -23,9 +23,10 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import compiled
-from apu_casadi.core.calling import Caller
+from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.calling import Caller, Mapped
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.lanes.lanelibrary import batch
 from apu_casadi.core.sharing import keep, kept, once
 from apu_casadi.machine.generatormodel import GeneratorModel
 
@@ -34,11 +35,14 @@ STAGES = 8  # of the Radau method that P is made by; even where stiff its error 
 FEW = (
     4  # stages where more than two steps are needed, for a stiff branch's sake: as good, and cheap
 )
+IN_A_ROW = 4  # steps of few stages that are one function; their number is a multiple of it
 STEP_TOL = 5e-7  # largest change of P, nominal units, when its steps are halved; then used: 2e-9
 HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goes on is refused
 EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
 NODES = 4  # Chebyshev nodes in speed
+COMPILE_FROM = 2000  # transition matrices; of so many there may be many more
+FEWEST = 8  # of them at once: trials are of few angles
 TABLES = (
     256  # kept for a model; a load or a fault that changes in time takes some ten in an interval
 )
@@ -93,8 +97,100 @@ def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
     return c, (c[:, None] ** (k + 1) / (k + 1)) @ np.linalg.inv(c[:, None] ** k)
 
 
+class _Leaps:
+    """Steps of the Radau method for many rotor angles at once, of one model structure.
+
+    They are evaluated as they are until that has taken about as long as a compiler would.
+    """
+
+    def __init__(self, ss: GeneratorModel, stages: int) -> None:
+        self.steps = IN_A_ROW if stages == FEW else 1
+        self._function = _radau_function(ss, stages)
+        if self.steps > 1:
+            self._function = _in_a_row(self._function, self.steps)
+        self._asked, self._compiled = 0, False
+        self._calls = self._batches(build=False)
+
+    def __call__(self, *columns: np.ndarray) -> np.ndarray:
+        """Return the matrices after ``steps``, one in each column; see :func:`_radau_function`."""
+        size = columns[0].shape[1]
+        self._asked += size * self.steps
+        if not self._compiled and self._asked > COMPILE_FROM:
+            self._calls, self._compiled = self._batches(build=True), True
+        made: np.ndarray = self._calls[size > FEWEST](*columns)[0]
+        return made
+
+    def _batches(self, *, build: bool) -> list[Mapped]:
+        how: dict[str, Any] = {"common": (5, 6), "build": build}
+        return [batch(self._function, 1, chunk=c, **how) for c in (FEWEST, 8 * FEWEST)]
+
+
+@kept
+def _leaps(ss: GeneratorModel, stages: int, _in_use: str) -> _Leaps:
+    return _Leaps(ss, stages)
+
+
+@kept
+def _radau_function(ss: GeneratorModel, stages: int) -> ca.Function:
+    """Function (theta_0, w_r, h, t, X, u, theta) -> X after a step of h that begins at t.
+
+    X is a transition matrix from theta_0 and t = 0 on, in nominal units, column by column.  The
+    stages X_i = X + h sum_j a_ij (M_j X_j + F_j) are eliminated one after the other, by blocks of
+    the windings' size; the last one is the result.
+    """
+    n, (c, a), iw = len(ss.linear), _radau(stages), ss.u.index("w_r")
+    sizes = {"theta_0": 1, "w": 1, "t": 1, "u": len(ss.u), "theta": len(ss.theta)}
+    angle, w, t, u, th = given = [ca.SX.sym(k, size) for k, size in sizes.items()]
+    u_now = ca.SX(u)
+    u_now[iw] = w
+    M = coefficients(ss)(angle + w * t, u_now, th) * _scale(ss)
+    drive = ca.SX.zeros(EXTRA, EXTRA)  # E from its derivatives; and one
+    drive[0, :-1] = ca.horzcat(*(t**i / math.factorial(i) for i in range(EXTRA - 1)))
+    drive[-1, -1] = 1
+    parts = [ca.densify(M[:n, :n]), ca.densify(M[:n, n:] @ drive)]
+    node = ca.Function("node", given, parts, {"cse": True})
+    inverse = _inverse(n)
+
+    sizes = {"theta_0": 1, "w": 1, "h": 1, "t": 1, "X": n * (n + EXTRA)}
+    sizes |= {"u": len(ss.u), "theta": len(ss.theta)}
+    angle, w, h, t, X, u, th = given = [ca.MX.sym(k, size) for k, size in sizes.items()]
+    each = [node(angle, w, t + h * float(at), u, th) for at in c]
+    M, F = ca.horzcat(*(M for M, _ in each)) * h, ca.horzcat(*(ca.vec(F) for _, F in each))
+    forced = ca.mtimes(F, ca.DM(a.T)) * h
+    before = ca.reshape(X, n, n + EXTRA)
+    rows = []
+    for i in range(stages):
+        weights, one = np.tile(np.repeat(a[i], n), (n, 1)), np.eye(n, stages * n, i * n)
+        driven = before[:, n:] + ca.reshape(forced[:, i], n, EXTRA)
+        rows.append(ca.horzcat(ca.DM(one) - ca.DM(weights) * M, before[:, :n], driven))
+    row = rows[0]
+    for k in range(stages):
+        row = ca.mtimes(inverse(rows[k][:, :n]), rows[k][:, n:])
+        for i in range(k + 1, stages):
+            rows[i] = rows[i][:, n:] - ca.mtimes(rows[i][:, :n], row)
+    return ca.Function(f"radau_{stages}_{ss.name}", given, [ca.vec(row)])
+
+
+def _in_a_row(step: ca.Function, steps: int) -> ca.Function:
+    """Return steps of :func:`_radau_function` as one function."""
+    angle, w, h, t, X, *fixed = given = step.mx_in()
+    for k in range(steps):
+        X = step(angle, w, h, t + k * h, X, *fixed)
+    return ca.Function(f"{step.name()}_x{steps}", given, [X])
+
+
+@once
+def _inverse(n: int) -> ca.Function:
+    """Inverse of a matrix with a dominant diagonal; its rows may be of any magnitude."""
+    A = ca.SX.sym("A", n, n)
+    d = ca.diag(A)
+    by_rows = ca.solve(A / ca.repmat(d, 1, n), ca.SX.eye(n)) / ca.repmat(d.T, n, 1)
+    return ca.Function("inverse", [A], [ca.densify(by_rows)], {"cse": True})
+
+
 def _transition(
-    M_of: Any,
+    ss: GeneratorModel,
+    given: tuple[np.ndarray, np.ndarray],
     theta0: np.ndarray,
     w: np.ndarray,
     h: np.ndarray,
@@ -104,36 +200,31 @@ def _transition(
 ) -> list[np.ndarray]:
     """Transition matrices over h, 2 h, ... from angles theta0 at speeds w, by Radau collocation.
 
-    All three arrays have the shape (angles,).  There are ``steps`` of the method in h, of order
-    2 stages - 1 (Hairer, Wanner, Solving ODEs II, section IV.5).  It is L-stable: a fault branch
-    that settles within nanoseconds, or an open generator, needs no smaller steps.
+    The last three arrays have the shape (angles,); ``given`` are u and theta.  There are ``steps``
+    of the method in h, of order 2 stages - 1 (Hairer, Wanner, Solving ODEs II, section IV.5).  It
+    is L-stable: a fault branch that settles within nanoseconds, or an open generator, needs no
+    smaller steps.
 
     Returns:
         One array for each leap, shape (angles, n, n + EXTRA): the rows of the windings.
     """
-    c, _ = _radau(stages)
-    hs, out = h / steps, []
-    X = np.empty(0)
-    for k in range(leaps * steps):
-        t = hs[:, None] * (k + c)
-        angles = theta0[:, None] + w[:, None] * t
-        M = M_of(angles.ravel(), np.repeat(w, stages))
-        M = M.reshape(theta0.size, stages, *M.shape[1:])
-        X = _radau_step(M, t, hs, X if k else None)
-        if (k + 1) % steps == 0:
-            out.append(X)
+    u, theta = given
+    n, hs, out = len(ss.linear), h / steps, []
+    step, full = _leaps(ss.shared, stages, backend_in_use()), ss.full(theta)
+    X = np.repeat(np.eye(n, n + EXTRA).ravel(order="F")[:, None], theta0.size, axis=1)
+    for k in range(0, leaps * steps, step.steps):
+        X = step(theta0[None], w[None], hs[None], (k * hs)[None], X, u, full)
+        if (k + step.steps) % steps == 0:
+            out.append(X.T.reshape(-1, n + EXTRA, n).transpose(0, 2, 1))
     return out
 
 
-def _radau_step(
-    M: np.ndarray, t: np.ndarray, hs: np.ndarray, X: np.ndarray | None = None
-) -> np.ndarray:
-    """Advance transition matrices by one step of the Radau method.
+def _radau_step(M: np.ndarray, t: np.ndarray, hs: np.ndarray) -> np.ndarray:
+    """Return transition matrices over the first step of the Radau method.
 
     Args:
         M: coefficients at the nodes, shape (angles, stages, n + EXTRA, n + EXTRA).
         t, hs: instants of the nodes, (angles, stages), and length of the step, (angles,), s.
-        X: matrices before it, (angles, n, n + EXTRA); None at the start.
     """
     N, stages, n = hs.size, M.shape[1], M.shape[2] - EXTRA
     _, a = _radau(stages)
@@ -141,8 +232,7 @@ def _radau_step(
     drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
     drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
     drive[..., -1, -1] = 1.0
-    if X is None:
-        X = np.broadcast_to(np.eye(n, n + EXTRA), (N, n, n + EXTRA))
+    X = np.broadcast_to(np.eye(n, n + EXTRA), (N, n, n + EXTRA))
     by_h = hs[:, None, None]
     G = -a[None, :, None, :, None] * M[:, None, :, :, :n].transpose(0, 1, 3, 2, 4)
     G = by_h * G.reshape(N, stages * n, stages * n) + np.eye(stages * n)
@@ -344,7 +434,9 @@ def transition_table(
             slow = [int(nodes.argmin())]
             return np.asarray(_constant_transition(M[slow], length(nodes)[slow], steps)[0])
         slowest = np.full(_PROBE.size, nodes.min())
-        return _transition(M_of, _PROBE, slowest, length(slowest), steps, stages=stages)[0]
+        return _transition(ss, (u, theta), _PROBE, slowest, length(slowest), steps, stages=stages)[
+            0
+        ]
 
     steps, stages, error = _enough(
         trial, f"{ss.name}: transition matrices over {length(nodes).max():.3g} s"
@@ -356,7 +448,7 @@ def transition_table(
         if constant:
             P = _constant_transition(M, length(nodes), steps, leaps).swapaxes(0, 1)
         else:
-            P = np.stack(_transition(M_of, a, w, length(w), steps, leaps, stages), axis=1)
+            P = np.stack(_transition(ss, (u, theta), a, w, length(w), steps, leaps, stages), axis=1)
         return P.transpose(0, 1, 3, 2).reshape(NODES, angles.size, -1)
 
     units = np.tile((1 / _scale(ss)[:n]).T.ravel(), leaps)

@@ -17,14 +17,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
-from apu_casadi.core.lanes.together import CHUNK, ensemble
+from apu_casadi.core.lanes.together import CHUNK, Course, ensemble
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.multirate import joint_course, simulate_joint
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["simulate_ensemble"]
+__all__ = ["course_of", "simulate_ensemble"]
 
 _DEFAULTS = {n: p.default for n, p in inspect.signature(simulate_joint).parameters.items()}
 
@@ -76,6 +76,18 @@ def simulate_ensemble(
         if progress is not None:
             progress(done, len(asked))
     return results
+
+
+def course_of(given: Mapping[str, Any]) -> Course[xr.Dataset]:
+    """Return the course of one run, for :func:`apu_casadi.core.lanes.together.ensemble`.
+
+    Args:
+        given: arguments of :func:`~apu_casadi.unit.multirate.simulate_joint` by name.
+
+    Raises:
+        ScenarioError: an argument that is not known or missing.
+    """
+    return joint_course(**_asked(0, given))
 
 
 def _asked(k: int, given: Mapping[str, Any]) -> dict[str, Any]:

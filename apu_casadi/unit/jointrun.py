@@ -182,8 +182,10 @@ class JointRun:
             free = int(np.searchsorted(grid, until + SAME_INSTANT, side="right")) - 1
             free = min(free, int(self._odd[np.searchsorted(self._odd, k)])) - k
             waves = self.settings.waveform_dt is not None
-            most = BLOCK if waves or self.asked.strict or asking() else LONG
-            sizes = dict.fromkeys((min(free, most) // BLOCK * BLOCK, BLOCK))
+            together = asking()  # a question then, which nothing may come before
+            most = BLOCK if waves or self.asked.strict or (together and self._changing) else LONG
+            first = min(free, most) // BLOCK * BLOCK
+            sizes = [first] if together else dict.fromkeys((first, BLOCK))
             ways[:0] = [partial(self._blocks, steps=n) for n in sizes if 0 < n <= free]
         return first_able(ways, k)
 

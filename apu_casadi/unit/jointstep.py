@@ -22,7 +22,7 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.lanes.together import Together
+from apu_casadi.core.lanes.together import Together, asking
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
@@ -179,6 +179,7 @@ class JointBlock(Rebuilt):
         n_x = [len(m.ss.x) for m in machines]
         self._n_gov, self._n_x = len(apu.governor.X), n_x
         self._sampled = [m.advance.n_out() == 4 for m in machines]
+        self._likely = LONG // BLOCK  # blocks in a row that an ensemble is asked for
         self._call = _caller(apu.gas_generator.family, links[0], self.machines, wide)
 
     def __call__(
@@ -199,7 +200,29 @@ class JointBlock(Rebuilt):
         """
         full = self.apu.gas_generator.full(theta)
         held = [a for own, fixed in zip(u_sg, self._fixed, strict=True) for a in (own, *fixed)]
+        if asking():
+            carry = np.concatenate([N, z, governor, *x_sg])
+            return self._row(min(blocks, self._likely), carry, [u, full, *held])
         return self.followed(N, z, governor, x_sg, repeat([u, full, *held], blocks))
+
+    def _row(self, blocks: int, carry: np.ndarray, held: Sequence[Any]) -> BlockResult:
+        """Advance by a row of blocks, one question to the ensemble, up to the first not right."""
+        last, *out = self._call.in_a_row(blocks, carry, *held)
+
+        def part(first: int, end: int) -> list[np.ndarray]:
+            """Outputs of some blocks, which have one column a step, or one a sample."""
+            widths = (a.shape[1] // blocks for a in out)
+            return [a[:, first * n : end * n] for a, n in zip(out, widths, strict=True)]
+
+        right, wrong = blocks, self._wrong(last, *out)
+        if wrong:
+            each = (self._wrong(last[:, i], *part(i, i + 1)) for i in range(blocks))
+            right, wrong = next(((i, w) for i, w in enumerate(each) if w), (blocks, ""))
+        # a row of which nothing can be taken costs as much as one that is right
+        self._likely = 1 if wrong else 2 * self._likely
+        if not right:
+            raise NotApplicable(wrong)
+        return self._parted(last[:, right - 1].copy(), part(0, right))
 
     def followed(
         self,
@@ -231,10 +254,14 @@ class JointBlock(Rebuilt):
                 break
             carry = last.copy()
             made.append(tuple([a.copy() for a in out]) if made else tuple(out))
-        y, _, *rest = (
-            c[0] if len(c) == 1 else np.concatenate(c, axis=1) for c in zip(*made, strict=True)
-        )
-        ends = np.cumsum([0, N.size, z.size, self._n_gov, *self._n_x]).tolist()
+        out = [c[0] if len(c) == 1 else np.concatenate(c, axis=1) for c in zip(*made, strict=True)]
+        return self._parted(carry, out)
+
+    def _parted(self, carry: np.ndarray, out: Sequence[np.ndarray]) -> BlockResult:
+        """Return the parts of the state at the end of blocks, and of their outputs."""
+        y, _, *rest = out
+        n_z = self.apu.gas_generator.family.step.numel_in(4)
+        ends = np.cumsum([0, 1, n_z, self._n_gov, *self._n_x]).tolist()
         N, z, x_gov, *x1 = (carry[i:j] for i, j in pairwise(ends))
         groups = []
         for x, sampled in zip(x1, self._sampled, strict=True):

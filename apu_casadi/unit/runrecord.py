@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from apu_casadi.core.cf import origin
 from apu_casadi.core.profiles.profile import Profile, Varying, at, later
 from apu_casadi.core.signals import Signal
-from apu_casadi.core.version import installed
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.machine.loads.load import Load
 from apu_casadi.unit.events import (
@@ -68,10 +68,7 @@ def asked(
         "faults": json.dumps([{**_at(t, k), **_fields(f)} for t, f, k in ill]),
         "profiles": json.dumps([g.told() for g in given_profiles(start, events)]),
         "seed": "none" if seed is None else seed,
-        "apu_casadi_version": installed(),
-        "Conventions": "CF-1.11, ACDD-1.3",
-        "source": f"apu-casadi {installed()}, model of an all-electric auxiliary power unit",
-        "history": f"simulated by apu-casadi {installed()}",
+        **origin("simulated"),
     }
 
 

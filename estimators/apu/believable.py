@@ -14,6 +14,7 @@ linearisation  beyond what the filters were tried on
 maps           an operating point off the component maps
 power          of the two sides, or of the short circuit that may be there
 time           rate and order of the samples
+lost           a filter that its model does not fit: there is no estimate
 ============== =================================================================================
 
 The thresholds come from :data:`LEVEL`, the probability that a group of tests doubts an estimate
@@ -29,16 +30,18 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
-from estimators.apu.gascauses import causes_of_alarms
+from estimators.apu.gascauses import causes_of_alarms, jumps_of
 from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
+from estimators.apu.trust import GAS, Doubt, part_of, severity
+from estimators.detection.signatures import linearised
 from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
@@ -53,11 +56,11 @@ if TYPE_CHECKING:
 __all__ = [
     "KINDS",
     "LEVEL",
-    "Doubt",
     "channel_doubts",
     "fit_doubts",
     "gas_causes",
     "gas_doubts",
+    "lost",
     "machine_causes",
     "machine_doubts",
     "standing_still",
@@ -65,7 +68,7 @@ __all__ = [
 
 KINDS = (
     *("innovations", "colour", "wild", "sensor", "prior", "machine"),
-    *("harmonics", "linearisation", "maps", "power", "time"),
+    *("harmonics", "linearisation", "maps", "power", "time", "lost"),
 )
 #: Probability that a group of tests doubts an estimate whose model holds: of a recording the gas
 #: path is one group, and each generator two.
@@ -79,6 +82,7 @@ STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
+FEWEST_INNOVATIONS = 8  # samples in which a drift is looked for
 RECENT = 0.1  # s, before a report, in which a reset is its own
 SETTLED = 0.1  # s after a report, in which its innovations are explained
 SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
@@ -86,25 +90,6 @@ FEWEST_SAMPLES = 100
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
 SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
-
-
-class Doubt(str):
-    """One sentence that speaks against an estimate; ``kind`` is one of ``KINDS``."""
-
-    kind: str
-
-    def __new__(cls, kind: str, text: str) -> Doubt:
-        """Make a sentence of a kind."""
-        made = super().__new__(cls, text)
-        made.kind = kind
-        return made
-
-    def of(self, what: str) -> Doubt:
-        """Return the same of a part: ``"machine 1, ..."``."""
-        return Doubt(self.kind, f"{what}, {self}")
-
-    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
-        return self.kind, str(self)
 
 
 # ------------------------------------------------------------------------------ channels
@@ -126,7 +111,8 @@ def channel_doubts(
         rows = None if n in coarse else standing_still(c.values, others)
         if rows is not None:
             a, b = (c.t[k] for k in rows)
-            yield Doubt("sensor", f"{c.source}: {n} stands still from {a:g} to {b:g} s")
+            text = f"{c.source}: {n} stands still from {a:g} to {b:g} s"
+            yield Doubt("sensor", text, part_of(n, m.electrical))
 
 
 def standing_still(
@@ -238,6 +224,7 @@ def _severity_doubts(side: ElectricalSide) -> Iterator[Doubt]:
         yield Doubt(
             "linearisation",
             f"h_{PHASES[best]} = {h[best, -1]:.2e} is larger than any that the filter was tried on",
+            severity(PHASES[best]),
         )
 
 
@@ -275,7 +262,27 @@ def machine_causes(
         if found is None:
             continue
         what = f"what is reported as a {said} at {t:g} s"
-        yield found, _rather(found, said, what) if said else None
+        yield found, _rather(found, said, what) if said else _unsaid(found)
+
+
+def _unsaid(found: Causes) -> Doubt | None:
+    """The doubt that a change raises which no filter knows, and which is no short circuit."""
+    best = found.best
+    if best.partition(" ")[0] in ("healthy", "short") or found.probability[best] < SURELY:
+        return None
+    return Doubt(
+        "sensor",
+        f"the change at {found.t:g} s is rather: {best} ({100 * found.probability[best]:.0f} %), "
+        "of which the filter knows nothing",
+    )
+
+
+def lost(why: Exception, first: Causes | None = None) -> Doubt:
+    """The doubt about a machine whose filter is lost; ``first``: what its first change is."""
+    text = f"its filter is lost, and nothing is estimated: {why}"
+    if first is not None:
+        text += f"; the first change is {first.best} ({100 * first.probability[first.best]:.0f} %)"
+    return Doubt("lost", text)
 
 
 def _rather(found: Causes, said: str, what: str) -> Doubt | None:
@@ -294,6 +301,7 @@ _GAS = {
     "wild": "its reading at {t:g} s is {v:+.1f} sigma from what model and stated noise explain",
     "mean": "its innovations have a mean of {v:+.2f} sigma",
     "drift": "its innovations drift by {v:+.1f} sigma along the recording",
+    "creep": "it drifts by {v:+.1%} along the recording, against all that was measured besides",
     "colour": "its innovations are not white, neighbours are correlated by {v:+.2f}: a lag?",
 }
 _GAS_KIND = {"size": "innovations", "window": "innovations", "wild": "wild"}
@@ -323,6 +331,7 @@ def gas_doubts(
         *r.x.names
     }:  # freer than a load moves: innovations alternate, sigma is large
         found = [f for f in found if f.test != "colour" or f.value > 0]
+    found += _creeping(filt, tracked, quiet)
     for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
@@ -344,6 +353,27 @@ def gas_doubts(
         abs(v - 1) > SURE * float(r[n][1][-1]) for n, v in x.items()
     )
     yield from (d for side in sides if changed for d in _hidden(side))
+
+
+def _creeping(filt: GasPathFilter, tracked: Tracked, quiet: np.ndarray) -> list[Finding]:
+    """Test whether a sensor, or the shaft power, drifts against all others.
+
+    What that would leave in the innovations of all sensors is known, so that a drift is found which
+    hardly shows in any one of them, and still moves the estimates by several sigmas.
+    """
+    r = tracked.result
+    jumps, of = jumps_of(filt)
+    names = {n: own for n, (own, _) in of.items() if n != GAS}
+    if quiet.sum() < FEWEST_INNOVATIONS:
+        return []
+    f = linearised(filt.model, r, tracked.data, [j for j in jumps if j.name not in HEALTH])
+    size, sigma = f.ramps(r.t).evidence(quiet)
+    z = {n: abs(size[k] / sigma[k]) for n, (own,) in names.items() for k in f.columns([own])}
+    # others share a part of its signature: the most striking one alone is told
+    most = max(z, key=lambda n: z[n])
+    chance = float(2 * ndtr(-z[most] / math.sqrt(MARGIN))) * len(z)
+    (k,) = f.columns(names[most])
+    return [Finding(most.removeprefix("sensor "), "creep", chance, float(size[k]))]
 
 
 def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from estimators.apu.believable import Doubt
 from estimators.apu.electrical.terminalsignals import VOLTAGES
 from estimators.apu.recordings.measured import Channel, Measurements
 from estimators.apu.recordings.plausible import WAVES, clipped, plain
 from estimators.apu.sensorchain import interpolated, slopes
 from estimators.apu.sensorfile import SensorFile, read_sensors
 from estimators.apu.sensors import Sensor, SensorSet, gas_path_table
+from estimators.apu.trust import Doubt, part_of
 
 __all__ = ["Declared", "as_declared", "tables"]
 
@@ -93,7 +93,8 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     slow = {n: gas_path[n] for n in m.gaspath if n in gas_path}
     every = slow | waves
     for n, s in every.items():
-        channels[n] = _kept(channels[n], s, notes, doubts, wave=plain(n) in WAVES)
+        part = part_of(n, m.electrical)
+        channels[n] = _kept(channels[n], s, notes, doubts, part, wave=plain(n) in WAVES)
         lost = 1 - np.isfinite(channels[n].values).sum() / max(np.isfinite(m[n].values).sum(), 1)
         if plain(n) in VOLTAGES and lost > FILLED:
             notes.append(f"{n}: {100 * lost:.0f} % are too many to be filled, none is used")
@@ -133,14 +134,16 @@ def _clocked(s: Sensor, beside: Mapping[str, Sensor]) -> Sensor:
     return dataclasses.replace(s, jitter=math.sqrt(n) * s.jitter) if n > 1 else s
 
 
-def _kept(c: Channel, s: Sensor, notes: list[str], doubts: list[Doubt], *, wave: bool) -> Channel:
+def _kept(
+    c: Channel, s: Sensor, notes: list[str], doubts: list[Doubt], part: str, *, wave: bool
+) -> Channel:
     """Return the channel without what is at the end of the range, and without expected errors."""
     limits = s.limits
     if limits is None and wave and np.isfinite(c.values).any() and (count := clipped(c.values)):
         limits = float(np.nanmin(c.values)), float(np.nanmax(c.values))
         text = f"{c.source}: {count} samples of {c.name} are clipped"
         how = "declare its range in a file of sensors if that is what it can show"
-        doubts.append(Doubt("sensor", f"{text}; {how}"))
+        doubts.append(Doubt("sensor", f"{text}; {how}", part))
     v = c.values if limits is None else _inside(c, limits, notes, BESIDE[wave])
     if s.bias_mean or s.gain_mean:
         v = (v - s.bias_mean) / (1.0 + s.gain_mean)

@@ -10,16 +10,18 @@ other.  Likelihoods, which are posterior over prior weights, multiply; two thing
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from estimators.apu import gascauses
 from estimators.apu.electrical import causes
 from estimators.apu.electrical.causes import Causes, kind_of
+from estimators.apu.trust import GAS
+from estimators.information.posterior import named_posterior
 
-__all__ = ["COINCIDENCE", "GAS", "Diagnosis", "diagnoses"]
+__all__ = ["COINCIDENCE", "Diagnosis", "diagnoses"]
 
-GAS = "gas path"
 TOGETHER = 0.2  # s; the gas path sees a change later than the waveforms do
 COINCIDENCE = 1e-3
 LEAST = 1e-9  # probability that is no less
@@ -78,21 +80,12 @@ def _one(t: float, seen: Mapping[str, Causes]) -> Diagnosis:
             if what == NOTHING[place == GAS]:
                 continue
             others = (_sees(seen[p], p, place, what) for p in seen if p != place)
-            product = max(c.probability[what], LEAST)
-            for likely in others:
-                product *= likely
-            score[name] = product
-    quiet = 1.0
-    for place, c in seen.items():
-        quiet *= max(c.probability[NOTHING[place == GAS]], LEAST)
-    score["nothing"] = quiet
+            score[name] = _log(c.probability[what]) + sum(others)
+    score["nothing"] = sum(_log(c.probability[NOTHING[p == GAS]]) for p, c in seen.items())
     if len(seen) > 1:
-        both = COINCIDENCE
-        for c in seen.values():
-            both *= max(c.probability.values())
-        score["two at once"] = both
-    total = sum(score.values())
-    shares = {n: v / total for n, v in sorted(score.items(), key=lambda x: -x[1])}
+        each = (max(c.probability.values()) for c in seen.values())
+        score["two at once"] = math.log(COINCIDENCE) + sum(map(math.log, each))
+    shares = dict(sorted(named_posterior(score).items(), key=lambda x: -x[1]))
     best = next(iter(shares))
     place, _, what = best.rpartition(": ")
     own = seen.get(place or GAS)
@@ -100,10 +93,14 @@ def _one(t: float, seen: Mapping[str, Causes]) -> Diagnosis:
     return Diagnosis(t, shares, failed)
 
 
+def _log(p: float) -> float:
+    return math.log(max(p, LEAST))
+
+
 def _sees(c: Causes, here: str, place: str, what: str) -> float:
-    """Likelihood of what one filter saw if a hypothesis of another one holds."""
+    """Log-likelihood of what one filter saw if a hypothesis of another one holds."""
     prior = gascauses.PRIOR if here == GAS else causes.PRIOR
-    likely = {n: max(p, LEAST) / prior[kind_of(n, prior)] for n, p in c.probability.items()}
+    likely = {n: _log(p) - math.log(prior[kind_of(n, prior)]) for n, p in c.probability.items()}
     return max(likely[n] for n in _expected(here, place, what, likely))
 
 

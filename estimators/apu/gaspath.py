@@ -359,14 +359,13 @@ def gas_path_filter(
     biased, consider = _offsets(sensors, named, (*sensors.outputs, *held))
     sigma |= {f"bias_{s.name}": s.bias for s in biased}
     walks |= {f"bias_{s.name}": s.drift for s in biased if s.drift}
-    if inertia is not None and power == "measured":
-        named, consider = (*named, "J"), (*consider, *(["gain_J"] if consider_inertia else []))
-        sigma["gain_J"] = inertia
-    if eta is not None:
-        named, consider = (*named, "PW"), (*consider, *(["gain_PW"] if consider_eta else []))
-        sigma["gain_PW"] = eta
+    factors = _factors(inertia if power == "measured" else None, eta)
+    sigma |= {f"gain_{n}": v for n, v in factors.items()}
+    asked = {"J": consider_inertia, "PW": consider_eta}
+    named, consider = (*named, *factors), (*consider, *[f"gain_{n}" for n in factors if asked[n]])
     lags = [s for s in sensors.sensors if s.tau and (s in slow or s.name not in LAGGING)]
     sigma |= {lag_of(s): LAG_SIGMA * s.signal.nominal for s in lags}
+    laws: dict[str, Any] = {"governed": governed, "power_jumps": power_jumps, "loss": loss}
     model = gas_path_model(
         gg,
         power=power,
@@ -374,14 +373,17 @@ def gas_path_filter(
         biases=tuple(s.name for s in biased),
         consider=consider,
         walks=tuple((walks | dict(walk or {})).items()),
-        governed=governed,
-        power_jumps=power_jumps,
-        loss=loss,
         sensors=model_sensors(gg, (*sensors.only(sensors.outputs).sensors, *slow)),
         free=tuple((free or {}).items()),
+        **laws,
     )
     sigma |= {n: FREE_SIGMA * model.x[n].nominal for n in free or {}}
     return GasPathFilter(gg, sensors, model, sigma)
+
+
+def _factors(J: float | None, PW: float | None) -> dict[str, float]:
+    """Return the relative standard deviations of the factors that are not known."""
+    return {n: v for n, v in {"J": J, "PW": PW}.items() if v is not None}
 
 
 def _held(sensors: SensorSet, power: str) -> tuple[str, ...]:

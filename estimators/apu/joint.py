@@ -63,6 +63,7 @@ from estimators.apu.gaspath import (
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.healthjumps import JumpTest, Tracked, spliced, track_jumps
 from estimators.apu.machinepowers import shaft_courses
+from estimators.apu.peers import compared_sides
 from estimators.apu.priorfile import Prior
 from estimators.apu.sensorchain import interpolated
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, SensorSet
@@ -283,7 +284,8 @@ def estimate_joint(
         to 3: a to c), ``nis`` of the gas-path filter.  P_total is the mean of the window that ends
         at the instant.  ``ttsc_probability`` is that of a short circuit, found or not.  Of
         generators that differ, names have endings, ``h_a_2``.  Attributes: ``resets`` of the
-        electrical filters, ``alarms`` and ``onsets`` of health jumps, s, as JSON.
+        electrical filters, ``alarms`` and ``onsets`` of health jumps, s, and what machines that
+        differ say ``compared`` with each other (:mod:`estimators.apu.peers`), as JSON.
 
     Raises:
         DataError, EstimationError: as the two filters.
@@ -291,32 +293,59 @@ def estimate_joint(
     apu = Apu() if apu is None else apu
     rng, noise = (None if seed is None else np.random.default_rng([seed, k]) for k in (1, 2))
     t, _ = samples(ds)
-    unknowns = usual(unknowns, gain_errors)
-    if eta is not None:
-        unknowns = {**unknowns, EFFICIENCY: Knowledge.of(eta)}
+    given = {} if eta is None else {EFFICIENCY: Knowledge.of(eta)}
+    unknowns = {**usual(unknowns, gain_errors), **given}
     how: dict[str, Any] = {"gain_errors": gain_errors, "backend": backend, "unknowns": unknowns}
     also: dict[str, Any] = {"ttsc": ttsc, "step": electrical_step, "prior": severity}
-    also["efficiency_error"] = (gas_gains or {}).get("PW", 0.0)
-    sides, pickups = {}, []
-    for number, (ending, one, view) in enumerate(machines_of(ds, apu), 1):
-        own = own_gains(electrical_gains, ending)
-        errors: dict[str, Any] = {"gains": own, "delay": delay}
-        measured = electrical_samples(view, one, rng, sensors=electrical_sensors, **errors)
-        sides[number] = electrical_side(one, electrical_sensors, measured, t, **also, **how)
-        pickups.append((measured["t"], measured["w_r"]))
-    gas_sensors.only([*(gas_gains or ())])  # all of them are there
-    read = gas_sensors.measure(true_readings(gas_sensors, ds)[1], noise, gains=gas_gains)
+    also |= {"efficiency_error": (gas_gains or {}).get("PW", 0.0), **how}
+    waves = _measured(ds, apu, rng, electrical_sensors, electrical_gains, delay)
+    sides = {
+        number: electrical_side(one, electrical_sensors, measured, t, **also)
+        for number, (one, measured) in enumerate(waves, 1)
+    }
+    pickup = waves[0][1]["t"], waves[0][1]["w_r"]
+    readings = _read_gas(ds, gas_sensors, gas_gains, noise)
     how |= {"power": power, "step": step}
     gas, tracked = fused(
-        apu,
-        [*sides.values()],
-        {n: (t, v) for n, v in read.items()},
-        gas_sensors,
-        speed=pickups[0] if speed else None,
-        speed_sigma=electrical_sensors.sigma("w_r", float(np.median(pickups[0][1]))),
+        *(apu, [*sides.values()], readings, gas_sensors),
+        speed=pickup if speed else None,
+        speed_sigma=electrical_sensors.sigma("w_r", float(np.median(pickup[1]))),
         **how,
     )
     return beside_truth(ds, sides, gas, tracked)
+
+
+def _read_gas(
+    ds: xr.Dataset,
+    sensors: SensorSet,
+    gains: Mapping[str, float] | None,
+    noise: np.random.Generator | None,
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Measure the gas path; return times and readings by sensor."""
+    sensors.only([*(gains or ())])  # all of them are there
+    t = samples(ds)[0]
+    read = sensors.measure(true_readings(sensors, ds)[1], noise, gains=gains)
+    return {n: (t, v) for n, v in read.items()}
+
+
+def _measured(
+    ds: xr.Dataset,
+    apu: Apu,
+    rng: np.random.Generator | None,
+    sensors: SensorSet,
+    gains: Mapping[str, float] | None,
+    delay: float,
+) -> list[tuple[Apu, dict[str, np.ndarray]]]:
+    """Measure the waveforms of every machine that differs; return each as a unit, with them."""
+    return [
+        (
+            one,
+            electrical_samples(
+                view, one, rng, sensors=sensors, gains=own_gains(gains, ending), delay=delay
+            ),
+        )
+        for ending, one, view in machines_of(ds, apu)
+    ]
 
 
 def fused(
@@ -471,6 +500,7 @@ def beside_truth(
         "resets": sorted({v for s in known.values() for v in s.resets}),
         "alarms": [float(r.t[i]) for i in tracked.alarms],
         "onsets": [float(r.t[i]) for i in tracked.onsets],
+        "compared": compared_sides(known)[1],
     }
     attrs = {n: json.dumps(v) for n, v in found.items()}
     return dataset({"time": t}, {"time": values}, signals=signals, attrs=attrs)

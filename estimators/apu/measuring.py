@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from apu_casadi.core.cf import described
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.resultformats import frames, save_frame
 from apu_casadi.core.results import save
@@ -176,7 +177,7 @@ def write_recording(readings: Mapping[str, xr.Dataset], path: str | Path) -> lis
     for kind, ds in readings.items():
         target = path if len(readings) == 1 else path.with_stem(f"{path.stem}_{kind}")
         if ending == ".nc":
-            made.append(save(ds, target))
+            made.append(save(described(ds, "readings of sensors"), target))
             continue
         made.append(save_frame(frames(ds)["time"], target))
     return made

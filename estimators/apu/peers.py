@@ -10,7 +10,8 @@ machines the estimates, one below the other, are
 
     h_hat = h + U c + e,   c ~ N(0, I),   e ~ N(0, blockdiag(P)),
 
-c being the common errors: of each considered one ``COMMON`` times what a single machine's may be,
+c being the common errors: of the considered ones those that ``COMMON`` names, so many times what a
+single machine's may be,
 and one that looks like a severity in all three phases at once, which is what wrong speeds,
 frequencies and hot fields do.  A hypothesis says which machines, at most
 ``TOGETHER`` of them, have a short circuit in which phase; such a severity is half-normal.  With its
@@ -40,11 +41,23 @@ from apu_casadi.machine.park import PHASES
 from estimators.apu.electrical.electricalside import Beliefs, ElectricalSide
 from estimators.apu.electrical.hypotheses import FAULTY, H_SCALE
 from estimators.apu.machinepowers import on_common_windows
+from estimators.apu.trust import Doubt, machine, severity
+from estimators.information.posterior import posterior
 
 __all__ = ["BALANCED", "COMMON", "Compared", "compare", "compared_sides"]
 
-COMMON = 10.0
-"""Standard deviation of a common error over that of one machine's own: 5 % of a gain."""
+COMMON = {"gain_": 10.0, "delay_": 4.0, "machine.": 1.0}
+"""Standard deviation of what all machines share of a considered error, over that of one machine's
+own, by the beginning of its name:
+
+* gains, 5 %: sensors of one type, calibrated together or read with the same wrong ratio;
+* delays, 20 us: one acquisition unit with one kind of filter, whose lag nobody declared;
+* inductances and the like of the machine: one design, of which the same is not known; what differs
+  between specimens is each one's own.
+
+Winding temperatures are no errors in common: each machine has its own, and so has its efficiency,
+which moves no severity.
+"""
 BALANCED = 1e-3
 """The same of a common severity in all three phases: half a per cent of the speed looks so."""
 TOGETHER = 2  # machines that have a short circuit at once, at most
@@ -115,19 +128,21 @@ def compared_sides(
             continue
         mean, sigma = found.alike[:, own - 1, -1]
         if mean > 3 * sigma:
-            doubts.append(
-                f"machine {number}: all machines show the same severity in phase "
+            text = (
+                f"{machine(number)}: all machines show the same severity in phase "
                 f"{PHASES[own - 1]}, {mean:.1e} beyond the other phases: an error that they share, "
                 "of sensors or speed, or the same short circuit in all of them; compared with the "
                 f"others it has one with a probability of {found.faulty[k, -1]:.2f}"
             )
+            part = f"{machine(number)}: {severity(PHASES[own - 1])}"
+            doubts.append(Doubt("machine", text, part))
     return found, found.report([*sides]), doubts
 
 
 def compare(
     beliefs: Sequence[Beliefs],
     *,
-    common: float = COMMON,
+    common: Mapping[str, float] = COMMON,
     balanced: float = BALANCED,
     faulty: float = FAULTY,
     scale: float = H_SCALE,
@@ -136,7 +151,8 @@ def compare(
 
     Args:
         beliefs: of each machine, of the same windows.
-        common: standard deviation of a common error over that of a machine's own; 0: none.
+        common: standard deviation of a common error over that of a machine's own, by the beginning
+            of its name; what is not named is not common.
         balanced: that of a common severity in all phases.
         faulty: probability that a machine has a short circuit.
         scale: of its severity.
@@ -158,9 +174,7 @@ def compare(
         worst = NONLINEAR * np.abs(own - np.median(own, axis=1)[:, None]).max(1)
         R[:, at, at] += b.cov[:, :3, :3] + worst[:, None, None] ** 2 * np.eye(3)
     each = [_Hypothesis(f, n, faulty, scale, h, R) for f in _sets(n)]
-    log = np.array([x.log for x in each])
-    share = np.exp(log - log.max(0))
-    share /= share.sum(0)
+    share = posterior(np.array([x.log for x in each]))
     probability, several = np.zeros((n, 4, h.shape[0])), np.zeros(h.shape[0])
     for x, w in zip(each, share, strict=True):
         found = dict(x.faults)
@@ -180,16 +194,17 @@ def compare(
     )
 
 
-def _common(beliefs: Sequence[Beliefs], common: float, balanced: float) -> np.ndarray:
+def _common(beliefs: Sequence[Beliefs], common: Mapping[str, float], balanced: float) -> np.ndarray:
     """Return what common errors of unit variance do to all severities, (K, 3 n, c)."""
     n, K = len(beliefs), beliefs[0].mean.shape[0]
-    of = [x for x in beliefs[0].names[3:] if x != "P" and all(x in b.names for b in beliefs)]
+    factor = {x: v for x in beliefs[0].names for n, v in common.items() if x.startswith(n)}
+    of = [x for x in factor if all(x in b.names for b in beliefs)]
     U = np.zeros((K, 3 * n, len(of) + 1))
     U[:, :, -1] = balanced
     for j, x in enumerate(of):
         at = [b.names.index(x) for b in beliefs]
         own = [b.cov[:, i, i] for i, b in zip(at, beliefs, strict=True)]
-        size = common * np.sqrt(np.max(own, axis=0))
+        size = factor[x] * np.sqrt(np.max(own, axis=0))
         for k, (i, b) in enumerate(zip(at, beliefs, strict=True)):
             slope = -b.cov[:, :3, i] / own[k].clip(1e-300)[:, None]
             U[:, 3 * k : 3 * k + 3, j] = slope * size[:, None]

@@ -60,6 +60,7 @@ from estimators.apu.recordedwaves import Waves, machines_in, told
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
+from estimators.apu.trust import GAS, Doubt, about, believed, is_lost, verdict
 from estimators.apu.unknowns import EFFICIENCY
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
@@ -99,6 +100,7 @@ class RecordedEstimate:
         sides: what the electrical filters say, by machine.
         causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
         compared: what a comparison of the machines says (:mod:`estimators.apu.peers`).
+        belief: why each part is not to be believed, by name (:mod:`estimators.apu.trust`).
     """
 
     gaspath: xr.Dataset | None
@@ -113,11 +115,12 @@ class RecordedEstimate:
     sides: Mapping[int, ElectricalSide] = field(default_factory=dict, repr=False)
     causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
     compared: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    belief: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def believable(self) -> bool:
-        """Whether nothing speaks against the estimates."""
-        return not self.doubts
+        """Whether nothing speaks against any part of what is estimated."""
+        return not any(self.belief.values()) if self.belief else not self.doubts
 
     @property
     def diagnoses(self) -> list[Diagnosis]:
@@ -132,6 +135,7 @@ class RecordedEstimate:
     def report(self) -> dict[str, Any]:
         """Return the estimates at the end, alarms and verdicts, ready for JSON."""
         out: dict[str, Any] = {"believable": self.believable, "doubts": list(self.doubts)}
+        out["belief"] = verdict(self.belief)
         if self.gaspath is not None:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
@@ -186,7 +190,6 @@ def estimate(
     apu, start = _known(engine, prior)
     how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
     how |= {"efficiency_error": efficiency_error, "backend": backend}
-    lacking: dict[str, str] = {}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
     notes = [*m.notes, *ready.notes]
@@ -194,10 +197,7 @@ def estimate(
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     causes: dict[str, tuple[Causes, ...]] = {}
-    reason = _no_gas_path(m, table) if only != "electrical" else "it was not asked for"
-    gas = reason is None
-    if only != "electrical" and reason is not None and (m.gaspath or only):
-        lacking["gas path"] = reason
+    gas, lacking = _beforehand(m, table, only)
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
     for k in machines_in(m) if only != "gaspath" and m.electrical else ():
         own = electrical_sensors.machine(k)
@@ -206,30 +206,41 @@ def estimate(
         side = waves.side(begin, lacking, doubts, notes, causes)
         if side is not None:
             sides[k] = side
-    if only == "electrical" and not m.electrical:
-        lacking["generators"] = "nothing of them was measured"
     found_by, e = None, None
     fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
         given = ambient or {}, notes, doubts, backend, start
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         e = gas_dataset(filt, tracked)
-        doubts += gas_doubts(filt, tracked, list(sides.values()))
-        causes["gas path"], odd = told(gas_causes(filt, tracked))
-        doubts += odd
+        causes[GAS], odd = told(gas_causes(filt, tracked))
+        doubts += about([*gas_doubts(filt, tracked, list(sides.values())), *odd], GAS)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     compared, alike = compared_sides(sides)[1:]
     doubts += alike
     if e is None and not sides and not found:
-        why = "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
-        raise DataError(f"nothing can be estimated: {why}")
+        raise DataError(f"nothing can be estimated: {_why(lacking)}")
     if apu.alike and 0 < len(sides) < len(apu.machines):
         notes.append(_some_of(tuple(sides), len(apu.machines)))
-    machines = {k: side_dataset(s) for k, s in sides.items()}
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
-    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared
+    told_of = [k for k in machines_in(m) if k in sides or is_lost(texts[1], k)]
+    belief = believed(texts[1], gas=e is not None, machines=told_of, power_of=[*fused_by])
+    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared, belief
+    machines = {k: side_dataset(s) for k, s in sides.items()}
     return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
+
+
+def _beforehand(m: Measurements, table: SensorSet, only: str | None) -> tuple[bool, dict[str, str]]:
+    """Say whether there is a gas-path estimate, and what is lacking for what was asked for."""
+    if only == "electrical":
+        return False, {} if m.electrical else {"generators": "nothing of them was measured"}
+    reason = _no_gas_path(m, table)
+    return reason is None, {"gas path": reason} if reason and (m.gaspath or only) else {}
+
+
+def _why(lacking: Mapping[str, str]) -> str:
+    """Say why each part is not estimated."""
+    return "; ".join(f"{n}: {w}" for n, w in lacking.items()) or "nothing was measured"
 
 
 def _some_of(numbers: tuple[int, ...], n: int) -> str:
@@ -474,10 +485,8 @@ class _GasPath:
                 "their own"
             )
         if usual > SLOW:
-            self.doubts.append(
-                f"{name} is known every {usual:g} s only: what happens in between is taken for a "
-                "change of health"
-            )
+            text = f"{name} is known every {usual:g} s only: what happens in between is taken for"
+            self.doubts.append(Doubt("time", f"{text} a change of health", GAS))
 
     def _start(self, readings: Streams, sensors: SensorSet) -> dict[str, float]:
         """Means of the start from the first readings, where the usual ones are far off."""

@@ -16,6 +16,7 @@ from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
 from estimators.apu.joint import ElectricalSide
+from estimators.apu.trust import in_words
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SURE",
     "Z95",
+    "compared_words",
     "gas_dataset",
     "gas_report",
     "machine_report",
@@ -125,6 +127,15 @@ def _likely(probability: Mapping[str, float]) -> str:
     return ", ".join(f"{what} {100 * p:.0f} %" for what, p in likely if p > 0.005)
 
 
+def compared_words(r: Mapping[str, Any] | None) -> Iterator[str]:
+    """Yield what a comparison of the machines says."""
+    for k, of in (r or {"machines": {}})["machines"].items():
+        yield (
+            f"compared with the others, generator {k} has a short circuit with a probability of "
+            f"{of['probability']:.3f}, likeliest in phase {of['likeliest_phase']}"
+        )
+
+
 def words(r: Mapping[str, Any]) -> Iterator[str]:
     """Yield a report's lines."""
     if "gaspath" in r:
@@ -155,11 +166,7 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
             yield f"  short circuit in phase {a['phase']}, reported at {a['t']:g} s"
         if not e["alarms"]:
             yield "  no short circuit reported; one within the bands above may be there"
-    for k, of in r.get("compared", {"machines": {}})["machines"].items():
-        yield (
-            f"compared with the others, generator {k} has a short circuit with a probability of "
-            f"{of['probability']:.3f}, likeliest in phase {of['likeliest_phase']}"
-        )
+    yield from compared_words(r.get("compared"))
     for n, s in r["sequences"].items():
         yield (
             f"{n}: {s['frequency']:.2f} Hz, positive sequence {s['positive']:.4g}, negative over "
@@ -182,4 +189,4 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"read: {n}" for n in r["notes"])
     yield from (f"doubt: {d}" for d in r["doubts"])
     if not r["believable"]:
-        yield "NOT TO BE BELIEVED as it stands, for the doubts above"
+        yield f"NOT TO BE BELIEVED as it stands, for the doubts above{in_words(r['belief'])}"

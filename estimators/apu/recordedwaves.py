@@ -11,7 +11,7 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, EstimationError
 from apu_casadi.unit.apu import Apu
-from estimators.apu.believable import Doubt, machine_causes, machine_doubts
+from estimators.apu.believable import lost, machine_causes, machine_doubts
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.electricalfilter import (
     ElectricalFilter,
@@ -33,6 +33,7 @@ from estimators.apu.gaspathmodel import DT
 from estimators.apu.joint import ElectricalSide, electrical_side
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensors import SensorSet
+from estimators.apu.trust import Doubt, machine
 from estimators.filters.belief import Belief
 from estimators.models.recording import Recording
 
@@ -103,19 +104,25 @@ class Waves:
         causes: dict[str, tuple[Causes, ...]],
     ) -> ElectricalSide | None:
         """Run the electrical filter from an instant on; None where it cannot."""
-        name, what = f"machine {self.number}", f"severity, machine {self.number}"
+        name = machine(self.number)
+        what = f"severity, {name}"
         try:
             a = self.samples(notes, begin)
             even = evened(a)["t"]
             t = even[window_starts(even, DT, None)]
             side = electrical_side(self.apu, self.sensors, a, t, judged=True, **self.how)
         except LostError as e:
-            lacking[what] = str(e)
             given = self.apu.generator.machine, self.sensors, a, e.resets[0]
             first = causes_of_change(*given)
             causes[name] = () if first is None else (first,)
+            lacking[what] = str(e)
+            doubts.append(lost(e, first).of(name))
             return None
-        except (DataError, EstimationError) as e:
+        except EstimationError as e:
+            lacking[what] = str(e)
+            doubts.append(lost(e).of(name))
+            return None
+        except DataError as e:
             lacking[what] = str(e)
             return None
         how = side, self.apu.generator.machine, self.sensors, a

@@ -23,6 +23,8 @@ import math
 
 import numpy as np
 
+from estimators.information.posterior import named_posterior
+
 __all__ = ["FAILURES", "failure"]
 
 FAILURES = ("stuck", "bias", "drift", "noise", "spikes", "dropout")
@@ -60,10 +62,7 @@ def failure(
     far = np.abs(z) > FAR
     if 0 < far.mean() <= SPIKES:
         score["spikes"] = -0.5 * float((z[~far] ** 2).sum()) - 1.5 * far.sum() * math.log(n)
-    top = max(score.values())
-    weight = {k: math.exp(v - top) for k, v in score.items()}
-    total = sum(weight.values())
-    return {k: weight.get(k, 0.0) / total for k in FAILURES}
+    return dict.fromkeys(FAILURES, 0.0) | named_posterior(score)
 
 
 def _left(z: np.ndarray, basis: np.ndarray) -> float:

@@ -6,6 +6,7 @@ filter, which is linear, or linearised about its own estimates.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -95,6 +96,38 @@ class LinearFilter:
             SignalError: unknown name.
         """
         return columns_of(names, self.names)
+
+    def ramps(self, t: np.ndarray) -> LinearFilter:
+        """Return the same where each jump comes little by little: all of it by the last sample.
+
+        Args:
+            t: instants of the samples, (K,).
+        """
+        share = (t - t[0]) / (t[-1] - t[0])
+        step = np.append(np.diff(share), 0.0)[:, None, None]
+        drift = share[:, None, None] * self.drift + step * self.state
+        return dataclasses.replace(
+            self,
+            state=np.zeros_like(self.state),
+            drift=drift,
+            output=share[:, None, None] * self.output,
+        )
+
+    def evidence(self, there: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return each jump alone, there from the first sample on: its most likely size and sigma.
+
+        Args:
+            there: samples that count, (K,); all by default.
+        """
+        g = self.signature(0)
+        if there is not None:
+            g = g * there[:, None, None]
+        weighted = np.linalg.solve(self.S, g)
+        b = np.einsum("kiq,ki->q", weighted, self.innovation)
+        C = np.einsum("kiq,kiq->q", weighted, g)
+        known = C > 0
+        C = np.where(known, C, 1.0)
+        return np.where(known, b / C, 0.0), np.where(known, 1 / np.sqrt(C), np.inf)
 
     def signature(self, onset: int, stop: int | None = None) -> np.ndarray:
         """Return what unit jumps at a sample add to the innovations, shape (K - onset, ny, q)."""

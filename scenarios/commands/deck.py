@@ -40,6 +40,7 @@ LARGEST = 5_000_000  # points; outputs alone are then 1.8 GB
 def run(args: argparse.Namespace) -> int:
     """Solve the grid and write it."""
     from apu_casadi.core import files, results
+    from apu_casadi.core.cf import described
     from apu_casadi.core.errors import ScenarioError
     from apu_casadi.gaspath.steady.steadypoint import MEANING, Status
     from apu_casadi.gaspath.steady.trimbatch import performance_deck
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     t = time.perf_counter() - t
     deck.attrs |= {"apu_casadi_version": installed(), **given.own(args)}
     deck.attrs |= {k: json.dumps(v, ensure_ascii=False) for k, v in given.assumed(args).items()}
-    results.save(deck, args.out)
+    results.save(described(deck, "performance deck"), args.out)
     status = deck["status"].values
     counts = {MEANING[s]: int((status == s).sum()) for s in Status if (status == s).any()}
     if args.json:

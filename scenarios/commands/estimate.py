@@ -37,7 +37,7 @@ _JOINT = f"""
 {given.WHOLE}
 --seed int N =1             | of all errors (default 1)
 --out DIR                   | folder (default results/estimate_NAME)
---figures =on               | draw truth, estimate and band (default)
+{given.FIGURES}
 --json                      | print the summary as JSON only
 --quiet                     | no progress bar, no list of files
 """
@@ -50,7 +50,7 @@ files FILE + | recorded data, CSV, Parquet or netCDF: gas path, generators, or b
 --prior FILE   | what is known before (TOML): mean, sigma by state, machine.r_s, delay_i, h
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep estimates, JSON and figure there
---figures =on  | draw estimates and bands into it (default)
+{given.FIGURES}
 --json         | print JSON only
 --quiet        | no list of files
 """
@@ -110,6 +110,7 @@ def _data(args: argparse.Namespace) -> int:
     from scenarios.figures.recordedplot import plot_recorded
     from scenarios.shell import progress
 
+    given.drawn(args)  # refused before anything is computed
     apu = given.engine_file(args).unit
     m = readingoptions.recording(args, apu.gas_generator)
     sensors = read_sensors(args.sensors)
@@ -133,6 +134,7 @@ def _data(args: argparse.Namespace) -> int:
 def _joint(args: argparse.Namespace) -> int:
     """Simulate a scenario, measure it with noise, estimate along it, and compare."""
     from apu_casadi.core import results
+    from apu_casadi.core.cf import described
     from apu_casadi.core.errors import ScenarioError
     from apu_casadi.core.files import write_text
     from estimators.apu.sensorfile import read_sensors
@@ -143,7 +145,7 @@ def _joint(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise ScenarioError(f"--seed must be >= 0, got {args.seed}")
     s = given.scenario(args, args.scenario)
-    sensors = read_sensors(args.sensors)
+    sensors, drawn = read_sensors(args.sensors), given.drawn(args)
     folder = registry.prepare(args.out or f"results/estimate_{s.name}")
     show = not args.quiet and sys.stderr.isatty()
     with bar(f"{s.name}, truth", s.duration, show=show) as progress:
@@ -153,12 +155,13 @@ def _joint(args: argparse.Namespace) -> int:
     e = jointrun.estimate(truth, args.seed, sensors=sensors, folder=folder)
     report = jointrun.report(e) | given.assumed(args)
     notices.tell(report["warnings"] or [])
-    made = [results.save(e, folder / f"estimate_{s.name}.nc")]
+    named = described(e, f"estimate: {s.title or s.name}")
+    made = [results.save(named, folder / f"estimate_{s.name}.nc")]
     text = jsontext.dumps(report)
     made.append(write_text(folder / "estimate.json", text + "\n"))
-    if args.figures:
-        path = folder / f"estimate_{s.name}.png"
-        made.append(jointrun.draw(jointrun.saved(e, every=1), path))
+    if drawn is not None:
+        figure = jointrun.figure(jointrun.saved(e, every=1))
+        made += drawn.save(figure, folder / f"estimate_{s.name}")
     if args.json:
         print(text)
         return 0

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from estimators.apu.recordings.recorded import Table
     from estimators.apu.sensors import SensorSet
     from estimators.batch.fitresult import Profile
+    from scenarios.figures.drawnas import DrawnAs
 
 NAME = "fit"
 HELP = "fit health factors to recorded data (CSV, Parquet, netCDF)"
@@ -58,7 +59,8 @@ files FILE +           | recorded data (see above)
 --fix NAME=VALUE ...   | a known health factor
 {given.ambient_options("a column, what the run file says, else ")}
 --profile              | intervals from the profile likelihood too
---figure FILE          | draw measured against fitted (.png)
+--figure FILE          | draw measured against fitted (.png, .pdf or .svg)
+{given.LOOK}
 --json                 | print JSON
 --quiet                | no word on progress
 """
@@ -91,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
     rows = sum(d.t.size for d in data)
     if rows > 200:
         _tell(args, f"fitting {rows} samples")
+    look = given.look(args)
     how: dict[str, Any] = {"steady": steady, "sensors": sensors, "averaged": args.readings}
     how |= {"own": given.names(args.own), "fixed": given.numbers(args.fix, "--fix")}
     how |= {"prior": _priors(args.prior), "consider": given.numbers(args.consider, "--consider")}
@@ -99,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     figures = []
     if args.figure:
         ambients = [d.ambient for d in data]
-        figures = _draw(fit, args.figure, steady, ambients, given.program(args))
+        figures = _draw(fit, args.figure, steady, ambients, given.program(args), look)
     found = report(fit, profiles, ignored, steady=steady)
     found["assumed_ambient"] = _assumed(data)
     found["read_as"] = [*notes, *_unheeded(tables, times, args), *_other_unit(args)]
@@ -487,10 +490,14 @@ def _day(ambient: Mapping[str, Any]) -> str:
 
 
 def _draw(
-    fit: EngineFit, path: str, steady: bool, days: Sequence[Mapping[str, Any]], program: str
+    fit: EngineFit,
+    path: str,
+    steady: bool,
+    days: Sequence[Mapping[str, Any]],
+    program: str,
+    look: DrawnAs,
 ) -> list[Path]:
     """Draw one figure for each file; a number is put before the ending when there are several."""
-    from apu_casadi.core import files
     from apu_casadi.gaspath.gasgenerator import GasGenerator
     from scenarios.figures.fitplot import plot_fit
 
@@ -508,5 +515,5 @@ def _draw(
         how["heading"] = f"{name}: measured and fitted"
         how["note"] = f"95 %: {note}. Ambient: {_day(days[k])}; {program}."
         fig = plot_fit(t, fit.series(k), units, **how)
-        made.append(files.save_figure(fig, target))
+        made.append(look.save_as(fig, target))
     return made

@@ -293,7 +293,7 @@ def report(
     """End a command on files: keep JSON, figure and data in ``--out``, print; return 0.
 
     Args:
-        args: of the command: ``files``, ``out``, ``figures``, ``json``, ``quiet``.
+        args: of the command: ``files``, ``out``, those of ``FIGURES``, ``json``, ``quiet``.
         name: of what is kept.
         made_of: the report, ready for JSON.
         text: the same in words.
@@ -301,7 +301,8 @@ def report(
         data: datasets by name.
     """
     from apu_casadi.core import results
-    from apu_casadi.core.files import save_figure, write_text
+    from apu_casadi.core.cf import described
+    from apu_casadi.core.files import write_text
     from scenarios import registry
     from scenarios.shell import jsontext
 
@@ -309,11 +310,14 @@ def report(
     made: list[Any] = []
     if args.out is not None:
         folder = registry.prepare(args.out)
-        made = [results.save(d, folder / f"{n}.nc") for n, d in (data or {}).items()]
+        for n, d in (data or {}).items():
+            title = f"{n} of {', '.join(args.files)}"
+            made.append(results.save(described(d, title), folder / f"{n}.nc"))
         made.append(write_text(folder / f"{name}.json", jsontext.dumps(whole) + "\n"))
-        if args.figures and figure is not None:
+        how = drawn(args)
+        if how and figure is not None:
             note = f"{', '.join(args.files)}; {program(args)}."
-            made.append(save_figure(figure(note), folder / f"{name}.png"))
+            made += how.save(figure(note), folder / name)
     if args.json:
         jsontext.show(whole)
         return 0
@@ -375,8 +379,33 @@ def formats(text: str) -> tuple[str, ...]:
     return names
 
 
-def drawn(args: Namespace) -> DrawnAs | bool:
-    """Return how figures are to be written, before anything is computed; False for no figures.
+LOOK = """
+--dpi float =160 | dots per inch of PNG; figures are 10 in wide
+--style {colour,grey} =colour | of figures; grey, for print, tells curves apart by line styles
+""".strip()
+"""Options of every command that draws; where FILE is given, its ending tells the format."""
+DRAWN = f"""
+--figures NAMES ? =png | formats of the figures, one or several with commas between: png, svg, pdf
+{LOOK}
+""".strip()
+FIGURES = f"{DRAWN}\n--no-figures | draw no figures"
+
+
+def look(args: Namespace) -> DrawnAs:
+    """Return how a figure of a given file name is to be drawn; errors as :func:`formatted`."""
+    from scenarios.figures.drawnas import DrawnAs
+
+    return DrawnAs(dpi=args.dpi, style=args.style)
+
+
+def drawn(args: Namespace) -> DrawnAs | None:
+    """Return how figures are to be written, None for no figures; errors as :func:`formatted`."""
+    made = formatted(args)
+    return None if args.no_figures else made
+
+
+def formatted(args: Namespace) -> DrawnAs:
+    """Return how figures are to be written, before anything is computed.
 
     Raises:
         ParameterError: an unknown format, or a resolution out of range.
@@ -384,4 +413,4 @@ def drawn(args: Namespace) -> DrawnAs | bool:
     from scenarios.figures.drawnas import DrawnAs
 
     formats = tuple(dict.fromkeys(names(args.figures)))
-    return not args.no_figures and DrawnAs(formats, args.dpi, args.style)
+    return DrawnAs(formats, args.dpi, args.style)

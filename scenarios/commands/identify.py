@@ -53,13 +53,13 @@ OPTIONS = f"""
 --transient          | also a load ramp of 5 s; takes some seconds
 --trials int N =0    | also estimate from N random snapshots, 12 ms each, to confirm the bounds
 --json               | print JSON
---figure FILE        | draw what shaft power is worth
+--figure FILE        | draw what shaft power is worth (.png, .pdf or .svg)
+{given.LOOK}
 """
 
 
 def run(args: argparse.Namespace) -> int:
     """Compute, print and draw."""
-    from apu_casadi.core import files
     from apu_casadi.core.errors import ParameterError
     from estimators.apu import identify as study
 
@@ -71,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
             f"{args.prior:g}, {args.eta_bias:g}, {args.samples:g}, {args.trials:g}"
         )
     given.parts(args)
+    look = given.look(args)
     alone = [given.number(x, "--shares", x) for x in given.names(args.shares or "1")]
     args.bias = study.independent_bias(args.eta_bias / 100, alone)
     args.aside = study.independent_bias(1.0, alone)
@@ -80,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     f = _found(args, machine)
     if args.figure is not None:
         figure = _figure(f.point, args.samples, _engine(args), given.program(args))
-        files.save_figure(figure, args.figure)
+        look.save_as(figure, args.figure)
     if args.json:
         jsontext.show(_report(args, sensors, sets, added, f))
         return 0

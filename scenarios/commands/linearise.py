@@ -44,7 +44,7 @@ OPTIONS = f"""
 {given.WHOLE}
 --json               | print JSON, with all matrices
 --out DIR =results/linearise | default %(default)s
---no-figures         | draw no figure
+{given.FIGURES}
 --save FILE          | write the matrices with names and units, .nc or .mat
 """
 
@@ -55,16 +55,15 @@ def run(args: argparse.Namespace) -> int:
     point = _point(args, unit)
     model = linear_model(args.model, unit, *point, number=args.generator, apart=args.apart)
     words = _words(args, unit)
-    path = None
-    if not args.no_figures:
-        from apu_casadi.core import files
+    made: list[Any] = []
+    if (how := given.drawn(args)) is not None:
         from scenarios import registry
         from scenarios.figures.eigenplot import plot_eigenvalues
 
         label = f"{words.load}, {day_words(given.ambient_of(args))}"
-        path = registry.prepare(args.out) / "eigenvalues.png"
+        stem = registry.prepare(args.out) / "eigenvalues"
         note = f"Load of {label}; {words.fault}; {given.program(args)}."
-        files.save_figure(plot_eigenvalues({label: model}, note), path)
+        made = how.save(plot_eigenvalues({label: model}, note), stem)
     if args.save is not None:
         from scenarios.export import linear
 
@@ -87,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     if args.model != "generator":
         print(f"\n{given.ambient_line(given.ambient_given(args))}")
     print(f"load of {words.load}; {words.fault}; {given.program(args)}")
-    if made := [str(p) for p in (args.save, path) if p is not None]:
+    if made := [str(p) for p in (args.save, *made) if p is not None]:
         print("", *made, sep="\n")
     return 0
 

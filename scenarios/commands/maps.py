@@ -17,12 +17,13 @@ OPTIONS = f"""
 {given.UNIT}
 --out DIR =results/maps | folder (default %(default)s)
 --no-lines              | draw no operating lines
+{given.DRAWN}
 """
 
 
 def run(args: argparse.Namespace) -> int:
     """Draw both maps and print the paths."""
-    from apu_casadi.core import files, results
+    from apu_casadi.core import results
     from apu_casadi.core.errors import DataError
     from scenarios import registry
     from scenarios.figures.mapplots import default_lines, plot_compressor_map, plot_turbine_map
@@ -30,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from scenarios.shell import progress
 
     ds = None if args.trajectory is None else results.load(args.trajectory)
+    how = given.formatted(args)
     folder = registry.prepare(args.out)
     progress.tell("drawing both maps")
     if ds is not None and args.engine is None:
@@ -38,7 +40,6 @@ def run(args: argparse.Namespace) -> int:
     note = f"Unit {Path(args.engine).stem}." if args.engine else ""
     lines = {} if args.no_lines else default_lines(gg)
     for name, draw in (("compressor_map", plot_compressor_map), ("turbine_map", plot_turbine_map)):
-        path = folder / f"{name}.png"
         try:
             figure = draw(gg, lines=lines, trajectory=ds, note=note)
         except DataError as e:
@@ -46,5 +47,5 @@ def run(args: argparse.Namespace) -> int:
             if str(args.trajectory) not in said:
                 said = f"{args.trajectory}: {said}"
             raise DataError(said) from None
-        print(files.save_figure(figure, path))
+        print(*how.save(figure, folder / name), sep="\n")
     return 0

@@ -17,11 +17,12 @@ from scenarios.shell import jsontext
 
 NAME = "multirate"
 HELP = "measure the error of the multi-rate exchange (takes minutes)"
-OPTIONS = """
+OPTIONS = f"""
 --out DIR     | folder for figure and numbers (default results/multirate)
 --json        | print JSON only
 --steps MS,MS | exchange steps in ms, divisors of 80 (default: six)
---events {both,one,all} | of both machines (default), of one alone, or all of these
+--events {{both,one,all}} | of both machines (default), of one alone, or all of these
+{given.DRAWN}
 --page FILE   | also write the page, with its figure in images/ beside it
 --quiet       | no progress bar
 """
@@ -34,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from scenarios.shell.progress import bar
     from scenarios.studies import multirate_study as study
 
+    how = given.formatted(args)
     steps = study.STEPS if args.steps is None else _steps(args.steps, study.COMMON)
     folder = registry.prepare(args.out or "results/multirate")
     show = not args.quiet and sys.stderr.isatty()
@@ -46,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
         rows = study.measure(steps=steps, cases=cases, progress=progress)
     report = study.report(rows)
     text = jsontext.dumps(report)
-    made = [study.write_figure(rows, folder / "multirate_error.png")]
-    made.append(markdown.write_text(folder / "multirate.json", text + "\n"))
+    made = [markdown.write_text(folder / "multirate.json", text + "\n")]  # before all that may fail
+    made += how.save(study.figure(rows), folder / "multirate_error")
     if args.page:
         page = Path(args.page)
         registry.prepare(page.parent / "images")

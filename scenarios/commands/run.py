@@ -25,10 +25,7 @@ scenario SCENARIO      | a name, a .toml or a .py file
 --format NAMES =nc     | of the data, one or several with commas between: nc (netCDF 3), nc4
                        | (compressed; waveforms in single precision), csv, parquet, mat
 --json                 | print the summary as JSON only
---figures NAMES =png   | formats of the figures, one or several with commas between: png, svg, pdf
---dpi float =160       | dots per inch of PNG; figures are 10 in wide
---style {{colour,grey}} =colour | of the figures; grey, for print, tells curves apart by line styles
---no-figures           | draw no figures
+{given.FIGURES}
 --no-waveforms         | keep no waveforms: a small file, rms figures
 --phasors              | keep the fundamental phasors of voltages and currents of every exchange
                        | step
@@ -61,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     with bar(s.name, s.duration, show=show) as progress:
         how = {"solver": args.solver, "phasors": args.phasors, "strict": args.strict}
         ds = registry.run(s, progress=progress, **how)
-    made = registry.write(ds, folder, figures=drawn, name=s.name, formats=formats)
+    made = registry.write(ds, folder, figures=drawn or False, name=s.name, formats=formats)
     report = registry.summary(ds)
     notices.tell(report["warnings"])
     if args.json:

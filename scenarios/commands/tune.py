@@ -40,7 +40,7 @@ files FILE + | recorded data, CSV, Parquet or netCDF
 --prior FILE   | what is known of the gas path before (TOML): mean and sigma by state
 {given.ambient_options("a column, what the run file says, else ")}
 --out DIR      | keep JSON and figure there
---figures =on  | draw the estimates into it (default)
+{given.FIGURES}
 --json         | print JSON only
 --quiet        | no list of files
 """
@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from scenarios.figures.noiseplot import plot_noise
     from scenarios.shell import progress
 
+    given.drawn(args)  # refused before anything is computed
     apu = given.engine_file(args).unit
     m = readingoptions.recording(args, apu.gas_generator)
     sensors = read_sensors(args.sensors)

@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 NAME = "validate"
 HELP = "recompute published tables and numerical checks"
-OPTIONS = """
+OPTIONS = f"""
 --only A,B              | sections to run, comma separated
 --list                  | list the sections and stop
 --json                  | print JSON
 --pycycle-python PYTHON | a Python that has pyCycle, for section pycycle
 --write FILE            | also write the page, VALIDATION.md
 --figures DIR           | draw Figures 15 to 25 of the paper there, and stop
+{given.LOOK}
 """
 
 
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     if args.figures:
         from scenarios.validation import paper_figures
 
-        print(*paper_figures.write_figures(args.figures), sep="\n")
+        print(*paper_figures.write_figures(args.figures, how=given.look(args)), sep="\n")
         return 0
     names = given.names(args.only) if args.only else list(known)
     report = {}

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from apu_casadi.core.cf import KEYWORDS
 from apu_casadi.core.version import installed
 
 if TYPE_CHECKING:
@@ -161,6 +162,7 @@ def croissant(
         "name": r.name,
         "description": r.title,
         "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "keywords": list(KEYWORDS),
         "license": LICENCE,
         "version": installed(),
         "citeAs": f"apu-casadi {installed()}, data set {r.name}, seed {r.seed}",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core import files, results
+from apu_casadi.core.cf import described
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.signals import Signals
 
@@ -36,15 +37,18 @@ def save(model: LinearModel, path: str | Path, told: Mapping[str, Any]) -> Path:
     path = Path(path)
     if path.suffix not in KINDS:
         raise DataError(f"{path}: a linear model is saved as {' or '.join(KINDS)}")
+    title = f"linear model {model.name}"
     if path.suffix == ".nc":
         ds = model.labelled()
         if not len(model.theta):  # a dimension without entries is another thing in netCDF
             ds = ds.drop_dims("theta")
-        return results.save(ds.assign_attrs(told), path)
+        return results.save(described(ds.assign_attrs(told), title), path)
+    import xarray as xr
     from scipy.io import savemat
 
     A, B, C, D = model.matrices
     values: dict[str, Any] = {"A": A, "B": B, "C": C, "D": D, "model": model.name, **told}
+    values["about"] = described(xr.Dataset(), title).attrs
     u, u0 = Signals([*model.u, *model.theta]), np.append(model.u0, model.theta0)
     for k, signals, at in (("x", model.x, model.x0), ("u", u, u0), ("y", model.y, model.y0)):
         for what in ("name", "unit"):

@@ -15,7 +15,7 @@ from scenarios.figures import figstyle as fs
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FORMATS", "STYLES", "DrawnAs", "grey"]
+__all__ = ["DRAWN", "FORMATS", "STYLES", "DrawnAs", "grey"]
 
 FORMATS = ("png", "svg", "pdf")
 STYLES = ("colour", "grey")
@@ -73,14 +73,19 @@ class DrawnAs:
         Raises:
             DataError: a file cannot be written.
         """
+        return [self.save_as(fig, f"{os.fspath(stem)}.{form}") for form in self.formats]
+
+    def save_as(self, fig: Figure, path: str | os.PathLike[str]) -> Path:
+        """Write a figure into a file whose ending tells the format; otherwise as :meth:`save`."""
         if self.style == "grey":
-            grey(fig)
-        made = []
+            grey(fig)  # grey stays grey
+        form = Path(path).suffix[1:].lower()
         with fs.drawing(_WRITING):
-            for form in self.formats:
-                how = {"dpi": self.dpi, "metadata": _UNDATED.get(form)}
-                made.append(files.save_figure(fig, Path(f"{os.fspath(stem)}.{form}"), **how))
-        return made
+            return files.save_figure(fig, path, dpi=self.dpi, metadata=_UNDATED.get(form))
+
+
+DRAWN = DrawnAs()
+"""As figures are drawn where nothing is said."""
 
 
 def grey(fig: Figure) -> Figure:

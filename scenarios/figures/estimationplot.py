@@ -105,7 +105,8 @@ def plot_alarms(groups: Mapping[str, Sequence[Mapping[str, Any]]], note: str) ->
             kinds = list(dict.fromkeys(x["kind"] for x in rows))
             for k, kind in enumerate(kinds):
                 own = [x for x in rows if x["kind"] == kind]
-                look = {"color": fs.LINE_INK[k % 4], "marker": fs.MARKS[k % 4], "ms": 5, "lw": 1.6}
+                ink, mark = fs.look(k)
+                look = {"color": ink, "marker": mark, "ms": 5, "lw": 1.6}
                 # side by side, so that those of one size are told apart
                 at = np.array([x["value"] for x in own]) * (1 + 0.04 * (k - (len(kinds) - 1) / 2))
                 share = np.array([100 * x["share"] for x in own])

@@ -18,14 +18,14 @@ def figure_exchange_error(
     curves: Mapping[tuple[str, str], tuple[np.ndarray, Mapping[str, np.ndarray]]],
     quantities: Mapping[str, str],
     *,
-    mark: float = 0.020,
+    marked: float = 0.020,
 ) -> Figure:
     """Draw errors over the exchange step, one logarithmic panel for each quantity.
 
     Args:
         curves: by (case, exchange), steps [s] and errors by quantity, arrays of one shape (n,).
         quantities: panels, by name with their title; four at most.
-        mark: step [s] that is marked: the paper's.
+        marked: step [s] that is marked: the paper's.
     """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import FixedLocator, NullLocator
@@ -37,17 +37,18 @@ def figure_exchange_error(
     with fs.drawing():
         fig = fs.new_figure(7.4)
         place = {"left": 0.085, "right": 0.985, "hspace": 0.3, "wspace": 0.2}
-        grid = fig.add_gridspec(2, 2, **place, **fs.margins(fig, top=0.65, bottom=0.85))
+        grid = fig.add_gridspec(
+            2, 2, **place, **fs.margins(fig, top=0.65 if len(cases) < 4 else 0.8, bottom=0.85)
+        )
         for k, (q, head) in enumerate(quantities.items()):
             ax = fig.add_subplot(grid[k // 2, k % 2])
             for (case, ex), (dt, errors) in curves.items():
-                c = cases.index(case)
-                inside = fs.LINE_INK[c] if ex == exchanges[0] else "white"
-                look = {"color": fs.LINE_INK[c], "marker": fs.MARKS[c], "mfc": inside}
+                ink, mark = fs.look(cases.index(case))
+                look = {"color": ink, "marker": mark, "mfc": ink if ex == exchanges[0] else "white"}
                 ax.loglog(1e3 * dt, errors[q], ls=dash[ex], ms=4.5, lw=1.5, **look)
             every = np.concatenate([errors[q] for _, errors in curves.values()])
             _slopes(ax, steps, every)
-            ax.axvline(1e3 * mark, color=fs.MUTED, lw=0.9, zorder=0.5)
+            ax.axvline(1e3 * marked, color=fs.MUTED, lw=0.9, zorder=0.5)
             ax.xaxis.set_major_locator(FixedLocator(list(1e3 * steps)))
             ax.xaxis.set_minor_locator(NullLocator())
             ax.set_xticklabels([f"{1e3 * s:g}" for s in steps])
@@ -60,15 +61,21 @@ def figure_exchange_error(
                 ax.set_xlabel("Exchange step [ms]")
         handles = []
         for c, case in enumerate(cases):
-            look = {"color": fs.LINE_INK[c], "marker": fs.MARKS[c], "label": case}
+            ink, mark = fs.look(c)
+            look = {"color": ink, "marker": mark, "label": case}
             handles.append(Line2D([], [], ms=4.5, lw=1.5, **look))
         for ex in exchanges:
             inside = fs.INK if ex == exchanges[0] else "white"
             look = {"color": fs.INK, "marker": "o", "mfc": inside, "label": f"exchange “{ex}”"}
             handles.append(Line2D([], [], ms=4.5, lw=1.5, ls=dash[ex], **look))
-        where = {"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), "ncols": len(handles)}
-        space = {"columnspacing": 1.2, "handlelength": 2.4}
-        fig.legend(handles=handles, frameon=False, fontsize=8.8, **where, **space)
+        space = {"columnspacing": 1.2, "handlelength": 2.4, "frameon": False, "fontsize": 8.8}
+        n = len(cases)
+        rows = [handles] if len(handles) <= 6 else [handles[:n], handles[n:]]
+        for k, row in enumerate(rows):
+            where = (0.53, 1.0 - 0.03 * k)
+            fig.legend(
+                handles=row, ncols=len(row), loc="upper center", bbox_to_anchor=where, **space
+            )
         text = (
             "Error of the multi-rate exchange against the unit as one model with one solver. "
             "Grey: slopes 1 and 2. Vertical line: the paper's 20 ms."

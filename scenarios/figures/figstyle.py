@@ -32,6 +32,7 @@ PHASE_INK = ("#33536f", "#1f4e79", "#8a5a00", "#9c2a1c")
 LINE_INK = ("#0b5394", "#b45309", "#0f766e", "#7a3e9d")
 """Colours of curves that are compared."""
 MARKS = ("o", "s", "^", "D")
+"""Marks of their points, of as many."""
 BANDS = ("#eef2f7", "#e3ebf5", "#fdf1dd", "#fbe3e0")
 """Backgrounds of the phases of a run, in their order."""
 ABC = {"a": "#d55e00", "b": "#0072b2", "c": "#009e73"}
@@ -72,6 +73,12 @@ STYLE: dict[str, Any] = {
 
 #: Matplotlib keeps settings and fonts for the whole process: one thread draws at a time.
 _drawing = threading.RLock()
+
+
+def look(k: int) -> tuple[str, str]:
+    """Return colour and mark of curve k; beyond the last colour they pair anew, 16 in all."""
+    n = len(LINE_INK)
+    return LINE_INK[k % n], MARKS[(k + k // n) % n]
 
 
 @contextlib.contextmanager

@@ -248,12 +248,7 @@ def _draw(
             if surge is not None and published is not None:
                 _surge(ax, surge, published)
             for k, (label, (x, y)) in enumerate(zip(lines, drawn, strict=True)):
-                look = {
-                    "color": fs.LINE_INK[k % len(fs.LINE_INK)],
-                    "lw": 2.0,
-                    "ms": 3.2,
-                    "zorder": 5,
-                }
+                look = {"color": fs.look(k)[0], "lw": 2.0, "ms": 3.2, "zorder": 5}
                 ax.plot(x, y, marker="o", label=f"operating line, {label}", **look)
             if run is not None and trajectory is not None:
                 _draw_run(ax, *run, trajectory)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +66,7 @@ def figure_gas_generator(
             ax = fig.add_subplot(grid[r])
             fs.bands(ax, rows, names=r == 0)
             every = []
-            for ds, check, ink in zip(runs, checks, fs.LINE_INK, strict=False):
+            for ds, check, ink in zip(runs, checks, itertools.cycle(fs.LINE_INK), strict=False):
                 t, y = ds["time"].values, ds[name].values * scale
                 ax.plot(t, y, color=ink, lw=1.7, solid_joinstyle="round")
                 some = slice(None, None, max(t.size // 40, 1))
@@ -94,7 +95,7 @@ def _routes(runs: Sequence[xr.Dataset]) -> list[Any]:
     flows = [f"turbine flow factor {float(ds.attrs['f_W_t']):g}" for ds in runs]
     lines = [
         Line2D([], [], color=ink, lw=1.7, label=flow)
-        for flow, ink in zip(flows, fs.LINE_INK, strict=False)
+        for flow, ink in zip(flows, itertools.cycle(fs.LINE_INK), strict=False)
     ]
     dots = {"color": fs.INK, "marker": "o", "ls": "", "ms": 3.6, "mfc": "white"}
     return [*lines, Line2D([], [], label="continuous model, CVODES", **dots)]

@@ -75,7 +75,7 @@ def figure_profiles(ds: xr.Dataset) -> Figure:
         for k, (label, values) in enumerate(curves):
             ax = fig.add_subplot(grid[k, 0])
             fs.bands(ax, rows, names=k == 0)
-            ax.step(t, values, where="pre", color=fs.LINE_INK[k % 4], lw=1.7)
+            ax.step(t, values, where="pre", color=fs.look(k)[0], lw=1.7)
             ax.set_ylabel(label, fontsize=8.5)
             fs.roomy(ax, values[np.isfinite(values)], 0.1)
             ax.tick_params(labelbottom=k == len(curves) - 1)

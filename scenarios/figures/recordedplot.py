@@ -42,7 +42,8 @@ def plot_recorded(found: Any, note: str = "") -> Figure:
         grid = fig.add_gridspec(rows, 2, left=0.075, right=0.985, hspace=0.55, wspace=0.2, **place)
         for k, (name, curves, alarms) in enumerate(panels):
             ax = fig.add_subplot(grid[k // 2, k % 2])
-            for (label, t, value, half), ink in zip(curves, fs.LINE_INK, strict=False):
+            for j, (label, t, value, half) in enumerate(curves):
+                ink = fs.look(j)[0]
                 ax.fill_between(t, value - half, value + half, color=ink, alpha=0.2, lw=0)
                 ax.plot(t, value, color=ink, lw=1.2, label=label)
             if len(curves) > 1:

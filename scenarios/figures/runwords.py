@@ -129,15 +129,15 @@ def caption_of(
 ) -> None:
     """Write title, scenario, severity and what the run was made with under a figure.
 
-    Figures of the paper's scenario have their number.
+    Figures of the paper's scenario and unit have their number.
 
     Args:
         more: further words.
         number: of the generator that is drawn; None: the unit, or each.
     """
-    name = scenario_of(ds).get("name", "")
+    name, engine = (scenario_of(ds).get(n, "") for n in ("name", "engine"))
     title = FIGURES[key] if number is None else f"{FIGURES[key]} {number}"
-    number_of_it = f"Figure {key[3:5]}. " if name == PAPER else ""
+    number_of_it = f"Figure {key[3:5]}. " if name == PAPER and not engine else ""
     # one figure for several machines
     alike = number is None and title.endswith("starter/generator") and _count(ds) > 1
     title = title.replace("of the starter", "of each starter") if alike else title

@@ -71,7 +71,8 @@ def plot_consistency(
                 top.axhline(limit, color=fs.MUTED, lw=1.2, ls="--")
                 look = {"color": fs.MUTED, "bbox": _PATCH, "ha": "right"}
                 fs.remark(top, f"goal {limit:g}", (at[-1], limit), (0, 2), fontsize=8, **look)
-            for (name, v), ink, mark in zip(ratios.items(), fs.LINE_INK, fs.MARKS, strict=False):
+            for j, (name, v) in enumerate(ratios.items()):
+                ink, mark = fs.look(j)
                 top.plot(at, v, mark, ls="-", color=ink, lw=1.2, ms=2.6, label=name)
             reach = max(float(np.max(v)) for v in ratios.values())
             if reach > 5:
@@ -79,9 +80,8 @@ def plot_consistency(
             else:
                 top.set_ylim(0, 1.25 * max(reach, limit or 1.0))
             fs.title(top, heads[k])
-            for (name, (v, band)), ink, mark in zip(
-                checks.items(), fs.LINE_INK, fs.MARKS, strict=False
-            ):
+            for j, (name, (v, band)) in enumerate(checks.items()):
+                ink, mark = fs.look(j)
                 low.axhspan(*band, color=ink, alpha=0.07, lw=0)
                 for edge in band:
                     low.axhline(edge, color=ink, lw=0.7, ls=":")
@@ -122,7 +122,8 @@ def plot_null(
         fig.subplots_adjust(left=0.065, right=0.985, top=0.89, bottom=0.255, wspace=0.08)
         for ax, (head, t, curves) in zip(axes, panels, strict=True):
             at = _same_length(head, t, curves)
-            for (name, v), ink, mark in zip(curves.items(), fs.LINE_INK, fs.MARKS, strict=False):
+            for j, (name, v) in enumerate(curves.items()):
+                ink, mark = fs.look(j)
                 ax.plot(at, v, mark, ls="-", color=ink, lw=1.3, ms=3, label=name)
             ax.set_xlabel("time [s]")
             ax.set_ylim(bottom=0)
@@ -164,7 +165,8 @@ def plot_coverage(
         for k, (head, group) in enumerate(groups.items()):
             for j, (name, (share, low, high)) in enumerate(group.items()):
                 ends = [[100 * (share - low)], [100 * (high - share)]]
-                look = {"fmt": fs.MARKS[j % 4], "color": fs.LINE_INK[j % 4], "ms": 5, "capsize": 3}
+                ink, mark = fs.look(j)
+                look = {"fmt": mark, "color": ink, "ms": 5, "capsize": 3}
                 label = name if k == 0 else None
                 ax.errorbar(k * width + j, 100 * share, ends, lw=1.2, label=label, **look)
             place = {"ha": "center", "va": "top", "xycoords": fs.OF_AXES}

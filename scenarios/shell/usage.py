@@ -174,6 +174,8 @@ def _option(words: list[str]) -> tuple[list[str], dict[str, Any]]:
     if flags[0].startswith("-") and not {"metavar", "type", "choices"} & set(options):
         on = options.get("default") == "on"
         options |= _ON if on else {"action": "store_true"}
+    if flags[0].startswith("-") and options.get("nargs") == "?":
+        options["const"] = options.get("default")  # the flag alone
     if "type" in options and isinstance(options.get("default"), str):
         options["default"] = options["type"](options["default"])
     return flags, options

@@ -28,8 +28,10 @@ from estimators.apu.gaspathmodel import DT
 from estimators.apu.joint import beside_truth
 from estimators.apu.measuring import drawn_gains, measure_run, write_recording
 from estimators.apu.recorded_estimate import estimate as recorded_estimate
+from estimators.apu.recorded_report import compared_words
 from estimators.apu.recordings.measured import read_recording
 from estimators.apu.sensorfile import SensorFile, read_sensors
+from estimators.apu.trust import in_words, verdict
 from scenarios import registry
 from scenarios.schema import Scenario
 from scenarios.shell.template import Template
@@ -101,6 +103,9 @@ The change of health at {onset:g} s moved {name} by {of_n:+.1e} within {seconds:
 
 @doubt
 NOT TO BE BELIEVED as it stands: {why}.
+
+@parts
+Part by part{parts}.
 
 @caption
 Scenario {scenario}, seed {seed}; gain errors drawn for all sensors.
@@ -206,6 +211,7 @@ def estimate(
         raise EstimationError("; ".join(f"{n}: {why}" for n, why in e.lacking.items()))
     found = beside_truth(ds, e.sides, *e.path)
     told = {"doubts": list(e.doubts), "lacking": dict(e.lacking), "notes": list(e.notes)}
+    told |= {"belief": verdict(e.belief)}
     found.attrs |= {n: json.dumps(v) for n, v in told.items()} | {"seed": seed}
     found.attrs |= {n: ds.attrs[n] for n in ("scenario", "phases")}
     found.attrs |= {n: ds.attrs[n] for n in (*_TOLD, "apu_casadi_version") if n in ds.attrs}
@@ -267,7 +273,10 @@ def report(e: xr.Dataset) -> dict[str, Any]:
     about |= {k: scenario[k] for k in ("engine", "governor") if k in scenario}
     found_out = {"short_circuit": _short_circuit(e), "health": _health(e)}
     doubts = json.loads(e.attrs.get("doubts", "[]"))
-    about |= {"believable": not doubts, "doubts": doubts}
+    belief = json.loads(e.attrs.get("belief", "{}"))
+    about |= {"believable": not doubts, "doubts": doubts, "belief": belief}
+    if compared := json.loads(e.attrs.get("compared", "{}")):
+        about["compared"] = compared
     out = {**about, "seed": e.attrs["seed"], **made_with(e), "phases": rows, **found_out}
     return {**out, "cross_talk": _cross_talk(e)}
 
@@ -418,7 +427,10 @@ def words(r: Mapping[str, Any]) -> list[str]:
     for c in talk["health_on_h"]:
         n = max(c["change"], key=lambda n: abs(c["change"][n]))
         out.append(TEXT.text("h moved", name=n, of_n=c["change"][n], sigma_n=c["sigma"][n], **c))
-    return [*out, *(TEXT.text("doubt", why=d) for d in r.get("doubts", ()))]
+    out += [f"{s[:1].upper()}{s[1:]}." for s in compared_words(r.get("compared"))]
+    out += [TEXT.text("doubt", why=d) for d in r.get("doubts", ())]
+    parts = in_words(r.get("belief", {})) if r.get("doubts") else ""
+    return [*out, TEXT.text("parts", parts=parts)] if parts else out
 
 
 def _short_circuit_words(s: Mapping[str, Any]) -> list[str]:

@@ -293,7 +293,7 @@ def figure(rows: Sequence[Measured]) -> Any:
     }
     if not curves:
         raise ScenarioError("nothing to draw: at least two exchange steps are needed")
-    return figure_exchange_error(curves, QUANTITIES, mark=PAPER_STEP)
+    return figure_exchange_error(curves, QUANTITIES, marked=PAPER_STEP)
 
 
 def write_figure(rows: Sequence[Measured], path: Path, dpi: float | None = None) -> Path:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core import files, simulation
+from apu_casadi.core import simulation
 from apu_casadi.core.errors import ScenarioError, nearest
 from apu_casadi.core.results import dataset
 from apu_casadi.core.sharing import last
@@ -29,6 +29,7 @@ from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
+from scenarios.figures.drawnas import DRAWN, DrawnAs
 from scenarios.validation.comparison import Row, compared, run, section
 
 if TYPE_CHECKING:
@@ -289,15 +290,21 @@ def table10() -> list[Row]:
 # --------------------------------------------------------------------------- figures
 
 
-def write_figures(folder: str | os.PathLike[str], *, joint: bool = True) -> list[Path]:
-    """Write Figures 15 to 19, and 20 to 25 of the joint run, as PNG; return the paths.
+def write_figures(
+    folder: str | os.PathLike[str], *, joint: bool = True, how: DrawnAs = DRAWN
+) -> list[Path]:
+    """Write Figures 15 to 19, and 20 to 25 of the joint run; return the paths.
+
+    Args:
+        folder: where they go.
+        joint: also those of the joint run.
+        how: formats, resolution, style.
 
     Raises:
         DataError: the folder cannot be written.
     """
     from scenarios import registry
     from scenarios.figures import moduleplots, plotting
-    from scenarios.figures.figstyle import DPI
 
     out = registry.prepare(folder)
     draw = {
@@ -321,7 +328,7 @@ def write_figures(folder: str | os.PathLike[str], *, joint: bool = True) -> list
     )
     made = []
     for key, figure in draw.items():
-        made.append(files.save_figure(figure(), out / f"{key}.png", dpi=DPI))
+        made += how.save(figure(), out / key)
     if joint:
-        made += plotting.save_figures(registry.run("joint"), out)
+        made += plotting.save_figures(registry.run("joint"), out, how)
     return made

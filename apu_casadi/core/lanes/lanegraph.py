@@ -18,6 +18,7 @@ from apu_casadi.core.lanes.lanecode import BINARY, UNARY, Fixed, NoForm, Writer,
 
 _MOVES = {ca.OP_RESHAPE, ca.OP_SPARSITY_CAST, ca.OP_TRANSPOSE, ca.OP_PROJECT, ca.OP_GETNONZEROS}
 _MOVES |= {ca.OP_HORZREPMAT}
+COLUMNS = 4  # of a product that are summed at once
 _JOINS = {ca.OP_HORZCAT, ca.OP_VERTCAT, ca.OP_DIAGCAT}
 _SPLITS = {ca.OP_HORZSPLIT, ca.OP_VERTSPLIT}
 _SETS = {ca.OP_SETNONZEROS: "=", ca.OP_ADDNONZEROS: "+="}
@@ -227,8 +228,9 @@ class _Graph:
         self.tables[k] = table = self.writer.table("double", [number(v) for v in values])
         looked_up = (ca.OP_LOW, ca.OP_GETNONZEROS_PARAM)
         for later in range(k + 1, self.n):
-            if i in self.ins[later][1:] or (
-                i in self.ins[later][:1] and self.op[later] not in looked_up
+            if self.op[later] != ca.OP_INPUT and (
+                i in self.ins[later][1:]
+                or (i in self.ins[later][:1] and self.op[later] not in looked_up)
             ):
                 self._each(len(values), f"{self._w(i)}[k]={self.p}all({table}[k])")
                 return
@@ -324,11 +326,7 @@ class _Graph:
             self._each(z.nnz(), f"{to}[k]={self._get(self.ins[k][0])}[k]")
         X, Y = self._get(ix), self._get(iy)
         if x.is_dense() and y.is_dense() and z.is_dense():
-            (n, m), q = x.shape, y.shape[1]
-            self.body.append(
-                f"for(int i=0;i<{q};i++)for(int j=0;j<{n};j++){{{self.T} s={to}[j+i*{n}];"
-                f"for(int k=0;k<{m};k++)s=s+{X}[j+k*{n}]*{Y}[k+i*{m}];{to}[j+i*{n}]=s;}}"
-            )
+            self._dense(to, X, Y, (*x.shape, y.shape[1]))
             return
         rows: list[tuple[int, int, int]] = []
         x_at, y_at, z_at = (np.array(_positions(s).full(), int) - 1 for s in (x, y, z))
@@ -339,6 +337,21 @@ class _Graph:
                         rows.append((z_at[i, j], x_at[i, r], y_at[r, j]))
         a, b, c = (self._at([int(row[q]) for row in rows]) for q in range(3))
         self._each(len(rows), f"{to}[{a}]={to}[{a}]+{X}[{b}]*{Y}[{c}]")
+
+    def _dense(self, to: str, X: str, Y: str, sizes: tuple[int, ...]) -> None:
+        """Dense z + x y, some columns at once: what is read of x serves all of them."""
+        (n, m, q), at, T = sizes, 0, self.T
+        for width in (COLUMNS, 1):
+            end, each = at + (q - at) // width * width, range(width)
+            if end > at:
+                first = ",".join(f"s{c}={to}[j+(i+{c})*{n}]" for c in each)
+                add = "".join(f"s{c}=s{c}+b*{Y}[k+(i+{c})*{m}];" for c in each)
+                last = "".join(f"{to}[j+(i+{c})*{n}]=s{c};" for c in each)
+                self.body.append(
+                    f"for(int i={at};i<{end};i+={width})for(int j=0;j<{n};j++){{{T} {first};"
+                    f"for(int k=0;k<{m};k++){{const {T} b={X}[j+k*{n}];{add}}}{last}}}"
+                )
+            at = end
 
     # -------------------------------------------------------------------------- tables
 
@@ -369,6 +382,9 @@ class _Graph:
         s, table = info["inner"], self._table_of(k)
         which = f"({s['start']}+k*{s['step']})"
         n = node.nnz()
+        if table and s["step"] == 1:
+            self.body.append(f"{self.p}rows({table}+{s['start']},{at}[0],{n},{to});")
+            return
         source = f"{table}[q+{which}]" if table else f"{self._get(self.ins[k][0])}[q+{which}][l]"
         self._room(1)
         self.body.append(

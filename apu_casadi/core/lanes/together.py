@@ -34,19 +34,21 @@ __all__ = [
     "ensemble",
 ]
 
-CHUNK = 64  # members that are under way at once
+CHUNK = 128  # members that are under way at once
+OFTEN = 40  # calls one by one before code in lanes is compiled; scalar code is after 50
 T = TypeVar("T")
 
 
 class Question(Exception):  # noqa: N818 - no error
-    """What a member of an ensemble asks: a function, and its arguments, copied."""
+    """What a member of an ensemble asks: a function, its arguments, copied, and how many calls."""
 
     function: Together
     given: tuple[np.ndarray, ...]
+    calls: int
 
-    def __init__(self, function: Together, given: tuple[np.ndarray, ...]) -> None:
+    def __init__(self, function: Together, given: tuple[np.ndarray, ...], calls: int) -> None:
         super().__init__(f"{function.fun.name()} is asked for by a member of an ensemble")
-        self.function, self.given = function, given
+        self.function, self.given, self.calls = function, given, calls
 
 
 #: What a member does: it yields questions, and returns its result.
@@ -115,7 +117,8 @@ class Together:
     Args:
         fun: as compiled for one call.
         of: what it was compiled from, with dense inputs and outputs.
-        one: evaluates one call; a ``Caller`` of ``fun`` if not given.
+        one: evaluates one call, compiled or not; a ``Caller`` of ``fun`` if not given.  With it,
+            code in lanes is compiled after ``OFTEN`` calls only; a library that is there is loaded.
     """
 
     def __init__(
@@ -126,7 +129,8 @@ class Together:
     ) -> None:
         self.fun, self.of = fun, of
         self._one = one  # a member's own is never made where all ask
-        self._wide: Caller | None = None
+        self._in_lanes: Caller | None = None
+        self._left = 0 if one is None else OFTEN
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
     def __call__(self, *given: Any) -> tuple[np.ndarray, ...]:
@@ -136,12 +140,31 @@ class Together:
             Question: by a member of an ensemble whose answer is not there yet.
             BackendError: as of a ``Caller``.
         """
+        made = self._asked(given, 0)
+        return self._alone(*given) if made is None else made
+
+    def in_a_row(self, calls: int, *given: Any) -> tuple[np.ndarray, ...]:
+        """Evaluate so many times, or ask; each call takes the last one's first output first.
+
+        Returns:
+            Each output of all calls, side by side.
+
+        Raises:
+            Question, BackendError: as of a call.
+        """
+        made = self._asked(given, calls)
+        if made is None:
+            arrays = tuple(np.array(a, dtype=float) for a in given)
+            (made,) = self.evaluate([Question(self, arrays, calls)])
+        return made
+
+    def _asked(self, given: Sequence[Any], calls: int) -> tuple[np.ndarray, ...] | None:
+        """Return the answer to a member's question, ask it, or None outside of ensembles."""
         member = _here.get()
-        if member is None:
-            return self._alone(*given)
-        results = member.answered(self)
-        if results is None:
-            member.asks = Question(self, tuple(np.array(a, dtype=float) for a in given))
+        results = None if member is None else member.answered(self)
+        if member is not None and results is None:
+            arrays = tuple(np.array(a, dtype=float) for a in given)
+            member.asks = Question(self, arrays, calls)
             raise member.asks
         return results
 
@@ -150,68 +173,115 @@ class Together:
             self._one = Caller(self.fun, copy=False)
         return self._one(*given)
 
-    def evaluate(self, asked: Sequence[tuple[np.ndarray, ...]]) -> list[tuple[np.ndarray, ...]]:
+    def evaluate(self, asked: Sequence[Question]) -> list[tuple[np.ndarray, ...]]:
         """Return the results for some members, as many as there are lanes at most."""
-        if len(asked) == 1:
-            return [tuple(a.copy() for a in self._alone(*asked[0]))]
-        wide, n = self._call, len(asked)
-        lanes = wide.fun.size2_out(0) // self._outputs[0][1]
-        if n > lanes:
-            raise BackendError(f"{self.fun.name()}: {n} members for {lanes} lanes")
-        for i, buffer in enumerate(wide.inputs):
-            flat = buffer.ravel(order="K").reshape(lanes, -1)  # a view: one member a row
-            for k in range(lanes):
-                flat[k] = asked[min(k, n - 1)][i].ravel(order="F")
-        wide.evaluate()
+        calls = max(1, *(q.calls for q in asked)) if len(asked) > 1 else max(1, asked[0].calls)
+        rows = self._one_by_one(asked[0], calls) if len(asked) == 1 else self._wide(asked, calls)
         results = []
-        for k in range(n):
+        for k, q in enumerate(asked):
             own = []
-            for buffer, (rows, columns) in zip(wide.outputs, self._outputs, strict=True):
-                part = buffer.ravel(order="K").reshape(lanes, -1)[k].copy()
-                own.append(part if columns == 1 else part.reshape((rows, columns), order="F"))
+            for row, (n, columns) in zip(rows, self._outputs, strict=True):
+                if q.calls:
+                    part = row[: q.calls, k].reshape(q.calls * columns, n).T
+                else:
+                    part = row[0, k].copy() if columns == 1 else row[0, k].reshape(columns, n).T
+                own.append(part)
             results.append(tuple(own))
         return results
 
+    def _room(self, calls: int, lanes: int) -> list[np.ndarray]:
+        return [np.empty((calls, lanes, n * columns)) for n, columns in self._outputs]
+
+    def _one_by_one(self, asked: Question, calls: int) -> list[np.ndarray]:
+        """Return the outputs of a row of calls, each of shape (calls, 1, entries)."""
+        rows, (first, *rest) = self._room(calls, 1), asked.given
+        self._left -= calls
+        for i in range(calls):
+            made = self._alone(first, *rest)
+            for row, out in zip(rows, made, strict=True):
+                row[i, 0] = out.ravel(order="F")
+            first = made[0].copy()
+        return rows
+
+    def _wide(self, asked: Sequence[Question], calls: int) -> list[np.ndarray]:
+        """Return the outputs of rows of calls in lanes, each of shape (calls, lanes, entries)."""
+        wide, lanes = self._call, self.lanes
+        if len(asked) > lanes:
+            raise BackendError(f"{self.fun.name()}: {len(asked)} members for {lanes} lanes")
+        # views, one member a row
+        given, made = (
+            [a.ravel(order="K").reshape(lanes, -1) for a in arrays]
+            for arrays in (wide.inputs, wide.outputs)
+        )
+        for i, flat in enumerate(given):
+            for k in range(lanes):
+                flat[k] = asked[min(k, len(asked) - 1)].given[i].ravel(order="F")
+        rows = self._room(calls, lanes)
+        for i in range(calls):
+            if i:
+                given[0][...] = made[0]
+            wide.evaluate()
+            for row, out in zip(rows, made, strict=True):
+                row[i] = out
+        return rows
+
     @property
     def lanes(self) -> int:
-        """Members that are evaluated at once."""
+        """Members that are evaluated at once; one while nothing is compiled."""
+        if not self._ready():
+            return 1
         return int(self._call.fun.size2_out(0)) // int(self._outputs[0][1])
+
+    def _ready(self) -> bool:
+        """Whether lanes may be used: they are compiled, or the calls so far are worth it."""
+        if self._in_lanes is None and self._left == OFTEN:
+            made = in_lanes(self.of, build=False)
+            if made.class_name() == "External":
+                self._in_lanes = Caller(made, copy=False)
+        return self._in_lanes is not None or self._left <= 0
 
     @property
     def _call(self) -> Caller:
-        if self._wide is None:
-            self._wide = Caller(in_lanes(self.of), copy=False)
-        return self._wide
+        if self._in_lanes is None:
+            self._in_lanes = Caller(in_lanes(self.of), copy=False)
+        return self._in_lanes
 
 
-def answer(members: Sequence[Member], pool: Executor | None = None) -> None:
+def answer(
+    members: Sequence[Member], pool: Executor | None = None, *, patient: bool = False
+) -> None:
     """Answer the questions of members, those of each function together.
 
     Args:
         members: those that ask; the others are left alone.
         pool: threads that evaluate packs of lanes at the same time; None evaluates one by one.
+        patient: answer those only that fill all lanes, or, where there are none, the most that ask
+            for one function.
     """
-    asking: dict[int, list[Member]] = {}  # by function: each member may have buffers of its own
-    functions: dict[int, Together] = {}
+    asking: dict[int, list[Question]] = {}  # by function: each member may have buffers of its own
+    whose: dict[Question, Member] = {}
     for m in members:
         if m.asks is not None:
-            key = hash(m.asks.function.of)
-            asking.setdefault(key, []).append(m)
-            functions.setdefault(key, m.asks.function)
-    packs = []
-    for key, own in asking.items():
-        function = functions[key]
-        n = function.lanes if len(own) > 1 else 1
-        packs += [(function, own[i : i + n]) for i in range(0, len(own), n)]
+            whose[m.asks] = m
+            asking.setdefault(hash(m.asks.function.of), []).append(m.asks)
+    packs: list[list[Question]] = []
+    full: list[list[Question]] = []
+    for own in asking.values():
+        own.sort(key=lambda q: -q.calls)  # rows of calls that are equally long go together
+        n = own[0].function.lanes if len(own) > 1 else 1
+        parts = [own[i : i + n] for i in range(0, len(own), n)]
+        packs += parts
+        full += [p for p in parts if len(p) == n and len(own) > 1]
+    if patient and packs:
+        packs = full or [max(packs, key=len)]
 
-    def work(pack: tuple[Together, list[Member]]) -> list[tuple[np.ndarray, ...]]:
-        function, own = pack
-        return function.evaluate([m.asks.given for m in own if m.asks is not None])
+    def work(pack: list[Question]) -> list[tuple[np.ndarray, ...]]:
+        return pack[0].function.evaluate(pack)
 
     done = map(work, packs) if pool is None else pool.map(work, packs)
-    for (_, own), results in zip(packs, done, strict=True):
-        for m, r in zip(own, results, strict=True):
-            m.take(r)
+    for own, results in zip(packs, done, strict=True):
+        for q, r in zip(own, results, strict=True):
+            whose[q].take(r)
 
 
 def alone(course: Course[T]) -> T:
@@ -257,13 +327,15 @@ def _moved(
     """Move each member to its next question, and answer; yields those that end."""
     for _ in range(len(under_way)):
         k, course, member = under_way.popleft()
-        try:
-            with member:
-                next(course)
-        except StopIteration as end:
-            yield k, end.value
-        except Exception as error:
-            yield k, error
-        else:
-            under_way.append((k, course, member))
-    answer([m for _, _, m in under_way], pool)
+        if member.asks is None:
+            try:
+                with member:
+                    next(course)
+            except StopIteration as end:
+                yield k, end.value
+                continue
+            except Exception as error:
+                yield k, error
+                continue
+        under_way.append((k, course, member))
+    answer([m for _, _, m in under_way], pool, patient=True)

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.core.backend import rarely
 from apu_casadi.core.errors import ApuError
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
@@ -42,6 +43,7 @@ from estimators.apu.sensors import SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, run
+from estimators.information.posterior import named_posterior
 from estimators.models.filtermodel import Unknown
 from estimators.models.recording import Recording
 
@@ -101,14 +103,9 @@ def probabilities(
         prior: weights by kind.
     """
     members = [kind_of(n, prior) for n in loglik]
-    score = {
-        n: v + math.log(prior[k] / members.count(k)) if math.isfinite(v) else -math.inf
-        for (n, v), k in zip(loglik.items(), members, strict=True)
-    }
-    top = max(score.values())
-    weight = {n: math.exp(v - top) for n, v in score.items()}
-    total = sum(weight.values())
-    return {n: w / total for n, w in weight.items()}
+    weight = [math.log(prior[k] / members.count(k)) for k in members]
+    score = zip(loglik.items(), weight, strict=True)
+    return named_posterior({n: v + w for (n, v), w in score})
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +214,6 @@ class _Piece:
         late = (t >= self.change - 1e-9) & np.isfinite(v)
         fit = np.polynomial.Polynomial.fit(t[late], np.unwrap(np.angle(v[late])), 2)
         said = np.where(t >= self.change - 1e-9, fit.deriv()(t), a["w_r"])
-        known = replace(self, samples=a | {"w_r": said})
         late, sigma = t >= self.change - 1e-9, self.sensors.sigma("w_r", said)
         off = a["w_r"] - said
         self.failed["sensor w_r"] = failure(t[late], a["w_r"][late], off[late], sigma[late])
@@ -227,6 +223,7 @@ class _Piece:
         misses = max((z @ z / n - 1) * math.sqrt(n / 2), abs(z.sum()) / math.sqrt(n))
         if misses < SPEED_MISSES:
             return -math.inf
+        known = replace(self, samples=a | {"w_r": said})
         # slope and curvature were found
         return float(known.run(phases=())[0].loglik) - math.log(max(int(late.sum()), 2))
 
@@ -251,7 +248,7 @@ def causes_of_change(
     samples: Mapping[str, np.ndarray],
     change: float,
     *,
-    backend: str | None = "vm",
+    backend: str | None = None,
 ) -> Causes | None:
     """Tell what a change of the waveforms is; None where there are too few samples around it.
 
@@ -259,13 +256,14 @@ def causes_of_change(
         machine, sensors: as the filter knows them; sensors with gain errors taken for noise.
         samples: as :meth:`ElectricalFilter.recording` takes them.
         change: its instant, s; that of the first sample where it was there from the start.
-        backend: see :func:`apu_casadi.core.backend.compiled`; the virtual machine is faster for
-            filters that are run once.
+        backend: see :func:`apu_casadi.core.backend.compiled`; by default as for what is done
+            :func:`~apu_casadi.core.backend.rarely`.
     """
     t = samples["t"]
     at = (t >= change - BEFORE - 1e-9) & (t <= change + AFTER + 1e-9)
     if at.sum() < FEWEST or (t[at] >= change).sum() < FEWEST // 4:
         return None
+    backend = backend or rarely("causes of a change")
     piece = _Piece(machine, sensors, {n: v[at] for n, v in samples.items()}, change, backend)
     found: dict[str, float] = {}
 

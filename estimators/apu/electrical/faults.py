@@ -18,6 +18,7 @@ from estimators.apu.electrical.terminalsignals import ADMITTANCE, PHASES_I
 from estimators.apu.electrical.tuning import BENT, FAULT_LEVEL, LEAST_SUSCEPTANCE
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
+from estimators.information.posterior import posterior
 
 __all__ = ["Verdict", "describe", "faulty_phase", "leaky_fault", "ridge", "shunt_of"]
 
@@ -69,8 +70,7 @@ def faulty_phase(belief: Belief | FilterResult, *, level: float = FAULT_LEVEL) -
     best = int(np.argmax(stat))
     # marginal likelihood over h > 0 with a flat prior: exp(stat/2) / sqrt(info)
     score = stat / 2 - 0.5 * np.log(np.diag(info))
-    prob = np.exp(score - score.max())
-    prob /= prob.sum()
+    prob = posterior(score)
     bent = BENT if f"gain_{PHASES_I[0]}" in b.x.names else 0.0
     return Verdict(
         PHASES[best] if stat[best] > level else None,

@@ -24,6 +24,7 @@ import numpy as np
 
 from apu_casadi.core.checked import number
 from apu_casadi.core.errors import ParameterError
+from estimators.information.posterior import posterior
 
 __all__ = ["COMMON", "FAULTY", "H_SCALE", "Hypotheses", "SeverityPrior", "loose_in_common"]
 
@@ -123,9 +124,7 @@ class Hypotheses:
     def probability(self) -> np.ndarray:
         """Of no short circuit, and of one in each phase, (4, n)."""
         odds = np.vstack([np.zeros(self.odds.shape[1]), self.odds])
-        share = np.exp(odds - odds.max(0))
-        out: np.ndarray = share / share.sum(0)
-        return out
+        return posterior(odds)
 
     def severities(self) -> np.ndarray:
         """Severity of each phase and its standard deviation if one has a short circuit, (2, 3, n).
@@ -133,8 +132,7 @@ class Hypotheses:
         The phase that is likelier not to be the faulty one keeps the standard deviation that it
         would have, so that a severity too small to be found is within the band.
         """
-        share = np.exp(self.odds - self.odds.max(0))
-        share /= share.sum(0)
+        share = posterior(self.odds)
         spread = share * (1 - share) * self.h**2
         return np.array([share * self.h, np.sqrt(self.variance + spread)])
 

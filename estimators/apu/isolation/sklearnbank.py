@@ -21,6 +21,7 @@ from estimators.apu.isolation.classifiers import isolate, recording_of
 from estimators.apu.isolation.problem import CLASSES, DEFAULT, OUTPUTS, Protocol
 from estimators.apu.isolation.truth import Windows
 from estimators.apu.isolation.windowmodel import model_of
+from estimators.information.posterior import posterior
 
 try:
     from sklearn.base import BaseEstimator, ClassifierMixin
@@ -89,9 +90,8 @@ class IsolationBank(ClassifierMixin, BaseEstimator):
         for i in range(n):
             data = recording_of(model, w, i, pr)
             verdict = isolate(data, pr, gg, methods=tuple(dict.fromkeys(("glr", self.method))))
-            log_p = verdict.log_probability[self.method][at]
-            out[i] = np.exp(log_p - log_p.max())
-        return np.asarray(out / out.sum(axis=1, keepdims=True))
+            out[i] = posterior(verdict.log_probability[self.method][at])
+        return out
 
     def predict(self, X: Any) -> np.ndarray:
         """Return the most probable class of each window."""

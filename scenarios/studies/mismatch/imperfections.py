@@ -78,6 +78,7 @@ class Imperfection:
         change: see the module.
         fault: which of ``FAULTS`` is in all runs; None: they take turns.
         healthy: a filter may be asked to hold: no fault, and nothing that is broken.
+        only: what is measured, ``"gaspath"`` alone; None: all.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Imperfection:
     change: Callable[[Any, float], Any]
     fault: str | None = None
     healthy: bool = False
+    only: str | None = None
 
 
 IMPERFECTIONS: dict[str, Imperfection] = {}
@@ -284,6 +286,11 @@ imperfection("fuel flow bias", "sensors", "relative", (0.01, 0.03, 0.06))(_gaine
 @imperfection("P3 drift", "sensors", "relative, to the end", (0.005, 0.02, 0.05))
 def _(c: Readings, size: float) -> None:
     c.gaspath["P3"] = c.gaspath["P3"] * (1 + size * c.gaspath["t"] / DURATION)
+
+
+@imperfection("shaft power drift", "sensors", "to the end", (0.02, 0.05, 0.1), only="gaspath")
+def _(c: Readings, size: float) -> None:
+    c.gaspath["PW"] = c.gaspath["PW"] * (1 + size * c.gaspath["t"] / DURATION)
 
 
 @imperfection("ambient temperature", "recording", "K", (1.0, 5.0, 10.0), healthy=True)

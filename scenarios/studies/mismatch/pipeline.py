@@ -22,6 +22,7 @@ from estimators.apu.gaspath import window_means
 from estimators.apu.measuring import measure_run
 from estimators.apu.recorded_estimate import RecordedEstimate, estimate
 from estimators.apu.recordings.measured import read_recording
+from estimators.apu.trust import GAS, machine
 from scenarios.studies.mismatch.imperfections import (
     DURATION,
     FAULTS,
@@ -85,7 +86,7 @@ def recorded(entry: Imperfection, size: float, seed: int, fault: str) -> tuple[A
 
 
 def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, Any]:
-    """Return errors over sigmas at the end, by quantity, and alarms that are false.
+    """Return errors over sigmas at the end, by quantity, and false alarms, all and by part.
 
     A report of what did happen, not before it did, is no false one.
     """
@@ -95,7 +96,7 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
         x, s = (float(d[f"{name}{end}"].values[-1]) for end in ("", "_sigma"))
         z[name] = (x - true) / s
 
-    t, false = ds["time"].values, 0
+    t, false = ds["time"].values, Counter[str]()
     if e.gaspath is not None:
         # a recording whose fuel flow ends has no estimate beyond
         end = int(np.searchsorted(t, e.gaspath["time"].values[-1] + 1e-7)) - 1
@@ -103,8 +104,8 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
             put(n, e.gaspath, float(ds[n].values[end]))
         changed = any(ds[n].values[-1] != ds[n].values[0] for n in HEALTH)
         found = json.loads(e.gaspath.attrs["alarms"])
-        false += sum(not (changed and a > ONSET - SETTLED) for a in found)
-    for m in e.machines.values():
+        false[GAS] += sum(not (changed and a > ONSET - SETTLED) for a in found)
+    for k, m in e.machines.items():
         h_true = float(severity_h(ds["mu"].values[-1], ds["k_rf"].values[-1]))
         for p in PHASES:
             there = fault == "short circuit" and p == phase
@@ -115,12 +116,19 @@ def judged(ds: Any, e: RecordedEstimate, fault: str, phase: str) -> dict[str, An
         rising = np.flatnonzero((said[1:] > 0) & (said[1:] != said[:-1])) + 1
         right = [
             fault == "short circuit"
-            and PHASES[said[k] - 1] == phase
-            and m["time"].values[k] > ONSET - SETTLED
-            for k in rising
+            and PHASES[said[i] - 1] == phase
+            and m["time"].values[i] > ONSET - SETTLED
+            for i in rising
         ]
-        false += len(right) - sum(right)
-    return {"z": z, "false": int(false)}
+        false[machine(k)] += len(right) - sum(right)
+    return {"z": z, "false": false.total(), "false_of": dict(false)}
+
+
+def part_of(quantity: str) -> str:
+    """Return the part of an estimate that a quantity is of; there is one machine."""
+    if quantity in ("N", *HEALTH):
+        return GAS
+    return machine(1) if quantity == "P_total" else f"{machine(1)}: {quantity}"
 
 
 def mismatch(
@@ -136,8 +144,8 @@ def mismatch(
 
     Returns:
         ``runs``; ``refused``: no estimate, but a message; ``flagged``: with doubts; ``wrong``: an
-        error beyond ``WRONG`` sigmas; ``silent``: wrong and believed; ``false_alarms`` and
-        ``silent_false_alarms``: runs with false alarms, and those of them that were believed;
+        error beyond ``WRONG`` sigmas; ``silent``: of a part that is believed; ``false_alarms`` and
+        ``silent_false_alarms``: runs with false alarms, and those of a part that is believed;
         ``z``: largest error over sigma of each quantity; ``seconds`` of data; ``doubts``: in how
         many runs by kind; ``missed``: seed and what was wrong of silent runs.
     """
@@ -150,23 +158,26 @@ def mismatch(
         count["runs"] += 1
         tell(k + 1, n)
         try:
-            e = estimate(read_recording(r.gaspath, r.electrical), Apu(), backend=backend)
+            given = (r.gaspath,) if entry.only == "gaspath" else (r.gaspath, r.electrical)
+            e = estimate(read_recording(*given), Apu(), backend=backend)
         except ApuError:
             count["refused"] += 1
             continue
         j = judged(ds, e, fault, PHASES[seed % 3])
         bad = {q: v for q, v in j["z"].items() if not abs(v) <= WRONG}
+        wrong = bool(bad)
         for q, v in j["z"].items():
             worst[q] = max(worst[q], abs(v)) if math.isfinite(v) else math.inf
-        flagged = not e.believable
+        bad = {q: v for q, v in bad.items() if not e.belief[part_of(q)]}
+        false = sum(n for part, n in j["false_of"].items() if not e.belief[part])
         doubts.update({kind_of(d) for d in e.doubts})
-        count["flagged"] += flagged
-        count["wrong"] += bool(bad)
-        count["silent"] += bool(bad) and not flagged
+        count["flagged"] += not e.believable
+        count["wrong"] += wrong
+        count["silent"] += bool(bad)
         count["false_alarms"] += bool(j["false"])
-        count["silent_false_alarms"] += bool(j["false"]) and not flagged
-        if (bad or j["false"]) and not flagged:
-            missed.append({"seed": seed, "fault": fault, "z": bad, "false": j["false"]})
+        count["silent_false_alarms"] += bool(false)
+        if bad or false:
+            missed.append({"seed": seed, "fault": fault, "z": bad, "false": false})
     keys = ["runs", "refused", "flagged", "wrong", "silent", "false_alarms", "silent_false_alarms"]
     out: dict[str, Any] = {k: count[k] for k in keys}
     out |= {"size": size, "unit": entry.unit, "seconds": DURATION * n, "z": worst}
