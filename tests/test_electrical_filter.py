@@ -160,6 +160,33 @@ def test_the_usual_nis_of_a_window_is_the_median_of_those_before():
         assert (_usual(share[:n], first) == np.maximum(want, len(MEASURED))).all()
 
 
+def test_a_severity_is_found_from_its_onset_between_windows():
+    """h = 2.4e-3 at 52.7 ms: samples before it in the same window would hold h back."""
+    h = 2.4e-3
+    truth = generator_truth(FULL, 0.08, ((0.0527, Ttsc(0.05, 0.05 / h - 0.95, phase="b")),))
+    filt = electrical_filter(gains="estimate")
+    samples = samples_of(truth, np.random.default_rng(2))
+    r, resets = track(filt, filt.prior(samples), filt.recording(samples), cov_at=np.array([700]))
+    assert resets[0] == pytest.approx(0.0527, abs=2.1e-4)
+    v = faulty_phase(Belief(r.x, r.mean[:, 700], r.some_cov[0]))
+    assert v.phase == "b"
+    assert v.h == pytest.approx(h, abs=4 * v.sigma)
+
+
+@pytest.mark.parametrize("gains", ["none", "consider"])
+def test_a_start_with_a_large_severity_follows_the_unbalance(gains):
+    """h = 1e-2 turns the rotor by a tenth of a radian, and the flux turns backwards, too."""
+    fault = Ttsc(0.05, 0.05 / 1e-2 - 0.95, phase="c")
+    truth = generator_truth(FULL, 0.02, ((-0.1, fault),), start=0.15)
+    filt = electrical_filter(gains=gains)
+    samples = samples_of(truth, np.random.default_rng(3))
+    prior = filt.prior(samples)
+    assert prior["h_c"][0] == pytest.approx(1e-2, rel=0.1)
+    assert prior["h_a"][0] == prior["h_b"][0] == 0.0
+    r = extended_kalman_filter(filt.model, prior, filt.recording(samples))
+    assert r.nis[:100].mean() < 20.0
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_single_severities_hold_what_all_three_have_in_common(seed):

@@ -13,7 +13,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError, ParameterError, nearest
 from apu_casadi.core.sharing import Parametric, last, of_family, remade
 from apu_casadi.machine.machinedata import MACHINE, MachineParameters, require_linear
-from apu_casadi.machine.park import PHASE_ANGLE, PHASES
+from apu_casadi.machine.park import PHASE_ANGLE, PHASES, Abc, abc_to_qd0
 from apu_casadi.machine.terminals import (
     FLUXES,
     INPUTS,
@@ -45,6 +45,7 @@ from estimators.apu.electrical.tuning import (
     H_BALANCED,
     H_BALANCED_CONSIDERED,
     H_SIGMA,
+    H_STRAIGHT,
     H_WALK,
     H_WALK_GAINS,
     HARMONIC_PERIODS,
@@ -208,7 +209,8 @@ class ElectricalFilter(Parametric):
         The positive sequence of voltages and currents gives the angle and the fluxes, the mean
         field current the field.  A severity h_k takes h_k v/(3 r_s) of the positive sequence from
         the machine, and gain errors are in the readings: the start moves with both, and the prior
-        holds the correlations (h by ``H_SIGMA``).  A leaky fault has been there for long: its
+        holds the correlations (h by ``H_SIGMA``), about a severity beyond ``H_STRAIGHT`` that the
+        unbalance shows.  A leaky fault has been there for long: its
         current is that of the phase's voltage phasor.  Unbalance and transients are what
         ``START_SIGMA`` stands for.  The period's samples are used again by the filter; beside their
         information that of the start is nothing.
@@ -222,8 +224,12 @@ class ElectricalFilter(Parametric):
             DataError: fewer than eight samples in the period, or no voltage.
         """
         first = _FirstPeriod.of(self.machine, samples, period)
-        at = self._start(first)
+        found = dict(zip(SHUNTS.names, first.severity(self.machine), strict=True))
+        found = {n: v if n in self.model.x else 0.0 for n, v in found.items()}
+        h = np.array([*found.values()])
+        at = self._start(first, h=h)
         means = dict.fromkeys(self.model.x.names, 0.0) | at
+        means |= {n: v for n, v in found.items() if n in means}
         means |= {n: LEAKY_START for n in ADMITTANCE.names if n in means}
         spread = dict.fromkeys((*SHUNTS.names, *ADMITTANCE.names), H_SIGMA) | START_SIGMA
         spread |= {"energy": 0.0, "i_shunt": START_SIGMA_SHUNT}
@@ -245,15 +251,18 @@ class ElectricalFilter(Parametric):
         e = 1e-6
         # of a parameter the same share of it
         size = dict.fromkeys(means, 1.0) | {n: abs(v) for n, v in own.items() if n in means}
-        moved = {n: self._start(first, h=e) for n in SHUNTS.names}
+        moved = {
+            n: self._start(first, h=h + e * one)
+            for n, one in zip(SHUNTS.names, np.eye(3), strict=True)
+        }
         moved |= {"g_shunt": self._start(first, Y=Y_START + e)}
         moved |= {"b_shunt": self._start(first, Y=Y_START - 1j * e)}
-        moved |= {f"gain_{n}": self._start(first, {n: -e}) for n in GAIN_SENSORS}
-        moved[DELAY.name] = self._start(first, delay=e * DELAY.nominal)
+        moved |= {f"gain_{n}": self._start(first, {n: -e}, h=h) for n in GAIN_SENSORS}
+        moved[DELAY.name] = self._start(first, h=h, delay=e * DELAY.nominal)
         size[DELAY.name] = DELAY.nominal
         for n in own.keys() & means.keys():
             more = self.machine.symbolic(**{n.partition(".")[2]: own[n] + e * size[n]})
-            moved[n] = dataclasses.replace(self, machine=more)._start(first)
+            moved[n] = dataclasses.replace(self, machine=more)._start(first, h=h)
         turned = np.eye(len(self.model.x))
         for name, there in moved.items():
             if name in self.model.x.names:
@@ -269,16 +278,17 @@ class ElectricalFilter(Parametric):
         first: _FirstPeriod,
         share: Mapping[str, float] | None = None,
         *,
-        h: float = 0.0,
+        h: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
         Y: complex = Y_START,
         delay: float = 0.0,
     ) -> dict[str, float]:
         """Return the start with some readings taken for more by a share, a fault, late currents."""
         p, turn = self.machine, TURN
         by = [1 + (share or {}).get(n, 0.0) for n in (*PHASES_V, *PHASES_I, "i_fd")]
-        v, i = (complex(x * k @ turn) / 3 for x, k in ((first.v, by[:3]), (first.i, by[3:6])))
+        V, late = first.v * by[:3], first.i * by[3:6] * np.exp(1j * first.w * delay)
+        v, i = (complex(x @ turn) / 3 for x in (V, late))
         i_0 = float((first.i * by[3:6]).sum().real) / 3
-        i = i * np.exp(1j * first.w * delay) + h * v / (3 * p.r_s)
+        i += sum(h) * v / (3 * p.r_s)
         i_shunt = 0.0
         if self.kappa is not None:
             k = PHASES.index(str(self.phase))
@@ -287,6 +297,11 @@ class ElectricalFilter(Parametric):
             i -= drawn * turn[k] / 3
             i_0 -= i_shunt / 3
         at = balanced_state(p, v=v, i=i, w_r=first.w, i_fd=first.i_fd * by[6], i_0=i_0)
+        # what turns backwards: d lambda/dt = v + r_s i of the windings
+        back = (V + p.r_s * late + np.array(h) * V) @ turn.conj() / 3 / (1j * first.w) * turn
+        more = abc_to_qd0(at["theta_e"], Abc(*back.real))
+        at["lam_sq"] += float(more.q)
+        at["lam_sd"] += float(more.d)
         return at if self.kappa is None else at | {"i_shunt": i_shunt}
 
 
@@ -328,6 +343,27 @@ class _FirstPeriod:
         if size < 0.05 * machine.V_rated_rms:
             raise DataError(f"no voltage to start from: positive sequence {size:.3g} V")
         return cls(w, v, i, float(np.nanmean(a["i_fd"])))
+
+    def severity(self, p: MachineParameters) -> tuple[float, float, float]:
+        """Severity of the phase whose short circuit explains the unbalance best; 0 of a small one.
+
+        A machine without one has i_0 = -v_0/(r_s + j w L_ls), and what turns backwards meets the
+        mean of both subtransient inductances; a short circuit takes h v_k/r_s beside that.
+        """
+        subtransient = sum(
+            p.L_ls + 1 / (1 / L_m + sum(1 / L for L in leak)) for L_m, leak in
+            ((p.L_md, (p.L_lfd, p.L_lkd)), (p.L_mq, (p.L_lkq,)))
+        ) / 2  # fmt: skip
+        turns = np.array([np.ones(3), TURN.conj()]) / 3
+        z = p.r_s + 1j * self.w * np.array([p.L_ls, subtransient])
+        lost = -(turns @ self.i + turns @ self.v / z)
+        drawn = turns * self.v / p.r_s  # of each phase by h = 1, (2, 3)
+        h = (drawn.conj() * lost[:, None]).sum(0).real / (np.abs(drawn) ** 2).sum(0)
+        left = (np.abs(lost[:, None] - h * drawn) ** 2).sum(0)
+        k = int(left.argmin())
+        out = np.zeros(3)
+        out[k] = h[k] if h[k] > H_STRAIGHT else 0.0
+        return float(out[0]), float(out[1]), float(out[2])
 
 
 def _middles(t: np.ndarray, v: np.ndarray, w_r: np.ndarray, jumped: np.ndarray) -> np.ndarray:

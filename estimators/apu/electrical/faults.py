@@ -14,8 +14,8 @@ from apu_casadi.machine.park import PHASES
 from apu_casadi.machine.terminals import LEAKY, shunt_parameters
 from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.machinemodel import leaky_pair
-from estimators.apu.electrical.terminalsignals import ADMITTANCE
-from estimators.apu.electrical.tuning import FAULT_LEVEL, LEAST_SUSCEPTANCE
+from estimators.apu.electrical.terminalsignals import ADMITTANCE, PHASES_I
+from estimators.apu.electrical.tuning import BENT, FAULT_LEVEL, LEAST_SUSCEPTANCE
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.information.posterior import posterior
@@ -30,7 +30,7 @@ class Verdict:
     Args:
         phase: "a", "b", "c", or None where no phase's h exceeds its noise by ``level``.
         h, sigma: severity of that (or of the likeliest) phase with the other two healthy, and its
-            standard deviation.
+            standard deviation; with gain errors ``BENT`` of h included.
         statistic: (h/sigma)^2 of each phase alone, chi-squared with one degree of freedom where
             there is no fault; zero for h < 0.
         probability: of each phase to be the one, given that one is faulty and all severities were
@@ -71,10 +71,11 @@ def faulty_phase(belief: Belief | FilterResult, *, level: float = FAULT_LEVEL) -
     # marginal likelihood over h > 0 with a flat prior: exp(stat/2) / sqrt(info)
     score = stat / 2 - 0.5 * np.log(np.diag(info))
     prob = posterior(score)
+    bent = BENT if f"gain_{PHASES_I[0]}" in b.x.names else 0.0
     return Verdict(
         PHASES[best] if stat[best] > level else None,
         float(c[best]),
-        float(1 / math.sqrt(info[best, best])),
+        math.hypot(1 / math.sqrt(info[best, best]), bent * c[best]),
         dict(zip(PHASES, map(float, stat), strict=True)),
         dict(zip(PHASES, map(float, prob), strict=True)),
     )

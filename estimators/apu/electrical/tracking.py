@@ -17,6 +17,7 @@ from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import (
     H_BALANCED_CONSIDERED,
+    ONSET_LEVEL,
     RESET_LEVEL,
     RESET_SIGMA,
     RESET_WINDOW,
@@ -106,7 +107,7 @@ def track(
                 "does not fit these data: a fault branch with leakage of its own, which "
                 "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults",
             )
-        cut = at + (int(bad[0]) - judged) * RESET_WINDOW
+        cut = at + _onset(r.nis, (int(bad[0]) - judged) * RESET_WINDOW)
         if cut > at:
             r, prior = _filtered(made, prior, data, at, cut, cov_at, backend)
             pieces.append(r)
@@ -136,6 +137,16 @@ def _loosened(filt: ElectricalFilter, r: FilterResult) -> FilterResult:
     along = along / along[rows].mean()
     final = Belief(r.x, r.final.mean, cov + COMMON**2 * np.outer(along, along))
     return dataclasses.replace(r, variance=variance, final=final)
+
+
+def _onset(nis: np.ndarray, start: int) -> int:
+    """The first sample from the window before ``start`` on that no noise makes; else ``start``.
+
+    What is before it says that nothing has changed, and would hold the belief back.
+    """
+    first = max(start - RESET_WINDOW, 0)
+    wild = np.flatnonzero(nis[first : start + RESET_WINDOW] > ONSET_LEVEL)
+    return first + int(wild[0]) if wild.size else start
 
 
 def _opened(filt: ElectricalFilter) -> np.ndarray:

@@ -6,6 +6,7 @@ from apu_casadi.machine.terminals import FLUXES, SHUNTS
 
 __all__ = [
     "ANGLE_WALK_CONSIDERED",
+    "BENT",
     "DELAY_SIGMA",
     "FAULT_LEVEL",
     "FLUX_WALK",
@@ -13,6 +14,7 @@ __all__ = [
     "H_BALANCED",
     "H_BALANCED_CONSIDERED",
     "H_SIGMA",
+    "H_STRAIGHT",
     "H_WALK",
     "H_WALK_CONSIDERED",
     "H_WALK_GAINS",
@@ -21,6 +23,7 @@ __all__ = [
     "LEAKY_START",
     "LEAKY_WALK",
     "LEAST_SUSCEPTANCE",
+    "ONSET_LEVEL",
     "RELEASE_LEVEL",
     "RESET_LEVEL",
     "RESET_SIGMA",
@@ -87,6 +90,13 @@ START_SIGMA = {
 FREE_SIGMA = 0.1
 #: Standard deviation of each h at the start.
 H_SIGMA = 1e-2
+#: Severity up to which a start about a healthy machine is straight enough: one of 1e-2 turns the
+#: rotor by a tenth of a radian, ten standard deviations, which that start does not follow.
+H_STRAIGHT = 1e-3
+#: By what share of itself a severity is off where gain errors are uncertain, beside what is
+#: claimed: noise in the derivatives pulls it down, by 0.3 % of 1e-2 a tenth to a third of a second
+#: after it appeared, at 10 and 100 kW; within 20 ms it is 1.3 % at 100 kW.
+BENT = 3e-3
 #: The same of what all three have in common, times sqrt(3): a balanced short circuit is a load that
 #: the rotor angle alone tells from one.  With ``H_SIGMA`` for it the angle starts 1 rad uncertain,
 #: far beyond where the model is linear: at 10 kW errors were 12 claimed standard deviations.  A
@@ -101,6 +111,8 @@ H_BALANCED_CONSIDERED = 1e-4
 RESET_WINDOW = 50
 #: ... whose mean NIS exceeds this; 4 is expected, 8 is ten standard deviations more.
 RESET_LEVEL = 8.0
+#: NIS of one sample from which a change is told to be there: noise passes it once in 3e7 samples.
+ONSET_LEVEL = 40.0
 #: What is added to the standard deviations at a reset.
 RESET_SIGMA = {
     **dict.fromkeys(SHUNTS.names, 1e-2),
