@@ -11,13 +11,14 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from apu_casadi.core.errors import DataError, ScenarioError
 from scenarios import cli
-from scenarios.datasets import making, scoring
+from scenarios.datasets import baselines, making, scoring
 from scenarios.datasets.recipe import CLASSES, Recipe, draw, read_recipe
 from scenarios.schema import Scenario
 
@@ -370,3 +371,33 @@ def test_metadata_names_every_file_and_column(small, made):
     card = (made / "CARD.md").read_text()
     assert "11 runs" in card and "{{" not in card and "| `X_s.T5` | K |" in card
     assert math.isfinite(small.duration)
+
+
+@pytest.mark.parametrize(
+    ("best", "alarmed", "said"),
+    [("gas path", True, "f_eta_t"), ("sensor T5", True, "sensor"), ("gas path", False, "healthy")],
+)
+def test_a_change_of_health_is_judged_from_its_onset(monkeypatch, best, alarmed, said):
+    """All factors are 2 % off, as gain errors make them; only one of them has changed."""
+    import xarray as xr
+
+    from estimators.apu import recorded_estimate
+    from estimators.apu.recordings import measured
+
+    t = np.linspace(0.0, 6.0, 301)
+    course = {n: ("time", np.full(t.size, 0.98)) for n in baselines.HEALTH}
+    course["f_eta_t"] = ("time", np.where(t < 3.2, 1.0, 0.985))
+    sigma = {f"{n}_sigma": ("time", np.full(t.size, 0.007)) for n in baselines.HEALTH}
+    attrs = {"onsets": "[3.0]" if alarmed else "[]", "alarms": "[3.2]" if alarmed else "[]"}
+    told = SimpleNamespace(
+        gaspath=xr.Dataset(course | sigma, {"time": t}, attrs),
+        diagnoses=[SimpleNamespace(best=best)],
+    )
+    monkeypatch.setattr(recorded_estimate, "estimate", lambda *a, **k: told)
+    monkeypatch.setattr(measured, "read_recording", lambda data: data)
+    columns = [f"X_s.{n}" for n in baselines.GAS_PATH.names] + [f"W.{n}" for n in baselines.VARIED]
+    gas = pd.DataFrame({"time": t} | dict.fromkeys(columns, 1.0))
+    row = baselines.estimated(1, gas, None)
+    assert row["class"] == said
+    assert row.get("alarm_time") == (3.2 if alarmed else None)
+    assert row["f_eta_t"] == 0.985

@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 from apu_casadi.core.backend import use_backend
 from apu_casadi.core.errors import DataError, EstimationError, ParameterError
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.terminals import FLUXES, shunt_parameters
 from apu_casadi.unit.events import LoadChange
 from estimators.apu.electrical.electricalfilter import electrical_filter
@@ -26,10 +27,12 @@ from estimators.apu.electrical.faults import (
     ridge,
     shunt_of,
 )
+from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.machinemodel import _exponential, leaky_pair
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
+from estimators.apu.joint import joint_case
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
@@ -143,6 +146,24 @@ def test_a_fault_is_found_at_once_with_its_phase():
     text = describe(POWER, r)
     assert "phase b" in text
     assert "not told apart" in text
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
+def test_single_severities_hold_what_all_three_have_in_common(seed):
+    """A healthy machine at part load: at -4 sigma in all three phases before that was added."""
+    truth = generator_truth(SeriesLoad.from_power(50e3), 0.6)
+    rng = np.random.default_rng(seed)
+    samples = samples_of(truth, rng, gains=joint_case(seed).electrical_gains)
+    filt = electrical_filter(gains="estimate")
+    r, resets = track(filt, filt.prior(samples), filt.recording(samples))
+    assert resets == [] and r.nis[-1000:].mean() < 4.2
+    h, variance = (v[r.x.indices(H), -1] for v in (r.mean, r.variance))
+    assert (np.abs(h) < 2.5 * np.sqrt(variance)).all() and np.abs(h).min() > COMMON / 2
+    assert_allclose(np.diag(r.final.marginal(H).cov), variance, rtol=0.05)
+    # one phase with the others healthy is known as well as it was
+    v = faulty_phase(r)
+    assert v.phase is None and v.sigma < 1e-4
 
 
 def test_window_power_is_the_mean_power_of_eq_8():

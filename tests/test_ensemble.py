@@ -6,6 +6,7 @@ import pytest
 from apu_casadi import Apu, FaultChange, HealthChange, LoadChange, SeriesLoad, Ttsc, simulate_joint
 from apu_casadi.core.backend import find_compiler
 from apu_casadi.core.errors import BackendError, OperatingPointError, ScenarioError, SimulationError
+from apu_casadi.core.lanes import together
 from apu_casadi.core.lanes.together import Member, Question, Together, answer, ensemble
 from apu_casadi.unit.ensemble import simulate_ensemble
 from apu_casadi.unit.noise import Noise
@@ -49,8 +50,9 @@ def test_members_are_the_single_runs(alone):
 @pytest.mark.compiled
 @pytest.mark.ci
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler found")
-def test_members_are_the_single_runs_in_lanes():
+def test_members_are_the_single_runs_in_lanes(monkeypatch):
     """The blocks of all members in compiled lanes, also on threads: the bits of compiled runs."""
+    monkeypatch.setattr(together, "OFTEN", 0)
     fault = FaultChange(t=0.05, fault=Ttsc(mu=0.05, k_rf=20.0))
     some = [*members()[:3], {"load": LOAD, "events": [fault]}]
     single = [simulate_joint(**{"apu": Apu(), **COMMON, **m}) for m in some]
@@ -130,6 +132,23 @@ def test_a_member_asks_and_finds_the_answer():
     answer(both)
     with both[0], pytest.raises(BackendError, match="asked for doubled, then for other"):
         g(x)
+
+
+def test_rows_of_calls_are_answered_together_and_whole_packs_first():
+    """Rows of two lengths: each member has its own; what one function is asked more often goes."""
+    f, g, x = doubled(), doubled("other"), np.array([[1.0, 2.0], [3.0, 4.0]])
+    row = np.hstack([2 * x, 4 * x, 8 * x])
+    assert np.array_equal(f.in_a_row(3, x)[0], row)
+    asked = [Member() for _ in range(3)]
+    for m, (h, n) in zip(asked, ((f, 3), (g, 1), (f, 2)), strict=True):
+        with m, pytest.raises(Question):
+            h.in_a_row(n, x)
+    answer(asked, patient=True)
+    answer(asked, patient=True)
+    answer(asked, patient=True)
+    for m, (h, n) in zip(asked, ((f, 3), (g, 1), (f, 2)), strict=True):
+        with m:
+            assert m.asks is None and np.array_equal(h.in_a_row(n, x)[0], row[:, : 2 * n])
 
 
 def test_a_hook_that_simulates_does_so_by_itself(alone):

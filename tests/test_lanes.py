@@ -1,5 +1,10 @@
 """Vector lanes: every operation gives the bits of scalar C, and no lane sees another."""
 
+import importlib.util
+import re
+import subprocess
+import sys
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -57,6 +62,7 @@ def graph():
     s, q = ca.SX.sym("s", 2), ca.SX.sym("q")
     inner = ca.Function("inner", [s, q], [ca.exp(-s * q), ca.sum1(s)])
     table = ca.MX(ca.DM(np.arange(12.0).reshape(3, 4) ** 1.5))
+    tall = ca.MX(ca.DM(np.arange(152.0).reshape(19, 8) ** 1.5))
     k = ca.low([0.0, 0.3, 0.7, 1.0, 2.0], p)
     k2 = ca.low(list(np.linspace(-3, 3, 9)), p, {"lookup_mode": "binary"})
     lower = ca.DM(ca.Sparsity.lower(3), 1)
@@ -67,6 +73,7 @@ def graph():
         *(ca.norm_inf(x), ca.dot(x, x), M[:2, 1:], ca.sum2(M), ca.repmat(x, 1, 3), M @ M.T),
         *(ca.if_else(p > 0, x, 2 * x), ca.diagcat(M, p), ca.triu(M), (lower * M) @ M),
         *(ca.vertsplit(x, 2)[1], ca.horzsplit(M)[2], table[:, k], k2, *a, b, *many),
+        *(tall[:, k2], ca.reshape(x, 3, 2) @ ca.reshape(ca.vertcat(x, x)[:10], 2, 5)),
         *(M + p, ca.densify(lower) * p, ca.project(M, ca.Sparsity.lower(3)).T),
     ]
     return ca.Function("graph", [x, M, p], outs)
@@ -160,6 +167,45 @@ def test_shapes_are_checked_as_those_of_a_map(operations):
         batch(f, 1)(a, b[:, :3])
 
 
+def cross_compiler():
+    """Clang for every processor, of the package ziglang."""
+    if importlib.util.find_spec("ziglang") is None:
+        return None
+    return [sys.executable, "-m", "ziglang", "cc"]
+
+
+@pytest.mark.ci  # seconds each
+@pytest.mark.skipif(cross_compiler() is None, reason="no ziglang (pip install ziglang)")
+@pytest.mark.parametrize(
+    ("target", "lanes", "flags", "products", "words"),
+    [
+        ("x86_64-linux-gnu", 2, (), r"\tmulpd\t", "%xmm"),
+        ("x86_64-linux-gnu", 4, ("-mavx2",), r"\tvmulpd\t.*%ymm", "%ymm"),
+        ("x86_64-linux-gnu", 8, lanelibrary.FLAGS[8], r"\tvmulpd\t.*%zmm", "%zmm"),
+        ("aarch64-linux-gnu", 2, (), r"\tfmul\tv.*\.2d", ".2d"),
+    ],
+)
+def test_clang_makes_vector_code_for_every_processor(
+    operations, tmp_path, target, lanes, flags, products, words
+):
+    """Compiled to assembly, not run: products are those of vectors, and none is fused."""
+    for f in (operations[0], graph(), newton()):
+        path = tmp_path / f"{f.name()}.c"
+        path.write_text(lanelibrary.source(f, lanes))
+        command = [*cross_compiler(), "-target", target, *flags, *lanelibrary.COMMON_FLAGS]
+        done = subprocess.run(
+            [*command, "-O1", "-fno-math-errno", "-S", "-o", "code.s", path.name],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        code = (tmp_path / "code.s").read_text(errors="replace")
+        assert re.search(products, code) and words in code
+        assert lanes == 8 or not re.search(r"\t(vfn?madd|vfn?msub|fmla|fmls)", code)
+
+
 X2 = ca.MX.sym("x", 2)
 
 
@@ -210,7 +256,7 @@ def test_without_a_compiler_it_is_a_map(monkeypatch, fresh, tmp_path):
 
 def test_a_compiler_that_fails_is_told_once(monkeypatch, fresh, caplog):
     monkeypatch.setenv("APU_LANES", "2")
-    monkeypatch.setattr(lanelibrary, "_COMMON_FLAGS", ("--no-such-option",))
+    monkeypatch.setattr(lanelibrary, "COMMON_FLAGS", ("--no-such-option",))
     made = in_lanes(small("failing"))
     assert made.size_in(0) == (2, 2) and made.class_name() == "Map"
     assert "failing_x2 could not be compiled" in caplog.text

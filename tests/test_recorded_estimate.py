@@ -184,6 +184,46 @@ def test_declared_imperfections_of_the_generators_sensors(run, tmp_path, names, 
     assert e.believable, e.doubts
 
 
+@pytest.mark.ci  # two estimates of two machines
+def test_a_channel_of_one_generator_has_a_sensor_of_its_own(readings, tmp_path):
+    """i_a of machine 2 has a noise of 20 A: declared it is believed, else that machine is not."""
+    w = readings["electrical"]
+    waves = {f"{n}_{k}": w[n].values for n in w for k in (1, 2)}
+    noise = 20.0 * np.random.default_rng(0).standard_normal(w["time"].size)
+    waves |= {"t": w["time"].values, "i_a_2": w["i_a"].values + noise}
+    path = tmp_path / "two.toml"
+    path.write_text("[i_a_2]\nnoise = 20.0\n")
+    m = read_recording(waves)
+    e = estimate(m, sensors=path, only="electrical", backend="vm")
+    assert e.believable, e.doubts
+    for n, true in (("h_a", 0.05 / 20.95), ("h_b", 0.0)):
+        x, s = (e.machines[2][f"{n}{end}"].values[-1] for end in ("", "_sigma"))
+        assert abs(x - true) < 3 * s
+    wrong = estimate(m, only="electrical", backend="vm")
+    assert not wrong.believable and not wrong.belief["machine 1"] and wrong.belief["machine 2"]
+    assert "doubted: machine 2" in wrong.summary() and "believed: machine 1" in wrong.summary()
+    report = wrong.report()["belief"]
+    assert [n for n, b in report.items() if b["believable"]] == [
+        n for n in report if n.startswith("machine 1")
+    ]
+
+
+@pytest.mark.ci  # an estimate
+def test_a_machine_whose_filter_is_lost_is_not_believed(readings):
+    """A step of a voltage's offset by 30 V: no severity is estimated, and that is said."""
+    w = readings["electrical"]
+    waves = {"t": w["time"].values, **{n: w[n].values.copy() for n in w}}
+    waves["v_a"] += 30.0 * (waves["t"] > 0.05)
+    e = estimate(
+        read_recording(gas_of(readings, "N", "P3", "T3", "T5", "Wf", "PW"), waves), backend="vm"
+    )
+    assert not e.believable and e.belief["machine 1"]
+    assert all(e.belief[f"machine 1: h_{p}"] for p in "abc")
+    if not e.machines:  # it was lost
+        assert any("its filter is lost" in d for d in e.belief["machine 1"])
+        assert not e.belief["gas path"] and "believed: gas path" in e.summary()
+
+
 @pytest.mark.long
 def test_a_subset_of_the_gas_path(readings):
     """Without shaft power, speed and temperatures: wider, and said so."""

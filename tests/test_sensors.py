@@ -142,6 +142,22 @@ def test_inputs_that_lag_are_followed_through_a_load_drop(drop):
     assert not estimate(m, backend="vm").believable
 
 
+@pytest.mark.ci  # three estimates
+def test_a_power_that_lags_is_followed_through_a_load_drop(drop, tmp_path):
+    """The same of the shaft power's sensor, from its file to what is believed."""
+    path = tmp_path / "slow.toml"
+    path.write_text("[PW]\nlag = 0.2\n")
+    for seed in range(2):
+        m = recorded(drop, read_sensors(path), seed)
+        e = estimate(m, sensors=path, backend="vm")
+        assert e.believable, e.doubts
+        assert of_health(e) < 3 and e.gaspath.attrs["alarms"] == "[]"
+        true = np.interp(e.result.t, drop["time"], drop["PW"])
+        z = (e.result["PW"][0] - true) / e.result["PW"][1]
+        assert np.sqrt(np.mean(z[25:] ** 2)) < 1.5
+    assert not estimate(m, backend="vm").believable
+
+
 @pytest.mark.long
 def test_a_lagging_sensor_is_followed_through_a_load_drop(drop):
     """The filter is consistent; one that takes the thermocouple for instantaneous is not."""

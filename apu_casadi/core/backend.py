@@ -32,6 +32,7 @@ import subprocess
 import sys
 import tempfile
 import weakref
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from contextvars import ContextVar, Token
@@ -65,6 +66,7 @@ __all__ = [
     "loaded_functions",
     "mapped",
     "package_digest",
+    "rarely",
     "recipe",
     "use_backend",
 ]
@@ -72,10 +74,14 @@ __all__ = [
 log: logging.Logger = logging.getLogger("apu_casadi")
 
 BACKENDS = ("auto", "vm", "c")
-FLAGS = ("-fPIC", "-shared", "-fno-math-errno")  # no -ffast-math, because NaN must survive
+FLAGS: tuple[str, ...] = ("-fPIC", "-shared", "-fno-math-errno")  # NaN must survive
+if platform.machine() not in ("x86_64", "AMD64"):
+    FLAGS += ("-ffp-contract=off",)  # elsewhere compilers fuse products and sums unasked
 LEVELS = (1, 2, 3)  # -O1, -O2, -O3
 COMPILE_TIMEOUT = 900.0  # s
 OFTEN = 50  # calls that are enough for a :class:`Gradual` function to be compiled
+READY = "ready"  # as an argument: the library that is there, else the virtual machine
+RARELY = 30  # uses from which on what is used rarely is compiled, too
 
 _chosen: list[use_backend | None] = [None]  # the last one is the choice of the process
 _here: ContextVar[str | None] = ContextVar("apu_backend", default=None)  # of a ``with`` block
@@ -85,6 +91,7 @@ _compiled: weakref.WeakKeyDictionary[ca.Function, dict[tuple[str, int], ca.Funct
 )
 _loaded: weakref.WeakValueDictionary[str, ca.Function] = weakref.WeakValueDictionary()
 _failed: dict[str, str] = {}
+_uses: Counter[str] = Counter()
 _MANY = 256  # failures remembered
 
 
@@ -216,7 +223,7 @@ def compiled(
     Args:
         fun: any function whose parts generate C (``fast_newton``, ``rosenbrock``, ``erk``,
             ``bspline`` and ``map`` do; ``cvodes``, ``idas``, ``newton`` and ``kinsol`` do not).
-        backend: overrides the backend in use.
+        backend: overrides the backend in use; ``"ready"`` is that in use, without ``build``.
         build: compile if no library is found; False only loads, which suits a single short call.
         level: how hard the C compiler optimises, 1 to 3.  Long straight-line code, a filter's block
             or a trim, runs as fast at 1 and compiles in half the time; short bodies in loops over
@@ -228,7 +235,8 @@ def compiled(
     """
     if level not in LEVELS:
         raise BackendError(f"{fun.name()}: level must be one of {LEVELS}, got {level!r}")
-    wanted = _wanted(backend)
+    wanted = _wanted(None if backend == READY else backend)
+    build = build and backend != READY
     if wanted == "vm":
         return fun
     level = min(level, _ceiling())
@@ -237,6 +245,19 @@ def compiled(
         return known
     with BUILDING:
         return _find_or_make(fun, wanted, build, level)
+
+
+def rarely(what: str) -> str | None:
+    """Return the backend of something that is done once in a while, by functions of its own.
+
+    To compile them would take longer than to do it: only libraries that are there are used, up to
+    the thirtieth time in this process.  Whoever does it that often does it more often.
+
+    Args:
+        what: is done; each is counted for itself.
+    """
+    _uses[what] += 1
+    return READY if _uses[what] < RARELY else None
 
 
 class Gradual:

@@ -35,6 +35,7 @@ STAGES = 8  # of the Radau method that P is made by; even where stiff its error 
 FEW = (
     4  # stages where more than two steps are needed, for a stiff branch's sake: as good, and cheap
 )
+IN_A_ROW = 4  # steps of few stages that are one function; their number is a multiple of it
 STEP_TOL = 5e-7  # largest change of P, nominal units, when its steps are halved; then used: 2e-9
 HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goes on is refused
 EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
@@ -103,13 +104,17 @@ class _Leaps:
     """
 
     def __init__(self, ss: GeneratorModel, stages: int) -> None:
-        self._function, self._asked, self._compiled = _radau_function(ss, stages), 0, False
+        self.steps = IN_A_ROW if stages == FEW else 1
+        self._function = _radau_function(ss, stages)
+        if self.steps > 1:
+            self._function = _in_a_row(self._function, self.steps)
+        self._asked, self._compiled = 0, False
         self._calls = self._batches(build=False)
 
     def __call__(self, *columns: np.ndarray) -> np.ndarray:
-        """Return the matrices after the step, one in each column; see :func:`_radau_function`."""
+        """Return the matrices after ``steps``, one in each column; see :func:`_radau_function`."""
         size = columns[0].shape[1]
-        self._asked += size
+        self._asked += size * self.steps
         if not self._compiled and self._asked > COMPILE_FROM:
             self._calls, self._compiled = self._batches(build=True), True
         made: np.ndarray = self._calls[size > FEWEST](*columns)[0]
@@ -166,6 +171,14 @@ def _radau_function(ss: GeneratorModel, stages: int) -> ca.Function:
     return ca.Function(f"radau_{stages}_{ss.name}", given, [ca.vec(row)])
 
 
+def _in_a_row(step: ca.Function, steps: int) -> ca.Function:
+    """Return steps of :func:`_radau_function` as one function."""
+    angle, w, h, t, X, *fixed = given = step.mx_in()
+    for k in range(steps):
+        X = step(angle, w, h, t + k * h, X, *fixed)
+    return ca.Function(f"{step.name()}_x{steps}", given, [X])
+
+
 @once
 def _inverse(n: int) -> ca.Function:
     """Inverse of a matrix with a dominant diagonal; its rows may be of any magnitude."""
@@ -199,9 +212,9 @@ def _transition(
     n, hs, out = len(ss.linear), h / steps, []
     step, full = _leaps(ss.shared, stages, backend_in_use()), ss.full(theta)
     X = np.repeat(np.eye(n, n + EXTRA).ravel(order="F")[:, None], theta0.size, axis=1)
-    for k in range(leaps * steps):
+    for k in range(0, leaps * steps, step.steps):
         X = step(theta0[None], w[None], hs[None], (k * hs)[None], X, u, full)
-        if (k + 1) % steps == 0:
+        if (k + step.steps) % steps == 0:
             out.append(X.T.reshape(-1, n + EXTRA, n).transpose(0, 2, 1))
     return out
 

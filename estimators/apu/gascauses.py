@@ -5,15 +5,20 @@ The innovations of a filter that knows no change hold the signature of one
 of the speed's sensor, of the shaft power's error, each with a prior of its size, is the more
 probable the better its signature fits, its size and instant unknown: marginal likelihoods of
 :meth:`~estimators.detection.glr.Glr.log_marginal`, averaged over the instants, times prior weights.
+At the likeliest instant the filter runs again with what may have jumped, since a signature is
+linear and large changes are not; and a sensor may as well be noise, of a size that is found, about
+what the others predict: stuck, drifting, or worse.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from apu_casadi.core.backend import rarely
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.electrical.causes import Causes, probabilities
 from estimators.apu.gaspath import JUMP, GasPathFilter
@@ -23,6 +28,7 @@ from estimators.apu.sensorfailures import failure
 from estimators.detection.glr import glr
 from estimators.detection.signatures import Jump, linearised
 from estimators.filters.belief import Belief
+from estimators.filters.filtering import FilterResult
 from estimators.models.recording import Recording
 
 __all__ = ["PRIOR", "causes_of_alarms", "jumps_of"]
@@ -30,6 +36,7 @@ __all__ = ["PRIOR", "causes_of_alarms", "jumps_of"]
 BACK, ON = 40, 50  # samples before and after an alarm that are looked at
 SIZE = 0.05  # standard deviation of a jump of a sensor's gain, of the reading
 WIDE = 1e8  # factor on the variance of a reading that says nothing
+FEWEST = 4  # readings from which a sensor's noise is told
 N_SIZE = 0.02  # the same of the speed's sensor
 #: Prior weights by kind; sensors share theirs.
 PRIOR = {"none": 1.0, "gas path": 1.0, "sensor": 0.3, "shaft power": 0.3}
@@ -54,13 +61,14 @@ def jumps_of(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str]
 
 
 def causes_of_alarms(
-    filt: GasPathFilter, tracked: Tracked, *, backend: str | None = "vm"
+    filt: GasPathFilter, tracked: Tracked, *, backend: str | None = None
 ) -> list[Causes]:
     """Tell of each reported change of health what it is.
 
     Args:
         filt, tracked: the filter and what it said.
-        backend: see :func:`apu_casadi.core.backend.compiled`.
+        backend: see :func:`apu_casadi.core.backend.compiled`; by default as for what is done
+            :func:`~apu_casadi.core.backend.rarely`.
     """
     out = []
     row = filt.model.u.index("jump")
@@ -70,10 +78,9 @@ def causes_of_alarms(
         u[row, onset:] = 0.0
         stop = min(k + ON, tracked.data.size)
         data = _part(replace(tracked.data, u=u), stop)
-        weighed = _weighed(filt, data, k, tracked.prior, backend)
-        failed = _failed(
-            filt, data, onset, max(weighed, key=lambda n: weighed[n]), tracked, backend
-        )
+        how = backend or rarely("causes of an alarm")
+        weighed = _weighed(filt, data, k, tracked.prior, how)
+        failed = _failed(filt, data, onset, max(weighed, key=lambda n: weighed[n]), tracked, how)
         out.append(Causes(float(data.t[k]), weighed, failed))
     return out
 
@@ -91,12 +98,18 @@ def _failed(
     if name == what or name not in filt.model.y:
         return {}
     row, late = filt.model.y.index(name), slice(onset + 1, data.size)
-    blind = data.variance.copy()
-    blind[row, late] *= WIDE
-    r = filt.run(replace(data, variance=blind), prior=tracked.prior, backend=backend)
+    blind = _blinded(data, row, onset + 1)
+    r = filt.run(blind, prior=tracked.prior, backend=backend)
     own = np.sqrt(data.variance[row, late])
     found = failure(data.t[late], data.y[row, late], r.innovation[row, late], own)
     return {what: found} if found else {}
+
+
+def _blinded(data: Recording, row: int, first: int) -> Recording:
+    """Return the recording with an output that says nothing from a sample on."""
+    variance = data.variance.copy()
+    variance[row, first:] *= WIDE
+    return replace(data, variance=variance)
 
 
 def _part(data: Recording, stop: int) -> Recording:
@@ -106,12 +119,70 @@ def _part(data: Recording, stop: int) -> Recording:
 def _weighed(
     filt: GasPathFilter, data: Recording, k: int, prior: Belief | None, backend: str | None
 ) -> dict[str, float]:
+    """Return the probabilities of what a change at about sample k is."""
     jumps, of = jumps_of(filt)
     r = filt.run(data, prior=prior, backend=backend)
-    f = linearised(filt.model, r, data, jumps, backend=backend)
-    g = glr(f, np.arange(max(k - BACK, 1), k + 1))
+    g = glr(linearised(filt.model, r, data, jumps, backend=backend), onsets := _onsets(k))
+    after = _After(filt, data, r, backend)
     found = {"none": 0.0}
     for name, (parts, size) in of.items():
         v = g.log_marginal(parts, np.zeros(len(parts)), np.diag(np.square(size)))
-        found[name] = float(v.max() + math.log(np.mean(np.exp(v - v.max()))))
+        top = int(v.argmax())
+        best, onset = float(v[top]), int(onsets[top])
+        if set(parts) <= set(filt.model.x.names) and not set(parts) & set(filt.model.consider):
+            best = after.opened(onset, parts, size)
+        if (sensor := name.removeprefix("sensor ")) in filt.model.y:
+            best = float(np.logaddexp(best, after.blind(onset, sensor))) - math.log(2.0)
+        found[name] = best + math.log(np.mean(np.exp(v - v[top])))
     return probabilities(found, PRIOR)
+
+
+def _onsets(k: int) -> np.ndarray:
+    return np.arange(max(k - BACK, 1), k + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _After:
+    """The filter from an onset on, as it would run if a change were known to have come then.
+
+    A signature is linear about estimates that a change has spoilt: one of P3 by 4 % is 20 of its
+    standard deviations, and what the linear terms lack would be told as a change of health.
+    """
+
+    filt: GasPathFilter
+    data: Recording
+    r: FilterResult
+    backend: str | None
+
+    def opened(self, onset: int, names: Sequence[str], size: Sequence[float]) -> float:
+        """Log-likelihood gained if states may have jumped by so much."""
+        return self._loglik(onset, names, size) - self._loglik(onset, (), ())
+
+    def blind(self, onset: int, sensor: str) -> float:
+        """The same if a sensor is noise of any size about what the others predict."""
+        row = self.filt.model.y.index(sensor)
+        data = _blinded(self.data, row, onset)
+        r = self._run(data, onset, self._before(onset))
+        there = np.isfinite(r.innovation[row])
+        nu, S = r.innovation[row, there], r.innovation_variance[row, there]
+        if nu.size < FEWEST:
+            return -math.inf
+        own = -0.5 * float((nu**2 / S + np.log(2 * math.pi * S)).sum())
+        # its noise is found: half the logarithm of the number of readings for that
+        white = max(float(np.mean(nu**2)), float(np.min(self.data.variance[row, onset:])))
+        instead = -0.5 * nu.size * (1 + math.log(2 * math.pi * white)) - 0.5 * math.log(nu.size)
+        return float(r.loglik - own + instead) - self._loglik(onset, (), ())
+
+    def _before(self, onset: int) -> Belief:
+        assert self.r.mean_pred is not None and self.r.cov_pred is not None
+        return Belief(self.r.x, self.r.mean_pred[:, onset], self.r.cov_pred[onset])
+
+    def _run(self, data: Recording, onset: int, belief: Belief) -> FilterResult:
+        part = data.part(onset, data.size)
+        return self.filt.run(part, prior=belief, backend=self.backend)
+
+    def _loglik(self, onset: int, names: Sequence[str], size: Sequence[float]) -> float:
+        b = self._before(onset)
+        cov, at = b.cov.copy(), b.x.indices(names)
+        cov[at, at] += np.square(size)
+        return float(self._run(self.data, onset, Belief(b.x, b.mean, cov)).loglik)

@@ -100,23 +100,26 @@ def _plain_newton(gg: GasGenerator) -> Callable[..., tuple[np.ndarray, float, bo
     return solve
 
 
+def deck_axes(size: Size) -> dict[str, Any]:
+    """Return the axes of the deck: altitude, m, Mach, ISA deviation, K, and power, W."""
+    ends = ((0.0, 12e3), (0.0, 0.8), (-30.0, 35.0), (0.0, 5e5))
+    names = ("altitude", "Mach", "dT_isa", "PW")
+    return {n: np.linspace(*e, k) for n, e, k in zip(names, ends, size.deck, strict=True)}
+
+
 @part("deck", order=11)
 def deck(size: Size) -> list[Row]:
     """A performance deck on all cores, two at most."""
 
     gg = apu().gas_generator
     threads = min(2, available_threads())
-    ends = ((0.0, 12e3), (0.0, 0.8), (-30.0, 35.0), (0.0, 5e5))
-    names = ("altitude", "Mach", "dT_isa", "PW")
-    axes: dict[str, Any] = {
-        n: np.linspace(*e, k) for n, e, k in zip(names, ends, size.deck, strict=True)
-    }
+    axes = deck_axes(size)
     performance_deck(gg, altitude=[0.0], PW=np.linspace(0, 1e9, 400), n_threads=threads)
     wall, made = timed(lambda: performance_deck(gg, **axes, n_threads=threads), 1)
     points = math.prod(size.deck)
     rng = np.random.default_rng(0)
     at = tuple(rng.integers(0, k, min(2000, points)) for k in size.deck)
-    given: dict[str, Any] = {n: axes[n][i] for n, i in zip(names, at, strict=True)}
+    given: dict[str, Any] = {n: a[i] for (n, a), i in zip(axes.items(), at, strict=True)}
     PW = given.pop("PW")
     again = trim_batch(gg, {"N": gg.parameters.N, "PW": PW}, n_threads=threads, **given)
     ok = again.status == Status.SOLVED

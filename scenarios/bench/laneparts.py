@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -15,12 +16,13 @@ import numpy as np
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_in_use
-from apu_casadi.gaspath.steady.trimbatch import trim_batch
+from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
 from apu_casadi.unit.ensemble import simulate_ensemble
 from estimators.apu.electrical.electricalfilter import electrical_filter
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filterensemble import run_many
 from estimators.filters.filtering import run
+from scenarios.bench.gasparts import deck_axes
 from scenarios.bench.measuring import Row, Size, apu, part
 from scenarios.bench.runparts import simulate
 from scenarios.campaigns import random_faults
@@ -96,6 +98,8 @@ def lanes(size: Size) -> list[Row]:
     what = f"trim, batch of {size.batch} points, a point, {n} lanes"
     rows = [_row(what, took, size.batch, 3.0, off(batch().w, by_one().w))]
 
+    rows.append(_deck(size, repeats))
+
     filt = electrical_filter()
     samples = samples_of(generator_truth(FULL, 0.05), np.random.default_rng(0))
     data, prior, step = filt.recording(samples), filt.prior(samples), ekf_step(filt.model)
@@ -108,6 +112,22 @@ def lanes(size: Size) -> list[Row]:
     rows.append(_row(what, took, some * data.size, 1.2, error))
     rows.append(_runs(size, repeats))
     return [*rows, _roofline(step.shared.function.expand(), repeats)]
+
+
+def _deck(size: Size, repeats: int) -> Row:
+    """Processor time of a performance deck on all cores."""
+    axes, gg = deck_axes(size), apu().gas_generator
+    deck = partial(performance_deck, gg, outputs=("T4", "Wf"), **axes)
+
+    def by_one() -> Any:
+        with scalar():
+            return deck()
+
+    took = in_turn({"lanes": deck, "scalar": by_one}, min(2, repeats))
+    error = max(off(deck()[n], by_one()[n]) for n in ("T4", "Wf"))
+    what = f"performance deck of {math.prod(size.deck)} points, processor time"
+    peer = {"peer": "scalar C, same run", "ratio": took["scalar"] / took["lanes"]}
+    return Row(what, took["lanes"], "s", 0.4, error, 1e-15, SAME, **peer)  # type: ignore[arg-type]
 
 
 def _runs(size: Size, repeats: int) -> Row:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -165,26 +166,30 @@ def predict(
 def estimated(run: int, gas: Any, waves: Any) -> dict[str, Any]:
     """Return what the filters of this project say of a run, gas path and generators apart.
 
-    A severity or a health factor is told where it is four standard deviations from healthy.
+    A severity is told where it is four standard deviations from none.  Of the gas path the change
+    since its onset counts, where the filter's test has found one: what all sensors' gain errors
+    leave uncertain of a factor is in both, and cancels.  Which factor it is the largest change
+    says, unless a sensor explains it better.
     """
     out: dict[str, Any] = {"run": run, "class": "healthy", "score": 0.0}
-    health = _of_gas_path(gas)
+    health, kind, alarm = _of_gas_path(gas)
     shorts = {k: _of_machine(waves, k) for k in (1, 2)} if waves is not None else {}
-    z_health = {n: abs(v - 1.0) / s for n, (v, s) in health.items() if s > 0}
-    for n, (v, s) in health.items():
+    for n, (v, s, _) in health.items():
         out |= {n: v, f"{n}_sigma": s}
     k, (phase, h, s) = max(shorts.items(), key=lambda i: i[1][1] / i[1][2], default=(0, ("", 0, 1)))
     out |= {"h": h, "h_sigma": s} if shorts and math.isfinite(s) else {}
-    short, sick = bool(shorts) and h > _ALARM * s, max(z_health.values(), default=0.0) > _ALARM
-    if short:
-        out |= {"class": "combined" if sick else "ttsc", "phase": phase, "generator": k}
-    elif sick:
-        out["class"] = max(z_health, key=lambda n: z_health[n])
-    out["score"] = max([h / s if shorts else 0.0, *z_health.values()])
+    if shorts and h > _ALARM * s:
+        out |= {"class": "combined" if kind else "ttsc", "phase": phase, "generator": k}
+    elif kind:
+        out |= {"class": kind}
+    out |= {"alarm_time": alarm} if kind else {}
+    moved = max((abs(change) / s for _, s, change in health.values() if s > 0), default=0.0)
+    out["score"] = max(h / s if shorts else 0.0, moved + (_ALARM if kind else 0.0))
     return out
 
 
-def _of_gas_path(gas: Any) -> dict[str, tuple[float, float]]:
+def _of_gas_path(gas: Any) -> tuple[dict[str, tuple[float, float, float]], str, float]:
+    """Factors, their sigmas and changes since the onset; class of the change or "", its alarm."""
     from estimators.apu.recorded_estimate import estimate
     from estimators.apu.recordings.measured import read_recording
 
@@ -194,11 +199,23 @@ def _of_gas_path(gas: Any) -> dict[str, tuple[float, float]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ApuWarning)
-            e = estimate(read_recording(data), only="gaspath").gaspath
+            found = estimate(read_recording(data), only="gaspath")
     except ApuError:
-        return {}
+        return {}, "", math.nan
+    e = found.gaspath
     assert e is not None
-    return {n: (float(e[n].values[-1]), float(e[f"{n}_sigma"].values[-1])) for n in HEALTH}
+    onsets, alarms = (json.loads(e.attrs[n]) for n in ("onsets", "alarms"))
+    # beliefs before the alarm do not know of the change
+    at = int(np.searchsorted(e["time"].values, onsets[0] - 1e-9)) if onsets else -1
+    health = {
+        n: (float(v[-1]), float(e[f"{n}_sigma"].values[-1]), float(v[-1] - v[at]))
+        for n, v in ((n, e[n].values) for n in HEALTH)
+    }
+    if not onsets:
+        return health, "", math.nan
+    sensor = any(d.best.startswith("sensor") for d in found.diagnoses)
+    kind = "sensor" if sensor else max(HEALTH, key=lambda n: abs(health[n][2]))
+    return health, kind, float(alarms[0])
 
 
 def _of_machine(waves: Any, k: int) -> tuple[str, float, float]:

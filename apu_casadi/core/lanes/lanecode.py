@@ -102,6 +102,35 @@ IN V v_fmin(V a,V b){return v_sel((a<b)|(b!=b),a,b);}
 IN V v_fmax(V a,V b){return v_sel((a>b)|(b!=b),a,b);}
 #endif
 IN V v_fabs(V a){return (V)((M)a&~(M)v_all(-0.0));}
+/* n numbers that begin at another place of a table in each lane: rows are read, and turned */
+#if L==8 && defined(__AVX512F__)
+#define TURNED 8
+#define LO(a,b) _mm512_unpacklo_pd(a,b)
+#define HI(a,b) _mm512_unpackhi_pd(a,b)
+#define EVEN(a,b) _mm512_shuffle_f64x2(a,b,0x88)
+#define ODD(a,b) _mm512_shuffle_f64x2(a,b,0xdd)
+#define HALF(to,f,r,a,b,c,d) {\
+const __m512d p=f(r[0],r[1]),q=f(r[2],r[3]),s=f(r[4],r[5]),t=f(r[6],r[7]);\
+to[a]=(V)EVEN(EVEN(p,q),EVEN(s,t));to[b]=(V)EVEN(ODD(p,q),ODD(s,t));\
+to[c]=(V)ODD(EVEN(p,q),EVEN(s,t));to[d]=(V)ODD(ODD(p,q),ODD(s,t));}
+IN void v_turned(const double*t,const int*i,V*to){
+__m512d r[8];for(int l=0;l<8;l++)r[l]=_mm512_loadu_pd(t+i[l]);
+HALF(to,LO,r,0,2,4,6) HALF(to,HI,r,1,3,5,7)}
+#elif L==4 && defined(__AVX__)
+#define TURNED 4
+IN void v_turned(const double*t,const int*i,V*to){
+__m256d r[4];for(int l=0;l<4;l++)r[l]=_mm256_loadu_pd(t+i[l]);
+const __m256d a=_mm256_unpacklo_pd(r[0],r[1]),b=_mm256_unpackhi_pd(r[0],r[1]);
+const __m256d c=_mm256_unpacklo_pd(r[2],r[3]),d=_mm256_unpackhi_pd(r[2],r[3]);
+to[0]=(V)_mm256_permute2f128_pd(a,c,0x20);to[1]=(V)_mm256_permute2f128_pd(b,d,0x20);
+to[2]=(V)_mm256_permute2f128_pd(a,c,0x31);to[3]=(V)_mm256_permute2f128_pd(b,d,0x31);}
+#endif
+IN void v_rows(const double*t,V q,int n,V*to){
+int i[L],k=0;for(int l=0;l<L;l++)i[l]=(int)q[l];
+#ifdef TURNED
+for(;k+TURNED<=n;k+=TURNED)v_turned(t+k,i,to+k);
+#endif
+for(int l=0;l<L;l++)for(int j=k;j<n;j++)((double*)to)[j*L+l]=t[i[l]+j];}
 #define EACH(f) static V v_##f(V a){V r;for(int l=0;l<L;l++)r[l]=f(a[l]);return r;}
 #if L==8 && defined(__AVX512F__)
 IN V v_sqrt(V a){return (V)_mm512_sqrt_pd((__m512d)a);}

@@ -228,8 +228,9 @@ class _Graph:
         self.tables[k] = table = self.writer.table("double", [number(v) for v in values])
         looked_up = (ca.OP_LOW, ca.OP_GETNONZEROS_PARAM)
         for later in range(k + 1, self.n):
-            if i in self.ins[later][1:] or (
-                i in self.ins[later][:1] and self.op[later] not in looked_up
+            if self.op[later] != ca.OP_INPUT and (
+                i in self.ins[later][1:]
+                or (i in self.ins[later][:1] and self.op[later] not in looked_up)
             ):
                 self._each(len(values), f"{self._w(i)}[k]={self.p}all({table}[k])")
                 return
@@ -381,6 +382,9 @@ class _Graph:
         s, table = info["inner"], self._table_of(k)
         which = f"({s['start']}+k*{s['step']})"
         n = node.nnz()
+        if table and s["step"] == 1:
+            self.body.append(f"{self.p}rows({table}+{s['start']},{at}[0],{n},{to});")
+            return
         source = f"{table}[q+{which}]" if table else f"{self._get(self.ins[k][0])}[q+{which}][l]"
         self._room(1)
         self.body.append(

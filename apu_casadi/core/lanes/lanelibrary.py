@@ -46,9 +46,9 @@ __all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "source", "unsupport
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
-_FLAGS = {2: (), 4: ("-mavx2",), 8: ("-mavx512f", "-mavx512dq", "-mavx512vl")}
+FLAGS = {2: (), 4: ("-mavx2",), 8: ("-mavx512f", "-mavx512dq", "-mavx512vl")}
 _NEEDS = {4: {"avx2"}, 8: {"avx512f", "avx512dq", "avx512vl"}}
-_COMMON_FLAGS = ("-ffp-contract=off", "-Wno-psabi")
+COMMON_FLAGS = ("-ffp-contract=off", "-Wno-psabi")
 _X86 = ("x86_64", "AMD64")
 
 
@@ -178,7 +178,7 @@ def unsupported(fun: ca.Function) -> str:
 
 def _code(fun: ca.Function, n: int, common: tuple[int, ...]) -> Code:
     content = f"{fun.name()} {n} {common} {_digest()}\n{fun.serialize()}"
-    flags = (*(_FLAGS[n] if platform.machine() in _X86 else ()), *_COMMON_FLAGS)
+    flags = (*(FLAGS[n] if platform.machine() in _X86 else ()), *COMMON_FLAGS)
     return Code(_name(fun, n), content, lambda: source(fun, n, common), flags)
 
 

@@ -34,7 +34,8 @@ __all__ = [
     "ensemble",
 ]
 
-CHUNK = 64  # members that are under way at once
+CHUNK = 128  # members that are under way at once
+OFTEN = 40  # calls one by one before code in lanes is compiled; scalar code is after 50
 T = TypeVar("T")
 
 
@@ -116,7 +117,8 @@ class Together:
     Args:
         fun: as compiled for one call.
         of: what it was compiled from, with dense inputs and outputs.
-        one: evaluates one call; a ``Caller`` of ``fun`` if not given.
+        one: evaluates one call, compiled or not; a ``Caller`` of ``fun`` if not given.  With it,
+            code in lanes is compiled after ``OFTEN`` calls only; a library that is there is loaded.
     """
 
     def __init__(
@@ -128,6 +130,7 @@ class Together:
         self.fun, self.of = fun, of
         self._one = one  # a member's own is never made where all ask
         self._in_lanes: Caller | None = None
+        self._left = 0 if one is None else OFTEN
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
     def __call__(self, *given: Any) -> tuple[np.ndarray, ...]:
@@ -192,6 +195,7 @@ class Together:
     def _one_by_one(self, asked: Question, calls: int) -> list[np.ndarray]:
         """Return the outputs of a row of calls, each of shape (calls, 1, entries)."""
         rows, (first, *rest) = self._room(calls, 1), asked.given
+        self._left -= calls
         for i in range(calls):
             made = self._alone(first, *rest)
             for row, out in zip(rows, made, strict=True):
@@ -223,8 +227,18 @@ class Together:
 
     @property
     def lanes(self) -> int:
-        """Members that are evaluated at once."""
+        """Members that are evaluated at once; one while nothing is compiled."""
+        if not self._ready():
+            return 1
         return int(self._call.fun.size2_out(0)) // int(self._outputs[0][1])
+
+    def _ready(self) -> bool:
+        """Whether lanes may be used: they are compiled, or the calls so far are worth it."""
+        if self._in_lanes is None and self._left == OFTEN:
+            made = in_lanes(self.of, build=False)
+            if made.class_name() == "External":
+                self._in_lanes = Caller(made, copy=False)
+        return self._in_lanes is not None or self._left <= 0
 
     @property
     def _call(self) -> Caller:
@@ -251,12 +265,14 @@ def answer(
             whose[m.asks] = m
             asking.setdefault(hash(m.asks.function.of), []).append(m.asks)
     packs: list[list[Question]] = []
+    full: list[list[Question]] = []
     for own in asking.values():
         own.sort(key=lambda q: -q.calls)  # rows of calls that are equally long go together
         n = own[0].function.lanes if len(own) > 1 else 1
-        packs += [own[i : i + n] for i in range(0, len(own), n)]
+        parts = [own[i : i + n] for i in range(0, len(own), n)]
+        packs += parts
+        full += [p for p in parts if len(p) == n and len(own) > 1]
     if patient and packs:
-        full = [p for p in packs if len(p) > 1 and len(p) == p[0].function.lanes]
         packs = full or [max(packs, key=len)]
 
     def work(pack: list[Question]) -> list[tuple[np.ndarray, ...]]:

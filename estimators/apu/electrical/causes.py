@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from apu_casadi.core.backend import rarely
 from apu_casadi.core.errors import ApuError
 from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
@@ -247,7 +248,7 @@ def causes_of_change(
     samples: Mapping[str, np.ndarray],
     change: float,
     *,
-    backend: str | None = "vm",
+    backend: str | None = None,
 ) -> Causes | None:
     """Tell what a change of the waveforms is; None where there are too few samples around it.
 
@@ -255,13 +256,14 @@ def causes_of_change(
         machine, sensors: as the filter knows them; sensors with gain errors taken for noise.
         samples: as :meth:`ElectricalFilter.recording` takes them.
         change: its instant, s; that of the first sample where it was there from the start.
-        backend: see :func:`apu_casadi.core.backend.compiled`; the virtual machine is faster for
-            filters that are run once.
+        backend: see :func:`apu_casadi.core.backend.compiled`; by default as for what is done
+            :func:`~apu_casadi.core.backend.rarely`.
     """
     t = samples["t"]
     at = (t >= change - BEFORE - 1e-9) & (t <= change + AFTER + 1e-9)
     if at.sum() < FEWEST or (t[at] >= change).sum() < FEWEST // 4:
         return None
+    backend = backend or rarely("causes of a change")
     piece = _Piece(machine, sensors, {n: v[at] for n, v in samples.items()}, change, backend)
     found: dict[str, float] = {}
 

@@ -205,7 +205,8 @@ class _Filters:
     def of(self, phases: tuple[str, ...], *, plain: bool = False) -> ElectricalFilter:
         """The filter with the severities of some phases; the healthy machine's without.
 
-        A ``plain`` one takes gain errors for noise, as the healthy machine's does.
+        A ``plain`` one takes gain errors for noise, as the healthy machine's does, and leaves the
+        power out: it is for innovations, which that does not change.
         """
         healthy = self.gain_errors and (plain or not phases)
         three = phases == PHASES and self.gain_errors and not plain
@@ -217,7 +218,7 @@ class _Filters:
             sensors=loosened(self.sensors) if healthy else self.sensors,
             h_walk=H_WALK_CONSIDERED if three else None,
             gains="consider" if self.gain_errors and not healthy else "none",
-            power=True,
+            power=not plain,
             phases=phases,
             free=free if phases else None,
         )
