@@ -4,6 +4,7 @@ The runs go through a host of the tests' own (``fmi_host``), which needs a C com
 where it is installed, validates the files and runs them by its own solvers.
 """
 
+import dataclasses
 import re
 import subprocess
 import zipfile
@@ -12,6 +13,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 from fmi_host import Fmu, cosimulate, exchanged
+from odd_engine import odd_engine
 
 from apu_casadi import (
     Apu,
@@ -25,6 +27,7 @@ from apu_casadi import (
 from apu_casadi.core.backend import find_compiler
 from apu_casadi.core.errors import BackendError, DataError, ParameterError
 from apu_casadi.gaspath.gasgenerator import GasGeneratorState
+from apu_casadi.unit.enginefile import read_unit
 from apu_casadi.unit.events import HEALTH_FACTORS, Ambient
 from apu_casadi.unit.monolithic import simulate_monolithic
 from scenarios import cli
@@ -404,6 +407,28 @@ def test_unit_by_cosimulation(built, asked, tmp_path, version):
     how = {"solver": "cvodes", "rtol": 1e-10, "atol": 1e-12, "waveform_dt": 1e-3}
     ds = simulate_joint(asked.unit, duration=1.2, load=LOAD, events=EVENTS, **how)
     compared(built("apu", version), tmp_path, ds, CHANGES)
+
+
+def own_engine():
+    """A unit that nobody ships: other gas-path numbers, maps, machine, gear and governor."""
+    moved = {"machine.r_s": 0.006, "coupling.gear": 3.1, "governor.Kp": 0.4}
+    return dataclasses.replace(Apu(), gas_generator=odd_engine()).change(moved)
+
+
+@needs_compiler
+@pytest.mark.ci
+@pytest.mark.parametrize("name", ["tpe331", "aps5000", "own"])
+def test_other_units_by_cosimulation(name, tmp_path):
+    """Load step, health step, fault and its end, as of the default unit."""
+    unit = own_engine() if name == "own" else read_unit(name).unit
+    rated = unit.generator.machine.P_rated
+    load, less = (SeriesLoad.from_power(k * rated) for k in (0.9, 0.45))
+    path = fmu.build(fmu_model("apu", Asked(unit, load, None, Ambient())), tmp_path / "u.fmu")
+    events = [LoadChange(0.2, less), *EVENTS[1:]]
+    of_less = of_each(dict(zip(("R_a", "R_b", "R_c"), less.R, strict=True)))
+    how = {"solver": "cvodes", "rtol": 1e-10, "atol": 1e-12, "waveform_dt": 1e-3}
+    ds = simulate_joint(unit, duration=1.2, load=load, events=events, **how)
+    compared(path, tmp_path, ds, [(0.2, of_less), *CHANGES[1:]])
 
 
 @needs_compiler

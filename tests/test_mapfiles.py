@@ -251,6 +251,8 @@ def without(*which: int):
         (replaced(34, "PR_surge", "PR"), DataError, "line 34: column PR_surge missing"),
         (lambda lines: lines[:3], DataError, "no map rows"),
         (lambda lines: [t.replace(",", ";") for t in lines], DataError, "line 3: .*not semicolons"),
+        (lambda lines: [t.replace(",", "\t") for t in lines], DataError, "line 3: .*not tabs"),
+        (lambda lines: [*lines[:2], "sep=,", *lines[2:]], DataError, "line 3: delete this line"),
         (lambda lines: ["# kind: turbine", "hello"], DataError, "neither a CSV map"),
         (lambda lines: [""], DataError, "file is empty"),
         (lambda t: [*t[:1], "# N_ref: one", *t[1:]], DataError, "line 2, N_ref: a number"),
@@ -326,3 +328,11 @@ def test_an_overlong_cell_is_no_traceback(write):
     lines[5] = "1" * 200_000
     with pytest.raises(DataError, match="line 6: no row of numbers"):
         read_map(write(lines))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+def test_maps_as_spreadsheets_save_them(tmp_path, encoding):
+    path = tmp_path / "my.csv"
+    path.write_bytes("\r\n".join(["# Höhe", *csv_lines()]).encode(encoding))
+    (tmp_path / "plain.csv").write_text("\n".join(csv_lines()))
+    assert_array_equal(read_map(path).W, read_map(tmp_path / "plain.csv").W)

@@ -117,6 +117,20 @@ def test_a_file_gives_a_column(tmp_path):
         ("sep=,\ntime,altitude\n0,1\n", "row 1: delete this line, and put commas between"),
         ("time,altitude [ft]\n0,1\n", "row 1: column 'altitude [ft]' has a unit; profiles are in"),
         ("time;altitude\n0;1\n", "row 1: cells must be separated by commas, not semicolons"),
+        ("time\taltitude\n0\t1\n", "row 1: cells must be separated by commas, not tabs"),
+        (
+            "time,altitude\ns,m\n0,1\n",
+            "row 2, column 'time': a number is expected, got 's': delete",
+        ),
+        (
+            "time,altitude\n0,1\n1,\n",
+            "row 3, column 'altitude': a number is expected, got '': comp",
+        ),
+        ('time,altitude\n0,"1,500"\n', "got '1,500': write numbers with a point"),
+        (
+            "time,altitude\n2024-01-01T00:00:00Z,1\n",
+            "times are seconds from the start of the phase",
+        ),
         ("time,altitude,altitude\n0,1,2\n", "row 1: column 'altitude' stands 2 times"),
         ("time,altitude\n0,1\n1,x\n", "row 3, column 'altitude': a number is expected, got 'x'"),
         ("time,altitude\n0,1\n1,nan\n", "row 3, column 'altitude': must be finite, got 'nan'"),
@@ -133,6 +147,16 @@ def test_wrong_files_are_refused_with_row_and_column(tmp_path, text, message):
     with pytest.raises(DataError) as e:
         profile_from_table({"file": str(path)}, "altitude")
     assert message in str(e.value) and "climb.csv" in str(e.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+def test_files_as_spreadsheets_save_them(tmp_path, encoding):
+    path = tmp_path / "climb.csv"
+    path.write_bytes("time,altitude,Höhe\r\n0,1,hoch\r\n2,3.5,über\r\n".encode(encoding))
+    assert profile_from_table({"file": str(path)}, "altitude").points == (1.0, 3.5)
+    path.write_bytes("time,altitude".encode("utf-16") + b"x")
+    with pytest.raises(DataError, match="damaged UTF-16 text"):
+        profile_from_table({"file": str(path)}, "altitude")
 
 
 @pytest.mark.parametrize(

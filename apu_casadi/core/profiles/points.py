@@ -31,6 +31,7 @@ from apu_casadi.core.errors import DataError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import PROFILES, Profile, in_run
 from apu_casadi.core.register import Key
 from apu_casadi.core.sharing import Parametric, derived
+from apu_casadi.core.units import unit_of
 
 FILE_KEYS = ("file", "column", "time")
 """Keys of a profile that is read from a file; the last two have defaults."""
@@ -162,7 +163,7 @@ class OfPoints(Parametric, Profile):
 
 def _read(path: str | os.PathLike[str], wanted: tuple[str, str]) -> list[tuple[int, list[float]]]:
     """Return two columns of a file, each row with its number in the file."""
-    text = files.read_text(path, "profile", LARGEST_FILE)
+    text = files.table_text(files.read_bytes(path, "profile", LARGEST_FILE), path)
     header, rows = None, []
     for row, cells in _cells(path, text):
         cells = [c.strip() for c in cells]
@@ -199,13 +200,8 @@ def _column(path: Any, row: int, header: list[str], name: str) -> int:
         return header.index(name)
     if name in header:
         raise DataError(f"{path}: row {row}: column {name!r} stands {header.count(name)} times")
-    if len(header) == 1 and ";" in header[0]:
-        raise DataError(f"{path}: row {row}: cells must be separated by commas, not semicolons")
-    if header[0].strip('"').lower().startswith("sep="):
-        raise DataError(
-            f"{path}: row {row}: delete this line, and put commas between the cells if there are "
-            "others"
-        )
+    if wrong := files.no_commas(header):
+        raise DataError(f"{path}: row {row}: {wrong}")
     if own := next((h for h in header if re.fullmatch(rf"{re.escape(name)}\s*[\[({{].*", h)), ""):
         raise DataError(
             f"{path}: row {row}: column {own!r} has a unit; profiles are in the unit of the "
@@ -220,10 +216,21 @@ def _number(path: Any, row: int, column: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise DataError(f"{where}: a number is expected, got {text!r}") from None
+        raise DataError(f"{where}: a number is expected, got {text!r}{_remedy(text)}") from None
     if not math.isfinite(value):
         raise DataError(f"{where}: must be finite, got {text!r}")
     return value
+
+
+def _remedy(cell: str) -> str:
+    """Return what to do about a cell that is no number, where that can be told."""
+    if unit_of(cell.strip("[]() ")) is not None:
+        return ": delete the row of units; a profile is in the unit of the scenario's key"
+    if re.match(r"\d{1,4}[-/.]\d\d?[-/.]\d", cell) or cell.count(":") > 1:
+        return ": times are seconds from the start of the phase, not dates"
+    if re.fullmatch(r"[-+\u2212]?[\d,. ']+", cell):
+        return ": write numbers with a point and without signs between thousands"
+    return ": complete the row, or delete it" if not cell else ""
 
 
 @PROFILES.add("table")

@@ -93,7 +93,7 @@ def read_map(path: str | Path, *, trim: bool | None = None, check: bool = True) 
     first = next((w for w in words if w and not w.startswith("#")), "")
     if re.match(r"99(\s|$)", first) or any(section_of(w) for w in words):
         return read_map_gasturb(path, trim=trim, check=check)
-    if "," in first or ";" in first:
+    if any(sign in first for sign in ",;\t|") or first.startswith("sep="):
         return read_map_csv(path, check=check)
     raise DataError(
         f"{path}: neither a CSV map (header {','.join(GRID_COLUMNS)}) nor the GasTurb/GSP layout "
@@ -215,8 +215,8 @@ def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _csv_header(path: str | Path, k: int, row: list[str], wanted: Sequence[str]) -> list[str]:
-    if len(row) == 1 and ";" in row[0]:
-        raise DataError(f"{path}, line {k}: cells must be separated by commas, not semicolons")
+    if wrong := files.no_commas(row):
+        raise DataError(f"{path}, line {k}: {wrong}")
     missing = [c for c in wanted if c not in row]
     unknown = [c for c in row if c not in wanted]
     if missing:

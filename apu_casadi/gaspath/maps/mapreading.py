@@ -15,25 +15,22 @@ from pathlib import Path
 
 import numpy as np
 
+from apu_casadi.core import files
 from apu_casadi.core.errors import ApuWarning, DataError, MapError
 from apu_casadi.gaspath.maps.mapcheck import Finding
 from apu_casadi.gaspath.maps.maptable import MapTable, found_text
 
 
 def file_lines(path: str | Path) -> list[str]:
-    """Return the lines of a map file in UTF-8 or Latin-1.
+    """Return the lines of a map file in UTF-8, UTF-16 or Windows-1252.
 
     Raises:
         DataError: it cannot be read, or is empty.
     """
     try:
-        data = Path(path).read_bytes()
+        text = files.table_text(Path(path).read_bytes(), path)
     except OSError as e:
         raise DataError(f"{path}: cannot read the map file: {e.strerror}") from None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
     if not text.strip():
         raise DataError(f"{path}: the map file is empty")
     return text.splitlines()
