@@ -32,7 +32,7 @@ from estimators.apu.electrical.machinemodel import _exponential, leaky_pair
 from estimators.apu.electrical.terminalsignals import GAIN_SENSORS, MEASURED
 from estimators.apu.electrical.tracking import _usual, track, window_power
 from estimators.apu.electrical.tuning import ANGLE_WALK_CONSIDERED, START_SIGMA
-from estimators.apu.joint import joint_case
+from estimators.apu.jointcases import joint_case
 from estimators.apu.sensors import ELECTRICAL
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter

@@ -25,9 +25,9 @@ from estimators.apu.joint import (
     electrical_samples,
     electrical_side,
     estimate_joint,
-    joint_case,
     speed_from_generators,
 )
+from estimators.apu.jointcases import joint_case
 from estimators.apu.monolithic_filter import compare_monolithic, monolithic_filter
 from estimators.apu.sensors import ELECTRICAL
 from estimators.apu.unknowns import UNKNOWNS, Knowledge

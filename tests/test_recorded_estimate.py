@@ -23,7 +23,8 @@ from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.electrical.sequences import sequences
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.healthjumps import track_jumps
-from estimators.apu.joint import ETA_SIGMA, estimate_joint, joint_case
+from estimators.apu.joint import ETA_SIGMA, estimate_joint
+from estimators.apu.jointcases import joint_case
 from estimators.apu.measuring import measure_run, read_sensors, write_recording
 from estimators.apu.recorded_estimate import estimate
 from estimators.apu.recordings.measured import read_recording

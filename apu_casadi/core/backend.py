@@ -236,7 +236,6 @@ def compiled(
     if level not in LEVELS:
         raise BackendError(f"{fun.name()}: level must be one of {LEVELS}, got {level!r}")
     wanted = _wanted(None if backend == READY else backend)
-    build = build and backend != READY
     if wanted == "vm":
         return fun
     level = min(level, _ceiling())
@@ -244,17 +243,14 @@ def compiled(
     if known is not None:
         return known
     with BUILDING:
-        return _find_or_make(fun, wanted, build, level)
+        return _find_or_make(fun, wanted, build and backend != READY, level)
 
 
 def rarely(what: str) -> str | None:
     """Return the backend of something that is done once in a while, by functions of its own.
 
     To compile them would take longer than to do it: only libraries that are there are used, up to
-    the thirtieth time in this process.  Whoever does it that often does it more often.
-
-    Args:
-        what: is done; each is counted for itself.
+    the thirtieth time in this process.  Each of ``what`` is counted for itself.
     """
     _uses[what] += 1
     return READY if _uses[what] < RARELY else None

@@ -434,13 +434,11 @@ def transition_table(
             slow = [int(nodes.argmin())]
             return np.asarray(_constant_transition(M[slow], length(nodes)[slow], steps)[0])
         slowest = np.full(_PROBE.size, nodes.min())
-        return _transition(ss, (u, theta), _PROBE, slowest, length(slowest), steps, stages=stages)[
-            0
-        ]
+        made = _transition(ss, (u, theta), _PROBE, slowest, length(slowest), steps, stages=stages)
+        return made[0]
 
-    steps, stages, error = _enough(
-        trial, f"{ss.name}: transition matrices over {length(nodes).max():.3g} s"
-    )
+    what = f"{ss.name}: transition matrices over {length(nodes).max():.3g} s"
+    steps, stages, error = _enough(trial, what)
 
     def sampled(angles: np.ndarray) -> np.ndarray:
         """Entries in nominal units, column by column, leap after leap: (nodes, angles, entries)."""
@@ -462,7 +460,6 @@ def transition_table(
         P = sampled(np.zeros(1))
         none = np.zeros((NODES, 0, kinds.odd.size))
         return Table(centre, half, powers(P[:, :, kinds.even], kinds.even), none, 0, error)
-    what = f"{ss.name}: the transition matrix over {length(nodes)[0]:.3g} s"
     F, highest = _fourier(sampled, kinds, what)
 
     def series(first: int, which: np.ndarray) -> np.ndarray:

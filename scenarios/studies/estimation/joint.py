@@ -10,7 +10,7 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.joint import cross_talk
+from estimators.apu.jointcases import cross_talk
 from estimators.apu.monolithic_filter import compare_monolithic
 from scenarios.studies import jointrun
 from scenarios.studies.estimation.speed import both

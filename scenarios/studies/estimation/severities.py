@@ -20,7 +20,8 @@ from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.joint import estimate_joint, joint_case
+from estimators.apu.joint import estimate_joint
+from estimators.apu.jointcases import joint_case
 from estimators.information.consistency import share_interval
 from scenarios.studies.estimation.speed import both
 from scenarios.studies.registration import Claim, Results, Study, Tell, numbers
