@@ -27,7 +27,7 @@ def block_that_counts(wrong_from):
     machine = SimpleNamespace(limits=np.array([LIMIT]), valid=lambda w: w < 2600.0)
     machine.ss = SimpleNamespace(name="stub")
     block.machines, block._sampled, block._n_gov, block._n_x = (machine,), [False], 1, [1]
-    block._call = call
+    block._n_z, block._call = 1, call
     return block, calls
 
 

@@ -178,6 +178,7 @@ class JointBlock(Rebuilt):
         ]
         n_x = [len(m.ss.x) for m in machines]
         self._n_gov, self._n_x = len(apu.governor.X), n_x
+        self._n_z = apu.gas_generator.family.step.numel_in(4)
         self._sampled = [m.advance.n_out() == 4 for m in machines]
         self._likely = LONG // BLOCK  # blocks in a row that an ensemble is asked for
         self._call = _caller(apu.gas_generator.family, links[0], self.machines, wide)
@@ -260,8 +261,7 @@ class JointBlock(Rebuilt):
     def _parted(self, carry: np.ndarray, out: Sequence[np.ndarray]) -> BlockResult:
         """Return the parts of the state at the end of blocks, and of their outputs."""
         y, _, *rest = out
-        n_z = self.apu.gas_generator.family.step.numel_in(4)
-        ends = np.cumsum([0, 1, n_z, self._n_gov, *self._n_x]).tolist()
+        ends = np.cumsum([0, 1, self._n_z, self._n_gov, *self._n_x]).tolist()
         N, z, x_gov, *x1 = (carry[i:j] for i, j in pairwise(ends))
         groups = []
         for x, sampled in zip(x1, self._sampled, strict=True):
