@@ -15,15 +15,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from scenarios.commands import given, readingoptions
 from scenarios.shell import jsontext, usage
 from scenarios.shell.progress import bar, moving
 from scenarios.studies.estimation import names
-
-if TYPE_CHECKING:
-    pass
 
 NAME = "estimate"
 HELP = "estimate faults with confidence: recordings, joint run, studies, their page"
