@@ -12,12 +12,14 @@ from apu_casadi.core.errors import SignalError
 from scenarios.figures import figstyle as fs
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["plot_recorded"]
 
 Z95 = 1.96
 SHOWN = {"N": ("speed [r/min]", 30 / np.pi), "PW": ("shaft power [kW]", 1e-3)}
+_EDGES = ((-1, 3), (1, 97))  # signs of a band's edges, and their percentiles that are to be seen
 Curve = tuple[str, np.ndarray, np.ndarray, np.ndarray]  # label, t, value, half width of the band
 
 
@@ -46,6 +48,7 @@ def plot_recorded(found: Any, note: str = "") -> Figure:
                 ink = fs.look(j)[0]
                 ax.fill_between(t, value - half, value + half, color=ink, alpha=0.2, lw=0)
                 ax.plot(t, value, color=ink, lw=1.2, label=label)
+            _fitted(ax, curves)
             if len(curves) > 1:
                 ax.legend(frameon=False, fontsize=8, ncols=len(curves))
             for when in alarms:
@@ -57,6 +60,14 @@ def plot_recorded(found: Any, note: str = "") -> Figure:
         text = f"{doubt}Shade: 95 % band. Dotted: reports of a change. {note}"
         fs.caption(fig, text.strip())
         return fig
+
+
+def _fitted(ax: Axes, curves: Sequence[Curve]) -> None:
+    """Show all values, and of their bands what does not last a moment, as the prior's."""
+    seen = [np.nanpercentile(v + sign * half, q) for _, _, v, half in curves for sign, q in _EDGES]
+    every = np.concatenate([*(v for _, _, v, _ in curves), seen])
+    if np.isfinite(every).any():
+        fs.roomy(ax, every, 0.06)
 
 
 def _panels(found: Any) -> list[tuple[str, list[Curve], Sequence[float]]]:
