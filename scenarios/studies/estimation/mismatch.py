@@ -20,7 +20,7 @@ from scenarios.studies.mismatch.imperfections import IMPERFECTIONS, SIZES, Imper
 from scenarios.studies.mismatch.pipeline import mismatch
 from scenarios.studies.registration import Claim, Results, Study, Tell
 
-__all__ = ["STUDY"]
+__all__ = ["STUDY", "filters"]
 
 GOAL = {"realistic": 0.01, "large": 0.05}
 """Largest share of runs that may be silently wrong, by size."""
@@ -28,7 +28,8 @@ START, EACH = 10.0, 1.2  # expected seconds of a part: once (truths), and for ea
 HOUR = 3600.0
 
 
-def _filters() -> list[ca.Function]:
+def filters() -> list[ca.Function]:
+    """Return the functions of the filters that a recording is given to."""
     models = gas_path_filter().model, electrical_filter(Apu().generator.machine, power=True).model
     return [ekf_step(m).function for m in models]
 
@@ -43,7 +44,7 @@ STUDY = Study(
     seed0=60_000,
     tuned="tests and thresholds were looked at on seeds below 1000",
     modules={"mismatch": ("estimators.apu.believable", "scenarios.studies.mismatch")},
-    filters=_filters,
+    filters=filters,
     text="""
 @intro
 A unit runs for 1 s: a load step, then nothing, a short circuit or a change of gas-path health, in

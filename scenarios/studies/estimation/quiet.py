@@ -11,7 +11,6 @@ from collections import Counter
 from functools import partial
 from typing import Any
 
-import casadi as ca
 import xarray as xr
 
 from apu_casadi.core.sharing import last
@@ -19,13 +18,11 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
-from estimators.apu.electrical.electricalfilter import electrical_filter
-from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.measuring import measure_run
 from estimators.apu.recorded_estimate import RecordedEstimate, estimate
 from estimators.apu.recordings.measured import read_recording
-from estimators.filters.ekf import ekf_step
 from estimators.information.consistency import count_limit
+from scenarios.studies.estimation.mismatch import filters
 from scenarios.studies.registration import Claim, Results, Study, Tell
 
 __all__ = ["STUDY", "reported"]
@@ -34,11 +31,6 @@ HOUR, STEP = 3600.0, 20.0  # s; of a load
 LOADS = (225, 100, 25)  # kW, of each generator; four fifths of it every other step
 #: Recorded -> (duration, s; expected seconds of its truth and of an estimate; share of the seeds).
 RECORDED = {"gas path": (600.0, 4.0, 20.0, 1.0), "unit": (40.0, 10.0, 40.0, 1.0)}
-
-
-def _filters() -> list[ca.Function]:
-    models = gas_path_filter().model, electrical_filter(Apu().generator.machine, power=True).model
-    return [ekf_step(m).function for m in models]
 
 
 STUDY = Study(
@@ -50,7 +42,7 @@ STUDY = Study(
     seed0=75_000,
     tuned="never looked at before the thresholds were set",
     modules={"quiet": ("estimators.apu.believable",)},
-    filters=_filters,
+    filters=filters,
     text="""
 @intro
 A healthy unit, with gain errors and noise, whose load steps by a fifth every 20 s. The gas path is
