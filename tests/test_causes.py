@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from apu_casadi.machine.faults.field import FieldShort
 
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.ttsc import Ttsc
@@ -16,6 +17,7 @@ from apu_casadi.unit.events import FaultChange, HealthChange
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.believable import gas_doubts
 from estimators.apu.electrical.causes import causes_of_change
+from estimators.apu.electrical.residuals import field_steps
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.healthjumps import Tracked
@@ -91,6 +93,20 @@ def test_a_voltage_sensor_harmonics_a_hot_winding(healthy):
     assert cause(waves(apu=hot)).best == "hot winding"
 
 
+def test_shorted_turns_of_the_field(healthy):
+    """4 % of them; the current's sensor alone may read less, which turns cannot make it."""
+    field = waves(FaultChange(AT, FieldShort(0.04)))
+    at = field["t"][field_steps(field, ELECTRICAL, [])[0] <= field["t"]][0]
+    found = causes_of_change(APU.generator.machine, ELECTRICAL, field, float(at))
+    assert found.best == "field winding" and found.probability[found.best] > 0.8
+    t = healthy["t"]
+    assert field_steps(healthy, ELECTRICAL, []) == []
+    less = healthy | {"i_fd": healthy["i_fd"] * np.where(t >= AT, 0.96, 1.0)}
+    assert field_steps(less, ELECTRICAL, []) == [pytest.approx(AT)]
+    assert field_steps(less, ELECTRICAL, [AT - 0.01]) == []  # that is told
+    assert cause(less).best == "sensor i_fd"
+
+
 def test_too_few_samples_tell_nothing(healthy):
     early = {n: v[:80] for n, v in healthy.items()}
     assert causes_of_change(APU.generator.machine, ELECTRICAL, early, 0.005) is None
@@ -131,6 +147,7 @@ def test_the_gas_path_or_one_of_its_sensors(gas):
     filt, quiet, worn = gas
     c = told(filt, filt.recording(worn, 3))
     assert c.best == "gas path" and c.probability["gas path"] > 0.9
+    assert max(c.failure["gas path"], key=c.failure["gas path"].get) == "f_eta_c"
     assert told(filt, filt.recording(quiet, 3)).best == "none"
     for name, share in (("P3", 0.04), ("T5", 0.06), ("T3", 0.06), ("N", 0.02)):
         data = filt.recording(quiet, 3)

@@ -373,31 +373,60 @@ def test_metadata_names_every_file_and_column(small, made):
     assert math.isfinite(small.duration)
 
 
+def told_of(*best, onsets=(), factors=(), severity=(0.0, 1e-5)):
+    """What an estimate says: all factors are 2 % off, by gain errors; only one has changed."""
+    import xarray as xr
+
+    t = np.linspace(0.0, 6.0, 301)
+    course = {n: ("time", np.full(t.size, 0.98)) for n in baselines.HEALTH}
+    course["f_eta_t"] = ("time", np.where(t < 3.2, 1.0, 0.985))
+    sigma = {f"{n}_sigma": ("time", np.full(t.size, 0.007)) for n in baselines.HEALTH}
+    alarms = [v + 0.2 for v in onsets]
+    attrs = {"onsets": str([*onsets]), "alarms": str(alarms)}
+    found = [SimpleNamespace(t=3.2, best=b, failure=dict(factors)) for b in best]
+    lost = {"h": severity[0], "h_sigma": severity[1]}
+    balance = xr.Dataset({n: ("time", np.full(t.size, v)) for n, v in lost.items()}, {"time": t})
+    return SimpleNamespace(
+        gaspath=xr.Dataset(course | sigma, {"time": t}, attrs), diagnoses=found, balance=balance
+    )
+
+
+def said_of(monkeypatch, told, waves=None):
+    """What the baseline makes of it."""
+    from estimators.apu import recorded_estimate
+    from estimators.apu.recordings import measured
+
+    monkeypatch.setattr(recorded_estimate, "estimate", lambda *a, **k: told)
+    monkeypatch.setattr(measured, "read_recording", lambda data: data)
+    columns = [f"X_s.{n}" for n in baselines.GAS_PATH.names] + [f"W.{n}" for n in baselines.VARIED]
+    t = told.gaspath["time"].values
+    return baselines.estimated(
+        1, pd.DataFrame({"time": t} | dict.fromkeys([*columns, "W.P_e"], 1.0)), waves
+    )
+
+
 @pytest.mark.parametrize(
     ("best", "alarmed", "said"),
     [("gas path", True, "f_eta_t"), ("sensor T5", True, "sensor"), ("gas path", False, "healthy")],
 )
 def test_a_change_of_health_is_judged_from_its_onset(monkeypatch, best, alarmed, said):
     """All factors are 2 % off, as gain errors make them; only one of them has changed."""
-    import xarray as xr
-
-    from estimators.apu import recorded_estimate
-    from estimators.apu.recordings import measured
-
-    t = np.linspace(0.0, 6.0, 301)
-    course = {n: ("time", np.full(t.size, 0.98)) for n in baselines.HEALTH}
-    course["f_eta_t"] = ("time", np.where(t < 3.2, 1.0, 0.985))
-    sigma = {f"{n}_sigma": ("time", np.full(t.size, 0.007)) for n in baselines.HEALTH}
-    attrs = {"onsets": "[3.0]" if alarmed else "[]", "alarms": "[3.2]" if alarmed else "[]"}
-    told = SimpleNamespace(
-        gaspath=xr.Dataset(course | sigma, {"time": t}, attrs),
-        diagnoses=[SimpleNamespace(best=best)],
-    )
-    monkeypatch.setattr(recorded_estimate, "estimate", lambda *a, **k: told)
-    monkeypatch.setattr(measured, "read_recording", lambda data: data)
-    columns = [f"X_s.{n}" for n in baselines.GAS_PATH.names] + [f"W.{n}" for n in baselines.VARIED]
-    gas = pd.DataFrame({"time": t} | dict.fromkeys(columns, 1.0))
-    row = baselines.estimated(1, gas, None)
+    told = told_of(*([best] if alarmed else []), onsets=(3.0,) if alarmed else ())
+    row = said_of(monkeypatch, told)
     assert row["class"] == said
     assert row.get("alarm_time") == (3.2 if alarmed else None)
     assert row["f_eta_t"] == 0.985
+
+
+def test_what_a_loss_of_the_generators_and_a_likelier_factor_say(monkeypatch):
+    short = "generators: short circuit"
+    row = said_of(monkeypatch, told_of(short, severity=(8e-4, 1e-4)))
+    assert (row["class"], row["h"], row["h_sigma"]) == ("ttsc", 8e-4, 1e-4)
+    assert said_of(monkeypatch, told_of(short, severity=(3e-4, 1e-4)))["class"] == "healthy"
+    both = told_of("gas path", short, onsets=(3.0,), factors={"f_W_c": 0.9}, severity=(8e-4, 1e-4))
+    assert said_of(monkeypatch, both)["class"] == "combined"
+    gas = told_of("gas path", onsets=(3.0,), factors={"f_W_c": 0.9, "several factors": 0.1})
+    assert said_of(monkeypatch, gas)["class"] == "f_W_c"
+    monkeypatch.setattr(baselines, "_of_machine", lambda _, k: ("a", 0.0, 1e-5, "field winding"))
+    row = said_of(monkeypatch, told_of(), waves=())
+    assert (row["class"], row["generator"]) == ("field", 1)

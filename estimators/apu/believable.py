@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -35,7 +35,7 @@ from scipy.special import ndtr, ndtri
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.electrical.causes import Causes, causes_of_change
-from estimators.apu.electrical.residuals import unexplained_waves
+from estimators.apu.electrical.residuals import field_steps, unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms, jumps_of
 from estimators.apu.gaspath import MODEL_ERROR
@@ -57,7 +57,8 @@ if TYPE_CHECKING:
 __all__ = [
     "KINDS",
     "LEVEL",
-    "channel_doubts",
+    "Still",
+    "channels_still",
     "fit_doubts",
     "gas_causes",
     "gas_doubts",
@@ -65,6 +66,7 @@ __all__ = [
     "machine_causes",
     "machine_doubts",
     "standing_still",
+    "still_causes",
 ]
 
 KINDS = (
@@ -96,16 +98,22 @@ OFF_MAP = ("off_c", "off_t")
 # ------------------------------------------------------------------------------ channels
 
 
-def channel_doubts(
-    m: Measurements, table: SensorSet, coarse: Collection[str] = ()
-) -> Iterator[Doubt]:
+class Still(NamedTuple):
+    """A sensor that stands still: its name, from when on, and what that makes doubtful."""
+
+    name: str
+    t: float
+    doubt: Doubt
+
+
+def channels_still(m: Measurements, table: SensorSet, coarse: Collection[str] = ()) -> list[Still]:
     """Say which sensors stand still while most others move.
 
     Args:
         m, table: readings and sensors of the gas path.
         coarse: sensors whose digits are wider than their noise, which stand still often.
     """
-    used = (*table.names, *m.electrical)
+    used, out = (*table.names, *m.electrical), []
     sensors = {n: c for n, c in m.items() if n in used and np.isfinite(c.values).any()}
     for n, c in sensors.items():
         others = [o.values for o in sensors.values() if o is not c and o.t is c.t]
@@ -113,7 +121,16 @@ def channel_doubts(
         if rows is not None:
             a, b = (c.t[k] for k in rows)
             text = f"{c.source}: {n} stands still from {a:g} to {b:g} s"
-            yield Doubt("sensor", text, part_of(n, m.electrical))
+            out.append(Still(n, float(a), Doubt("sensor", text, part_of(n, m.electrical))))
+    return out
+
+
+def still_causes(still: Sequence[Still]) -> Iterator[Causes]:
+    """Tell what the stand of a gas-path sensor is: as little probable otherwise as ``LEVEL``."""
+    for s in still:
+        if s.doubt.part == GAS:
+            name = f"sensor {s.name}"
+            yield Causes(s.t, {name: 1 - LEVEL, "none": LEVEL}, {name: {"stuck": 1.0}})
 
 
 def standing_still(
@@ -244,7 +261,8 @@ def machine_causes(
 ) -> Iterator[tuple[Causes, Doubt | None]]:
     """Tell what the first changes of a generator are, and where the report says something else.
 
-    A change is a reported short circuit, or a new beginning of the filter without a report.
+    A change is a reported short circuit, a new beginning of the filter without a report, or a step
+    of the field's current alone, which gain errors hide from the filter.
 
     Args:
         side, machine, sensors, samples: as of :func:`machine_doubts`.
@@ -258,6 +276,7 @@ def machine_causes(
     }
     changes = [(begins[t], f"short circuit {p}") for t, p in reports]
     changes += [(t, "") for t in resets if t not in begins.values()]
+    changes += [(t, "") for t in field_steps(samples, sensors, [t for t, _ in changes])]
     for t, said in sorted(changes)[:MOST_CAUSES]:
         found = causes_of_change(machine, sensors, samples, t)
         if found is None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from estimators.apu import gascauses
 from estimators.apu.electrical import causes
 from estimators.apu.electrical.causes import Causes, kind_of
-from estimators.apu.trust import GAS
+from estimators.apu.trust import GAS, GENERATORS
 from estimators.information.posterior import named_posterior
 
 __all__ = ["COINCIDENCE", "Diagnosis", "diagnoses"]
@@ -26,6 +26,7 @@ TOGETHER = 0.2  # s; the gas path sees a change later than the waveforms do
 COINCIDENCE = 1e-3
 LEAST = 1e-9  # probability that is no less
 NOTHING = {True: "none", False: "healthy"}  # of the gas path, of a machine
+SHORT = "short circuit"
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Diagnosis:
         t: its first instant, s.
         probability: by hypothesis, ``"gas path"``, ``"sensor T5"``, ``"machine 1: sensor i_a"``,
             ``"machine 2: short circuit b"``, ``"two at once"``.
-        failure: how the most probable sensor failed, with probabilities; empty for others.
+        failure: how the most probable sensor failed, or which factor of the gas path changed,
+            with probabilities; empty for others.
     """
 
     t: float
@@ -111,3 +113,5 @@ def _expected(here: str, place: str, what: str, known: Mapping[str, float]) -> I
         yield from (n for n in ("shaft power",) if n in known)
         if what == "sensor w_r":
             yield from (n for n in ("sensor N",) if n in known)
+    elif what.startswith(SHORT) and GENERATORS in (here, place):
+        yield from (n for n in known if n.startswith(SHORT))  # of which the power says no phase

@@ -7,7 +7,8 @@ probable the better its signature fits, its size and instant unknown: marginal l
 :meth:`~estimators.detection.glr.Glr.log_marginal`, averaged over the instants, times prior weights.
 At the likeliest instant the filter runs again with what may have jumped, since a signature is
 linear and large changes are not; and a sensor may as well be noise, of a size that is found, about
-what the others predict: stuck, drifting, or worse.
+what the others predict, or off it by a line: stuck, drifting, or worse.  A change of health is as
+often of a single factor as of all four.
 """
 
 from __future__ import annotations
@@ -25,19 +26,24 @@ from estimators.apu.gaspath import JUMP, GasPathFilter
 from estimators.apu.gaspathmodel import LAGGING
 from estimators.apu.healthjumps import Tracked
 from estimators.apu.sensorfailures import failure
+from estimators.apu.trust import GAS
 from estimators.detection.glr import glr
 from estimators.detection.signatures import Jump, linearised
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
+from estimators.information.posterior import named_posterior
 from estimators.models.recording import Recording
 
-__all__ = ["PRIOR", "causes_of_alarms", "jumps_of"]
+__all__ = ["PRIOR", "SEVERAL", "causes_of_alarms", "jumps_of"]
 
 BACK, ON = 40, 50  # samples before and after an alarm that are looked at
+BEFORE = 10  # samples before the onset that the alarm found, which may be long before it
 SIZE = 0.05  # standard deviation of a jump of a sensor's gain, of the reading
 WIDE = 1e8  # factor on the variance of a reading that says nothing
 FEWEST = 4  # readings from which a sensor's noise is told
 N_SIZE = 0.02  # the same of the speed's sensor
+ALL = 0.5  # probability that a change of health is one of all factors, not of a single one
+SEVERAL = "several factors"
 #: Prior weights by kind; sensors share theirs.
 PRIOR = {"none": 1.0, "gas path": 1.0, "sensor": 0.3, "shaft power": 0.3}
 
@@ -45,7 +51,7 @@ PRIOR = {"none": 1.0, "gas path": 1.0, "sensor": 0.3, "shaft power": 0.3}
 def jumps_of(filt: GasPathFilter) -> tuple[list[Jump], dict[str, tuple[list[str], list[float]]]]:
     """Return jumps that may be, and by hypothesis the names and standard deviations of its own."""
     jumps = [Jump("state", n) for n in HEALTH]
-    of = {"gas path": (list(HEALTH), [JUMP] * len(HEALTH))}
+    of = {GAS: (list(HEALTH), [JUMP] * len(HEALTH))}
     for n in (n for n in filt.model.y.names if n not in LAGGING):
         if f"gain_{n}" in filt.model.x:
             jumps.append(Jump("state", f"gain_{n}"))
@@ -79,9 +85,10 @@ def causes_of_alarms(
         stop = min(k + ON, tracked.data.size)
         data = _part(replace(tracked.data, u=u), stop)
         how = backend or rarely("causes of an alarm")
-        weighed = _weighed(filt, data, k, tracked.prior, how)
-        failed = _failed(filt, data, onset, max(weighed, key=lambda n: weighed[n]), tracked, how)
-        out.append(Causes(float(data.t[k]), weighed, failed))
+        weighed, factors = _weighed(filt, data, (onset, k), tracked.prior, how)
+        best = max(weighed, key=lambda n: weighed[n])
+        failed = _failed(filt, data, onset, best, tracked, how)
+        out.append(Causes(float(data.t[k]), weighed, {GAS: factors} | failed))
     return out
 
 
@@ -117,15 +124,22 @@ def _part(data: Recording, stop: int) -> Recording:
 
 
 def _weighed(
-    filt: GasPathFilter, data: Recording, k: int, prior: Belief | None, backend: str | None
-) -> dict[str, float]:
-    """Return the probabilities of what a change at about sample k is."""
+    filt: GasPathFilter,
+    data: Recording,
+    about: tuple[int, int],
+    prior: Belief | None,
+    backend: str | None,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the probabilities of what a change of some onset and some alarm is.
+
+    And those of which factor it is, if it is one of the gas path: one of the four, or several.
+    """
     jumps, of = jumps_of(filt)
     r = filt.run(data, prior=prior, backend=backend)
-    g = glr(linearised(filt.model, r, data, jumps, backend=backend), onsets := _onsets(k))
+    g = glr(linearised(filt.model, r, data, jumps, backend=backend), onsets := _onsets(*about))
     after = _After(filt, data, r, backend)
-    found = {"none": 0.0}
-    for name, (parts, size) in of.items():
+
+    def likely(name: str, parts: list[str], size: list[float]) -> float:
         v = g.log_marginal(parts, np.zeros(len(parts)), np.diag(np.square(size)))
         top = int(v.argmax())
         best, onset = float(v[top]), int(onsets[top])
@@ -133,12 +147,18 @@ def _weighed(
             best = after.opened(onset, parts, size)
         if (sensor := name.removeprefix("sensor ")) in filt.model.y:
             best = float(np.logaddexp(best, after.blind(onset, sensor))) - math.log(2.0)
-        found[name] = best + math.log(np.mean(np.exp(v - v[top])))
-    return probabilities(found, PRIOR)
+        return best + math.log(np.mean(np.exp(v - v[top])))
+
+    found = {"none": 0.0} | {name: likely(name, *own) for name, own in of.items()}
+    each = {n: likely(GAS, [n], [JUMP]) for n in HEALTH}
+    each = {n: v + math.log((1 - ALL) / len(HEALTH)) for n, v in each.items()}
+    each |= {SEVERAL: found[GAS] + math.log(ALL)}
+    found[GAS] = float(np.logaddexp.reduce([*each.values()]))
+    return probabilities(found, PRIOR), named_posterior(each)
 
 
-def _onsets(k: int) -> np.ndarray:
-    return np.arange(max(k - BACK, 1), k + 1)
+def _onsets(onset: int, k: int) -> np.ndarray:
+    return np.arange(max(min(k - BACK, onset - BEFORE), 1), k + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +179,7 @@ class _After:
         return self._loglik(onset, names, size) - self._loglik(onset, (), ())
 
     def blind(self, onset: int, sensor: str) -> float:
-        """The same if a sensor is noise of any size about what the others predict."""
+        """The same if a sensor is off what the others predict: noise of any size, bias, drift."""
         row = self.filt.model.y.index(sensor)
         data = _blinded(self.data, row, onset)
         r = self._run(data, onset, self._before(onset))
@@ -171,6 +191,13 @@ class _After:
         # its noise is found: half the logarithm of the number of readings for that
         white = max(float(np.mean(nu**2)), float(np.min(self.data.variance[row, onset:])))
         instead = -0.5 * nu.size * (1 + math.log(2 * math.pi * white)) - 0.5 * math.log(nu.size)
+        # its own noise again, and a line through what it is off
+        more = (data.variance - self.data.variance)[row, onset:]
+        s = np.sqrt(S - more[there])
+        line = np.column_stack([np.ones(nu.size), np.arange(nu.size)]) / s[:, None]
+        rest = nu / s - line @ np.linalg.lstsq(line, nu / s, rcond=None)[0]
+        drift = -0.5 * float(rest @ rest + np.log(2 * math.pi * s**2).sum()) - math.log(nu.size)
+        instead = float(np.logaddexp(instead, drift)) - math.log(2.0)
         return float(r.loglik - own + instead) - self._loglik(onset, (), ())
 
     def _before(self, onset: int) -> Belief:

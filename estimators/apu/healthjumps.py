@@ -9,21 +9,40 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError
-from estimators.apu.gaspath import JUMP, GasPathFilter
+from estimators.apu.gaspath import JUMP
 from estimators.apu.gaspathmodel import DT
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult, StepMaker
 from estimators.information.consistency import exceeded
+from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
 __all__ = ["JumpTest", "Tracked", "spliced", "track_jumps", "whitened"]
 
 SAME_JUMP = 25  # samples between onsets of one jump, as two courses of the power show it
+
+
+class Jumping(Protocol):
+    """A filter whose model has the input ``jump``: how much may change at once."""
+
+    @property
+    def model(self) -> FilterModel:
+        """Its model."""
+
+    def run(
+        self,
+        data: Recording,
+        *,
+        prior: Belief | None = None,
+        step: StepMaker | None = None,
+        backend: str | None = None,
+    ) -> FilterResult:
+        """Filter a recording, with all covariances."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +63,7 @@ class JumpTest:
             wild reading is no jump.
     """
 
-    windows: tuple[int, ...] = (1, 3, 10, 30)
+    windows: tuple[int, ...] = (1, 3, 10, 30, 100, 200)
     rate: float = 1.0
     margin: float = 1.25
     hold: int = 25
@@ -117,7 +136,7 @@ class Tracked:
 
 
 def track_jumps(
-    filt: GasPathFilter,
+    filt: Jumping,
     data: Recording,
     *,
     test: JumpTest | None = None,

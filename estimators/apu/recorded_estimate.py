@@ -29,7 +29,7 @@ from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
 from apu_casadi.unit.events import who
-from estimators.apu.believable import channel_doubts, gas_causes, gas_doubts
+from estimators.apu.believable import channels_still, gas_causes, gas_doubts, still_causes
 from estimators.apu.declared import as_declared, tables
 from estimators.apu.diagnosis import Diagnosis, diagnoses
 from estimators.apu.electrical.causes import Causes
@@ -47,8 +47,10 @@ from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
 from estimators.apu.joint import ElectricalSide, fused, unit_of
 from estimators.apu.machinepowers import fusable
 from estimators.apu.peers import compared_sides
+from estimators.apu.powerbalance import OUTPUT, balance
 from estimators.apu.priorfile import Prior, read_prior
 from estimators.apu.recorded_report import (
+    balance_report,
     gas_dataset,
     gas_report,
     machine_report,
@@ -60,7 +62,7 @@ from estimators.apu.recordedwaves import Waves, machines_in, told
 from estimators.apu.recordings.measured import Measurements
 from estimators.apu.sensorfile import SensorFile
 from estimators.apu.sensors import ELECTRICAL, SensorSet
-from estimators.apu.trust import GAS, Doubt, about, believed, is_lost, verdict
+from estimators.apu.trust import GAS, GENERATORS, Doubt, about, believed, is_lost, verdict
 from estimators.apu.unknowns import EFFICIENCY
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
@@ -101,6 +103,8 @@ class RecordedEstimate:
         causes: what each change is, with probabilities, by ``"gas path"`` or ``"machine 1"``.
         compared: what a comparison of the machines says (:mod:`estimators.apu.peers`).
         belief: why each part is not to be believed, by name (:mod:`estimators.apu.trust`).
+        balance: loss of the generators by shaft power and output (:mod:`.powerbalance`), where
+            both were measured.
     """
 
     gaspath: xr.Dataset | None
@@ -116,6 +120,7 @@ class RecordedEstimate:
     causes: Mapping[str, tuple[Causes, ...]] = field(default_factory=dict, repr=False)
     compared: Mapping[str, Any] = field(default_factory=dict, repr=False)
     belief: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    balance: xr.Dataset | None = None
 
     @property
     def believable(self) -> bool:
@@ -130,6 +135,7 @@ class RecordedEstimate:
     def datasets(self) -> dict[str, xr.Dataset]:
         """Return the estimates over time by what they are of."""
         out = {} if self.gaspath is None else {"gaspath": self.gaspath}
+        out |= {} if self.balance is None else {"balance": self.balance}
         return out | {f"electrical_{k}": e for k, e in self.machines.items()}
 
     def report(self) -> dict[str, Any]:
@@ -138,6 +144,8 @@ class RecordedEstimate:
         out["belief"] = verdict(self.belief)
         if self.gaspath is not None:
             out["gaspath"] = gas_report(self.gaspath, joint=self.joint)
+        if self.balance is not None:
+            out["balance"] = balance_report(self.balance)
         out["machines"] = {str(k): machine_report(e) for k, e in self.machines.items()}
         if self.compared:
             out["compared"] = dict(self.compared)
@@ -193,7 +201,8 @@ def estimate(
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
     notes = [*m.notes, *ready.notes]
-    doubts = list[str]([*ready.doubts, *channel_doubts(m, table, ready.coarse)])
+    still = channels_still(m, table, ready.coarse)
+    doubts = list[str]([*ready.doubts, *(s.doubt for s in still)])
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
     causes: dict[str, tuple[Causes, ...]] = {}
@@ -213,21 +222,44 @@ def estimate(
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         e = gas_dataset(filt, tracked)
         causes[GAS], odd = told(gas_causes(filt, tracked))
+        causes[GAS] = (*still_causes(still), *causes[GAS])
         doubts += about([*gas_doubts(filt, tracked, list(sides.values())), *odd], GAS)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
+    lost = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)
     compared, alike = compared_sides(sides)[1:]
     doubts += alike
-    if e is None and not sides and not found:
+    if e is None and lost is None and not sides and not found:
         raise DataError(f"nothing can be estimated: {_why(lacking)}")
     if apu.alike and 0 < len(sides) < len(apu.machines):
         notes.append(_some_of(tuple(sides), len(apu.machines)))
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
     told_of = [k for k in machines_in(m) if k in sides or is_lost(texts[1], k)]
     belief = believed(texts[1], gas=e is not None, machines=told_of, power_of=[*fused_by])
-    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared, belief
+    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared, belief, lost
     machines = {k: side_dataset(s) for k, s in sides.items()}
     return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
+
+
+def _balanced(
+    m: Measurements,
+    apu: Apu,
+    table: SensorSet,
+    start: Prior,
+    doubts: list[str],
+    causes: dict[str, tuple[Causes, ...]],
+) -> xr.Dataset | None:
+    """Compare shaft power and electrical output, where both were measured."""
+    if not ("PW" in m and OUTPUT in m and "PW" in table):
+        return None
+    power, output = m.streams("PW")["PW"], m.streams(OUTPUT)[OUTPUT]
+    if min(power[0].size, output[0].size) < FEWEST:
+        return None
+    of = balance(apu, table["PW"], power, output, start.unknowns())
+    tracked = of.tracked()
+    causes[GENERATORS], odd = told(of.causes(tracked))
+    doubts += about([*of.doubts(tracked), *odd], GAS)
+    return of.dataset(tracked)
 
 
 def _beforehand(m: Measurements, table: SensorSet, only: str | None) -> tuple[bool, dict[str, str]]:

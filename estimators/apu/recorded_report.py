@@ -16,7 +16,7 @@ from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
 from estimators.apu.joint import ElectricalSide
-from estimators.apu.trust import in_words
+from estimators.apu.trust import GAS, in_words
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SURE",
     "Z95",
+    "balance_report",
     "compared_words",
     "gas_dataset",
     "gas_report",
@@ -102,6 +103,14 @@ def gas_report(e: xr.Dataset, *, joint: bool) -> dict[str, Any]:
     return out | {"false_alarms_per_hour": JumpTest().rate}
 
 
+def balance_report(e: xr.Dataset) -> dict[str, Any]:
+    """Return loss and severity at the end, and what came about, ready for JSON."""
+    t = e["time"].values
+    out: dict[str, Any] = {"from": float(t[0]), "to": float(t[-1])}
+    out["values"] = {n: _last(e, n) for n in ("loss", "h")}
+    return out | {n: json.loads(e.attrs[n]) for n in ("alarms", "onsets")}
+
+
 def machine_report(e: xr.Dataset) -> dict[str, Any]:
     """Return the same of a generator."""
     t, phase = e["time"].values, e["faulty_phase"].values.astype(int)
@@ -136,6 +145,20 @@ def compared_words(r: Mapping[str, Any] | None) -> Iterator[str]:
         )
 
 
+def _balance_words(b: Mapping[str, Any] | None) -> Iterator[str]:
+    """Yield what shaft power and electrical output say together."""
+    if b is None:
+        return
+    (loss, dl), (h, dh) = (
+        (b["values"][n]["estimate"], b["values"][n]["half_width"]) for n in ("loss", "h")
+    )
+    yield f"shaft power over electrical output, {b['from']:g} to {b['to']:g} s; at the end, 95 %"
+    yield f"  {'new loss [kW]':<22} {1e-3 * loss:.2f} +- {1e-3 * dl:.2f}"
+    yield f"  {'as a severity [1e-3]':<22} {1e3 * h:.3f} +- {1e3 * dh:.3f}"
+    for t, onset in zip(b["alarms"], b["onsets"], strict=True):
+        yield f"  it changed after {onset:g} s, reported at {t:g} s"
+
+
 def words(r: Mapping[str, Any]) -> Iterator[str]:
     """Yield a report's lines."""
     if "gaspath" in r:
@@ -155,6 +178,7 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
         if not g["alarms"]:
             yield "  no sudden change of health"
         yield f"  (at most {g['false_alarms_per_hour']:g} false report an hour if the model holds)"
+    yield from _balance_words(r.get("balance"))
     for k, e in r["machines"].items():
         yield f"generator {k}, {e['from']:g} to {e['to']:g} s; at the end, 95 %"
         for n, v in e["values"].items():
@@ -182,8 +206,9 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
         for c in told:
             yield f"{n}: the change at {c['t']:g} s is: {_likely(c['probability'])}"
     for d in r["changes"]:
+        how = "of it" if GAS in [*d["probability"]][:1] else "it failed by"
         yield f"at {d['t']:g} s: {_likely(d['probability'])}" + (
-            f"; it failed by {_likely(d['failure'])}" if d["failure"] else ""
+            f"; {how} {_likely(d['failure'])}" if d["failure"] else ""
         )
     yield from (f"not estimated: {n}: {why}" for n, why in r["lacking"].items())
     yield from (f"read: {n}" for n in r["notes"])

@@ -23,6 +23,7 @@ from estimators.apu.recordings.plausible import plain
 
 __all__ = [
     "GAS",
+    "GENERATORS",
     "MACHINE",
     "Doubt",
     "about",
@@ -37,6 +38,7 @@ __all__ = [
 
 GAS = "gas path"
 MACHINE = "machine"  # all machines
+GENERATORS = "generators"  # any of them, as the place of a change
 
 
 class Doubt(str):

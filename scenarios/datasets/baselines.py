@@ -22,6 +22,7 @@ from apu_casadi.core import files
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, nearest
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.sensors import GAS_PATH
+from estimators.apu.trust import GAS
 from scenarios.datasets.making import VARIED
 from scenarios.datasets.recipe import CLASSES
 from scenarios.datasets.scoring import read_labels
@@ -166,59 +167,86 @@ def predict(
 def estimated(run: int, gas: Any, waves: Any) -> dict[str, Any]:
     """Return what the filters of this project say of a run, gas path and generators apart.
 
-    A severity is told where it is four standard deviations from none.  Of the gas path the change
-    since its onset counts, where the filter's test has found one: what all sensors' gain errors
-    leave uncertain of a factor is in both, and cancels.  Which factor it is the largest change
-    says, unless a sensor explains it better.
+    A severity is told where it is four standard deviations from none, in the waveforms or, by
+    what the shaft gives more than the loads take, after them.  Of the gas path the change since
+    its onset counts, where the filter's test has found one: what all sensors' gain errors leave
+    uncertain of a factor is in both, and cancels.  Which factor it is the largest change says,
+    unless a sensor explains it better.
     """
     out: dict[str, Any] = {"run": run, "class": "healthy", "score": 0.0}
-    health, kind, alarm = _of_gas_path(gas)
-    shorts = {k: _of_machine(waves, k) for k in (1, 2)} if waves is not None else {}
+    health, kind, alarm, lost = _of_gas_path(gas)
+    machines = {k: _of_machine(waves, k) for k in (1, 2)} if waves is not None else {}
     for n, (v, s, _) in health.items():
         out |= {n: v, f"{n}_sigma": s}
-    k, (phase, h, s) = max(shorts.items(), key=lambda i: i[1][1] / i[1][2], default=(0, ("", 0, 1)))
-    out |= {"h": h, "h_sigma": s} if shorts and math.isfinite(s) else {}
-    if shorts and h > _ALARM * s:
-        out |= {"class": "combined" if kind else "ttsc", "phase": phase, "generator": k}
+    place: dict[str, Any] = {}
+    h, s = 0.0, math.inf
+    for k, (phase, *severity, _) in machines.items():
+        if severity[0] / severity[1] > h / s:
+            (h, s), place = severity, {"phase": phase, "generator": k}
+    if lost is not None and h <= _ALARM * s and lost[0] / lost[1] > max(h / s, _ALARM):
+        (h, s), place = lost, {}
+    out |= {"h": h, "h_sigma": s} if math.isfinite(s) else {}
+    wound = [k for k, m in machines.items() if m[-1] == "field winding"]
+    if h > _ALARM * s:
+        out |= {"class": "combined" if kind in HEALTH else "ttsc", **place}
+    elif wound:
+        out |= {"class": "field", "generator": wound[0]}
     elif kind:
         out |= {"class": kind}
-    out |= {"alarm_time": alarm} if kind else {}
+    out |= {"alarm_time": alarm} if math.isfinite(alarm) else {}
     moved = max((abs(change) / s for _, s, change in health.values() if s > 0), default=0.0)
-    out["score"] = max(h / s if shorts else 0.0, moved + (_ALARM if kind else 0.0))
+    out["score"] = max(h / s, moved + (_ALARM if kind or wound else 0.0))
     return out
 
 
-def _of_gas_path(gas: Any) -> tuple[dict[str, tuple[float, float, float]], str, float]:
-    """Factors, their sigmas and changes since the onset; class of the change or "", its alarm."""
+Severity = tuple[float, float]
+
+
+def _of_gas_path(
+    gas: Any,
+) -> tuple[dict[str, tuple[float, float, float]], str, float, Severity | None]:
+    """Factors, their sigmas and changes since the onset; class of the change or "", its alarm.
+
+    And the severity that a loss of the generators tells, with its sigma; None if there is none.
+    """
+    from estimators.apu.powerbalance import OUTPUT
     from estimators.apu.recorded_estimate import estimate
     from estimators.apu.recordings.measured import read_recording
 
     data = {"t": gas["time"].to_numpy()}
     data |= {n: gas[f"X_s.{n}"].to_numpy(dtype=float) for n in GAS_PATH.names}
     data |= {n: gas[f"W.{n}"].to_numpy(dtype=float) for n in VARIED}
+    data[OUTPUT] = gas["W.P_e"].to_numpy(dtype=float)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ApuWarning)
             found = estimate(read_recording(data), only="gaspath")
     except ApuError:
-        return {}, "", math.nan
-    e = found.gaspath
-    assert e is not None
-    onsets, alarms = (json.loads(e.attrs[n]) for n in ("onsets", "alarms"))
+        return {}, "", math.nan, None
+    e, b, best = found.gaspath, found.balance, [d.best for d in found.diagnoses]
+    assert e is not None and b is not None
+    onsets = json.loads(e.attrs["onsets"])
+    lost = None
+    if any(n.endswith("short circuit") for n in best):
+        lost = float(b["h"].values[-1]), float(b["h_sigma"].values[-1])
+    alarm = min((d.t for d in found.diagnoses), default=math.nan)
     # beliefs before the alarm do not know of the change
     at = int(np.searchsorted(e["time"].values, onsets[0] - 1e-9)) if onsets else -1
     health = {
         n: (float(v[-1]), float(e[f"{n}_sigma"].values[-1]), float(v[-1] - v[at]))
         for n, v in ((n, e[n].values) for n in HEALTH)
     }
-    if not onsets:
-        return health, "", math.nan
-    sensor = any(d.best.startswith("sensor") for d in found.diagnoses)
-    kind = "sensor" if sensor else max(HEALTH, key=lambda n: abs(health[n][2]))
-    return health, kind, float(alarms[0])
+    if any(n.startswith("sensor") for n in best):
+        return health, "sensor", alarm, lost
+    kind = max(HEALTH, key=lambda n: abs(health[n][2])) if onsets else ""
+    factors = next((d.failure for d in found.diagnoses if d.best == GAS), {})
+    told = max(factors, key=lambda n: factors[n], default="")
+    kind = told if told in HEALTH else kind
+    return health, kind, alarm, lost
 
 
-def _of_machine(waves: Any, k: int) -> tuple[str, float, float]:
+def _of_machine(waves: Any, k: int) -> tuple[str, float, float, str]:
+    """Likeliest phase, its severity and sigma, and what the first change of the machine is."""
     from estimators.apu.recorded_estimate import estimate
     from estimators.apu.recordings.measured import read_recording
 
@@ -232,12 +260,14 @@ def _of_machine(waves: Any, k: int) -> tuple[str, float, float]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ApuWarning)
-            e = estimate(read_recording(data), only="electrical").machines[1]
+            found = estimate(read_recording(data), only="electrical")
+        e = found.machines[1]
     except (ApuError, KeyError):
-        return "", 0.0, math.inf
+        return "", 0.0, math.inf, ""
     h = {p: (float(e[f"h_{p}"].values[-1]), float(e[f"h_{p}_sigma"].values[-1])) for p in "abc"}
     phase = max(h, key=lambda p: h[p][0] / h[p][1])
-    return phase, *h[phase]
+    changes = found.causes.get("machine 1", ())
+    return phase, *h[phase], changes[0].best if changes else ""
 
 
 def predictions_text(rows: Rows) -> str:

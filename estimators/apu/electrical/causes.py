@@ -8,7 +8,9 @@ likelihoods compare, and with prior odds give probabilities.
 healthy             nothing that the filter does not know
 short circuit a     one phase has a severity, which comes with the change (b, c)
 hot winding         field and stator have other resistances
+field winding       turns of the field are shorted from the change on
 sensor i_a          that current says nothing from the change on, stuck, biased or noisy (i_b, ...)
+sensor i_fd         the same, or reads a share more or less
 sensor w_r          the same of the speed, in place of which the voltages' angle stands
 sensor V_fd         the same of the field's voltage, whose error acts as unknown steps
 voltage sensors     the same of the phases' voltages
@@ -19,6 +21,11 @@ What a failed current sensor reads is taken for noise about the prediction of th
 with the variance that is found, and harmonics have the amplitudes that are found; half the
 logarithm of the number of readings is taken off for each (Schwarz 1978, Annals of Statistics 6,
 461).
+
+Shorted turns of the field (:mod:`apu_casadi.machine.faults.field`) leave its flux, referred to all
+turns, where it is, and raise what is read of its current, the voltage and the resistance, both so
+referred, by 1/(1 - mu_f).  A current sensor that reads as much more does not: in a machine at rest
+both are alike, and what follows the change tells them apart, or the prior weights do.
 """
 
 from __future__ import annotations
@@ -60,11 +67,17 @@ PRIOR = {
     "healthy": 1.0,
     "short circuit": 1.0,
     "hot winding": 0.3,
+    "field winding": 0.3,
     "sensor": 0.3,
     "voltage sensors": 0.3,
     "harmonics": 0.3,
 }
 FEWEST = 100  # samples that a verdict takes
+TURNS = (
+    0.1  # scale of the share of the field's turns that are shorted, and of an error of its current
+)
+LOOSE = 0.01  # what the errors of both readings of the field have beside, relative
+FIELD_MEAN = 0.0025  # s before and after the change, over which the field's current is averaged
 
 
 @dataclass(frozen=True)
@@ -75,7 +88,7 @@ class Causes:
         t: its instant, s.
         probability: of each hypothesis.
         failure: of sensors by hypothesis, how they failed, with probabilities
-            (:mod:`estimators.apu.sensorfailures`).
+            (:mod:`estimators.apu.sensorfailures`); of the gas path, which factor changed.
     """
 
     t: float
@@ -133,10 +146,16 @@ class _Piece:
         prior = filt.prior(self.samples)
         return run(ekf_step(filt.model), prior, data, backend=self.backend), data
 
-    def shorted(self, phase: str) -> float:
-        """Log-likelihood of a short circuit that comes with the change, or was there before."""
-        filt, data = self.filter(phases=(phase,))
-        prior, step = filt.prior(self.samples), ekf_step(filt.model)
+    def changed(
+        self,
+        filt: ElectricalFilter,
+        data: Recording,
+        cov: np.ndarray,
+        shift: Mapping[str, float] | None = None,
+    ) -> float:
+        """Log-likelihood where the belief moves and opens at the change; from it on, if at once."""
+        prior, step, x = filt.prior(self.samples), ekf_step(filt.model), filt.model.x
+        moved = np.array([(shift or {}).get(n, 0.0) for n in x.names])
         cut = int(np.searchsorted(data.t, self.change - 1e-9))
         if cut < 1:
             return float(run(step, prior, data, backend=self.backend).loglik)
@@ -144,14 +163,46 @@ class _Piece:
         y = upto.y.copy()
         y[:, -1] = np.nan  # the sample of the change is of what follows
         first = run(step, prior, replace(upto, y=y), backend=self.backend)
-        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in filt.model.x.names]
-        then = Belief(filt.model.x, first.final.mean, first.final.cov + np.diag(wide))
+        then = Belief(x, first.final.mean + moved, first.final.cov + cov)
         rest = run(step, then, data.part(cut, data.size), backend=self.backend)
         return float(first.loglik + rest.loglik)
 
+    def shorted(self, phase: str) -> float:
+        """Log-likelihood of a short circuit that comes with the change, or was there before."""
+        filt, data = self.filter(phases=(phase,))
+        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in filt.model.x.names]
+        return self.changed(filt, data, np.diag(wide))
+
+    def field(self, *, turns: bool) -> float:
+        """Log-likelihood of shorted turns of the field, or of its current sensor that is off.
+
+        The belief begins at the share that the current shows, and the prior weighs that.
+        """
+        t, i = self.samples["t"], self.samples["i_fd"]
+        before = (t < self.change - 1e-9) & (t >= self.change - FIELD_MEAN)
+        after = self.late_at(t) & (t < self.change + FIELD_MEAN)
+        ratio = float(np.nanmean(i[after]) / np.nanmean(i[before])) if before.any() else math.nan
+        if not (1.0 if turns else 0.0) < ratio < 2.0:
+            return -math.inf
+        r_fd = self.machine.r_fd
+        shift = {"gain_i_fd": ratio - 1}
+        shift |= {"gain_V_fd": 1 / ratio - 1, "machine.r_fd": r_fd * (ratio - 1)} if turns else {}
+        filt, data = self.filter(phases=(), free={"machine.r_fd": Unknown()})
+        size = [shift.get(n, 0.0) for n in filt.model.x.names]
+        along = np.array(size) / (ratio - 1) * TURNS
+        own = np.diag([LOOSE**2 * n.startswith("gain_") * (v != 0.0)
+                       for n, v in zip(filt.model.x.names, size, strict=True)])  # fmt: skip
+        found = self.changed(filt, data, np.outer(along, along) + own, shift)
+        likely = math.log(2.0) if turns else 0.0  # turns only raise the current
+        return found + likely - 0.5 * ((ratio - 1) / TURNS) ** 2
+
+    def late_at(self, t: np.ndarray) -> np.ndarray:
+        """Which instants are after the change."""
+        return np.asarray(t >= self.change - 1e-9)
+
     def late(self, data: Recording) -> np.ndarray:
         """Samples after the change."""
-        return np.asarray(data.t >= self.change - 1e-9)
+        return self.late_at(data.t)
 
     @cached_property
     def healthy(self) -> FilterResult:
@@ -278,8 +329,12 @@ def causes_of_change(
         judge(f"short circuit {p}", lambda p=p: piece.shorted(p))  # type: ignore[misc]
     warm = {f"machine.{n}": Unknown() for n in ("r_fd", "r_s")}
     judge("hot winding", lambda: piece.run(phases=(), free=warm)[0].loglik)
+    judge("field winding", lambda: piece.field(turns=True))
     for k, n in enumerate(MEASURED):
         judge(f"sensor {n}", lambda k=k: piece.without(k))  # type: ignore[misc]
+    noisy = found["sensor i_fd"]
+    judge("sensor i_fd", lambda: piece.field(turns=False))
+    found["sensor i_fd"] = max(noisy, found["sensor i_fd"]) - math.log(2.0)
     judge("sensor w_r", piece.speed_off)
     judge("sensor V_fd", piece.field_off)
     judge("voltage sensors", piece.voltages_off)

@@ -35,6 +35,7 @@ from estimators.apu.electrical.terminalsignals import DELAY, PHASES_I, PHASES_V
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import (
     FAULT_LEVEL,
+    H_BALANCED_CONSIDERED,
     H_SIGMA,
     H_WALK_CONSIDERED,
     RELEASE_LEVEL,
@@ -250,7 +251,8 @@ class _Filters:
         of = self.of(PHASES, plain=True)
         sigma = {n: s for n, s in self.spread().items() if n in of.model.x.names}
         data, prior = self.recording(of, base), of.prior(self.measured, sigma=sigma)
-        return track(of, prior, data, step=self.step, backend=self.backend, own_level=True)[0]
+        how: dict[str, Any] = {"step": self.step, "backend": self.backend}
+        return track(of, prior, data, own_level=True, common=H_BALANCED_CONSIDERED, **how)[0]
 
     def healthy(self, base: Recording) -> tuple[FilterResult, Any, Any]:
         """Power of a healthy machine, and its variance."""
@@ -298,6 +300,7 @@ class _Filters:
             backend=self.backend,
             own_level=self.gain_errors or None,
             cov_at=starts[1:],
+            common=H_BALANCED_CONSIDERED,
         )
         self.checked(data.t[starts[1:]], begin, end)
         names = (*(f"h_{k}" for k in phases), "energy", *of.model.consider)

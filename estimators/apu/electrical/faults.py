@@ -15,7 +15,7 @@ from apu_casadi.machine.terminals import LEAKY, shunt_parameters
 from estimators.apu.electrical.electricalfilter import ElectricalFilter
 from estimators.apu.electrical.machinemodel import leaky_pair
 from estimators.apu.electrical.terminalsignals import ADMITTANCE, PHASES_I
-from estimators.apu.electrical.tuning import BENT, FAULT_LEVEL, LEAST_SUSCEPTANCE
+from estimators.apu.electrical.tuning import FAULT_LEVEL, H_SIGMA, LEAST_SUSCEPTANCE
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult
 from estimators.information.posterior import posterior
@@ -30,7 +30,7 @@ class Verdict:
     Args:
         phase: "a", "b", "c", or None where no phase's h exceeds its noise by ``level``.
         h, sigma: severity of that (or of the likeliest) phase with the other two healthy, and its
-            standard deviation; with gain errors ``BENT`` of h included.
+            standard deviation.
         statistic: (h/sigma)^2 of each phase alone, chi-squared with one degree of freedom where
             there is no fault; zero for h < 0.
         probability: of each phase to be the one, given that one is faulty and all severities were
@@ -48,7 +48,9 @@ def faulty_phase(belief: Belief | FilterResult, *, level: float = FAULT_LEVEL) -
     """Find the faulty phase from the three severities and their covariance.
 
     For each phase k the best h_k with the other two zero is c = (P^-1 h)_k / (P^-1)_kk, and its
-    likelihood ratio against a healthy machine c^2 (P^-1)_kk.
+    likelihood ratio against a healthy machine c^2 (P^-1)_kk.  Where gains are unknown, what all
+    three have in common counts for nothing: the start and every reset hold it near zero, for the
+    sake of the rotor angle, and of a fault in one phase that is a third.
 
     Args:
         belief: of a filter with the three h, or a result (its last instant).
@@ -64,18 +66,21 @@ def faulty_phase(belief: Belief | FilterResult, *, level: float = FAULT_LEVEL) -
             f"faulty_phase needs {', '.join(names)}; the belief has {', '.join(b.x.names)}"
         )
     m = b.marginal(names)
-    info = np.linalg.inv(m.cov)
+    cov = m.cov
+    if f"gain_{PHASES_I[0]}" in b.x.names:
+        along = cov.sum(1) / cov.sum(1).mean()
+        cov = cov + H_SIGMA**2 * np.outer(along, along)
+    info = np.linalg.inv(cov)
     c = (info @ m.mean) / np.diag(info)
     stat = np.where(c > 0, c**2 * np.diag(info), 0.0)
     best = int(np.argmax(stat))
     # marginal likelihood over h > 0 with a flat prior: exp(stat/2) / sqrt(info)
     score = stat / 2 - 0.5 * np.log(np.diag(info))
     prob = posterior(score)
-    bent = BENT if f"gain_{PHASES_I[0]}" in b.x.names else 0.0
     return Verdict(
         PHASES[best] if stat[best] > level else None,
         float(c[best]),
-        math.hypot(1 / math.sqrt(info[best, best]), bent * c[best]),
+        1 / math.sqrt(info[best, best]),
         dict(zip(PHASES, map(float, stat), strict=True)),
         dict(zip(PHASES, map(float, prob), strict=True)),
     )

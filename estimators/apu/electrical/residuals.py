@@ -39,7 +39,7 @@ from estimators.filters.filtering import FilterResult, run
 from estimators.information.consistency import above
 from estimators.information.innovationtests import Finding, least
 
-__all__ = ["unexplained_waves"]
+__all__ = ["field_steps", "unexplained_waves"]
 
 PERIODS = 10  # electrical periods of a window
 MARGIN = 1.25  # on the variance: the filter's own error adds 0.08 to 0.2 of it
@@ -52,6 +52,11 @@ FEWEST_WINDOWS = 3
 GAPPY = 0.02
 TOLD = 0.2  # least singular value of the orders over the largest; 0.7 without gaps
 NEAR = 0.03  # s from a cause to the reset that it makes
+BESIDE = 5  # samples before and after a step of the field's current
+STEP, RIPPLE = (
+    10.0,
+    3.0,
+)  # standard deviations of it, and share of its usual change, that it exceeds
 EXCUSED = 0.34  # largest share of windows with steps of the voltage; more are no steps of load
 
 
@@ -194,6 +199,36 @@ def unexplained_waves(
     rated = math.sqrt(2) * machine.P_rated / 3 / machine.V_rated_rms
     found = _tests(windows, quiet, noise, per, size, sensors, rated)
     return out + least(found, level)
+
+
+def field_steps(
+    samples: Mapping[str, np.ndarray], sensors: SensorSet, known: Sequence[float]
+) -> list[float]:
+    """Return the instant of the largest step of the field's current with no cause; none if small.
+
+    A step of a load moves the voltages as well.
+
+    Args:
+        samples: as of :func:`unexplained_waves`.
+        sensors: with their own noise.
+        known: instants of changes that are told already, s.
+    """
+    i, t = samples["i_fd"], samples["t"]
+    if i.size < 10 * BESIDE:
+        return []
+    total = np.concatenate([[0.0], np.cumsum(i)])
+    mean = (total[BESIDE:] - total[:-BESIDE]) / BESIDE
+    step = np.abs(mean[BESIDE:] - mean[:-BESIDE])  # at sample BESIDE and on
+    if not np.isfinite(step).all():
+        return []
+    k = int(step.argmax())
+    sigma = sensors.sigma("i_fd", float(np.median(i))) * math.sqrt(2 / BESIDE)
+    usual = float(np.quantile(step, 0.99))
+    at = float(t[k + BESIDE])
+    causes = np.array([*known, *_jumped(samples, sensors)])
+    if step[k] < max(STEP * sigma, RIPPLE * usual) or (np.abs(causes - at) < NEAR).any():
+        return []
+    return [at]
 
 
 def _jumped(samples: Mapping[str, np.ndarray], sensors: SensorSet) -> np.ndarray:

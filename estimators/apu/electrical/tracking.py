@@ -16,7 +16,7 @@ from estimators.apu.electrical.electricalfilter import ElectricalFilter, conside
 from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import (
-    H_BALANCED_CONSIDERED,
+    H_BALANCED,
     ONSET_LEVEL,
     RESET_LEVEL,
     RESET_SIGMA,
@@ -50,6 +50,7 @@ def track(
     max_resets: int = 20,
     own_level: bool | None = None,
     cov_at: np.ndarray | None = None,
+    common: float = H_BALANCED,
 ) -> tuple[FilterResult, list[float]]:
     """Filter a recording in which faults come and go: h follows steps at once.
 
@@ -71,6 +72,10 @@ def track(
             instead of with what white innovations give: where gain errors are considered (the
             default there), or taken as noise, each unit has a level of its own.
         cov_at: samples whose covariances are kept, see :func:`estimators.filters.filtering.run`.
+        common: where gains are unknown, by how much a reset lets all three severities differ from
+            zero together, times sqrt(3).  A fault of h has h/3 of it: with less, the filter is
+            linearised about another angle, and h is held back by a per cent for a tenth of a
+            second.
 
     Returns:
         result: as from one filter; where gains are unknown, the variances of the three severities,
@@ -111,7 +116,7 @@ def track(
         if cut > at:
             r, prior = _filtered(made, prior, data, at, cut, cov_at, backend)
             pieces.append(r)
-        prior = Belief(model.x, prior.mean, prior.cov + _opened(filt))
+        prior = Belief(model.x, prior.mean, prior.cov + _opened(filt, common))
         resets.append(float(data.t[cut]))
         if filt.gains == "estimate":
             filt = considering(filt)
@@ -149,13 +154,13 @@ def _onset(nis: np.ndarray, start: int) -> int:
     return first + int(wild[0]) if wild.size else start
 
 
-def _opened(filt: ElectricalFilter) -> np.ndarray:
+def _opened(filt: ElectricalFilter, common: float) -> np.ndarray:
     """What a reset adds to the covariance; where gains are uncertain, h in common stays small."""
     x = filt.model.x
     out = np.diag([RESET_SIGMA.get(n, 0.0) ** 2 for n in x.names])
     if set(SHUNTS.names) <= set(x.names) and filt.gains != "none":
         rows = np.ix_(*[x.indices(SHUNTS.names)] * 2)
-        out[rows] -= (RESET_SIGMA[SHUNTS.names[0]] ** 2 - H_BALANCED_CONSIDERED**2) / 3
+        out[rows] -= (RESET_SIGMA[SHUNTS.names[0]] ** 2 - common**2) / 3
     return out
 
 

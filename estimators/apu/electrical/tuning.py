@@ -6,7 +6,6 @@ from apu_casadi.machine.terminals import FLUXES, SHUNTS
 
 __all__ = [
     "ANGLE_WALK_CONSIDERED",
-    "BENT",
     "DELAY_SIGMA",
     "FAULT_LEVEL",
     "FLUX_WALK",
@@ -93,19 +92,16 @@ H_SIGMA = 1e-2
 #: Severity up to which a start about a healthy machine is straight enough: one of 1e-2 turns the
 #: rotor by a tenth of a radian, ten standard deviations, which that start does not follow.
 H_STRAIGHT = 1e-3
-#: By what share of itself a severity is off where gain errors are uncertain, beside what is
-#: claimed: noise in the derivatives pulls it down, by 0.3 % of 1e-2 a tenth to a third of a second
-#: after it appeared, at 10 and 100 kW; within 20 ms it is 1.3 % at 100 kW.
-BENT = 3e-3
-#: The same of what all three have in common, times sqrt(3): a balanced short circuit is a load that
+#: That of what all three have in common, times sqrt(3): a balanced short circuit is a load that
 #: the rotor angle alone tells from one.  With ``H_SIGMA`` for it the angle starts 1 rad uncertain,
 #: far beyond where the model is linear: at 10 kW errors were 12 claimed standard deviations.  A
 #: fault in one phase has a third of its h in common, which this hardly holds back.
 H_BALANCED = 1e-3
-#: The same where gains are considered, after a reset too: noise in the derivatives by angle and h
-#: makes that filter learn of it what is not there, and with 1e-3 a healthy machine at 50 kW was at
-#: -2e-3 in all three phases after 1.6 s, 17 claimed standard deviations.  It holds a fault in one
-#: phase back by a per cent, until it is found.
+#: The same where gains are considered, and after a reset too where a power is made of the
+#: severities: noise in the derivatives by angle and h makes that filter learn of it what is not
+#: there, and with 1e-3 a healthy machine at 50 kW was at -2e-3 in all three phases after 1.6 s, 17
+#: claimed standard deviations.  It holds a fault in one phase back by a per cent, until it is found
+#: and has a filter of its own.
 H_BALANCED_CONSIDERED = 1e-4
 #: A step of h is looked for in windows of this many samples (5 ms) ...
 RESET_WINDOW = 50

@@ -53,6 +53,7 @@ _OF = (
     ("SM", (-0.5, 2.0)),
     ("Mach8", (0.0, 1.0)),
     ("V8", (0.0, 700.0)),
+    ("P_e_total", (-2e4, 9e5)),
     ("w_r", (1e3, 6e3)),
     ("V_fd", (-600.0, 600.0)),
     ("i_fd", (-500.0, 2500.0)),  # 1.4 kA at 225 kW and a power factor of 0.6
@@ -67,7 +68,7 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = ChainMap(
     RANGES, {n: span for names, span in _OF for n in names.split()}, dict(CONDITIONS)
 )
 #: Quantities whose range holds zero: without a unit, a largest reading below this is not in SI.
-_SMALL = {"PW": 2e3}
+_SMALL = {"PW": 2e3, "P_e_total": 2e3}
 #: What a quantity is read in, beside SI.
 _USUAL = {
     "K": ("degC", "degF", "degR"),
@@ -94,6 +95,8 @@ def si_of(name: str) -> str | None:
         return ELECTRICAL[name].unit
     if name in KNOWN:
         return KNOWN[name].unit
+    if name == "P_e_total":  # electrical output of all generators
+        return "W"
     signals = next((s for s in (GasGenerator.Y, GasGenerator.U) if name in s.names), None)
     return None if signals is None else signals[name].unit
 
