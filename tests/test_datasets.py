@@ -385,9 +385,12 @@ def told_of(*best, onsets=(), factors=(), severity=(0.0, 1e-5)):
     attrs = {"onsets": str([*onsets]), "alarms": str(alarms)}
     found = [SimpleNamespace(t=3.2, best=b, failure=dict(factors)) for b in best]
     lost = {"h": severity[0], "h_sigma": severity[1]}
-    balance = xr.Dataset({n: ("time", np.full(t.size, v)) for n, v in lost.items()}, {"time": t})
+    lost = {n: ("time", np.full(t.size, v)) for n, v in lost.items()}
     return SimpleNamespace(
-        gaspath=xr.Dataset(course | sigma, {"time": t}, attrs), diagnoses=found, balance=balance
+        gaspath=xr.Dataset(course | sigma, {"time": t}, attrs),
+        diagnoses=found,
+        balance=xr.Dataset(lost, {"time": t}, {"evidence": 0.3}),
+        path=(None, SimpleNamespace(result=None)),
     )
 
 
@@ -397,6 +400,7 @@ def said_of(monkeypatch, told, waves=None):
     from estimators.apu.recordings import measured
 
     monkeypatch.setattr(recorded_estimate, "estimate", lambda *a, **k: told)
+    monkeypatch.setattr(recorded_estimate, "JUMPS", SimpleNamespace(evidence=lambda _: 0.4))
     monkeypatch.setattr(measured, "read_recording", lambda data: data)
     columns = [f"X_s.{n}" for n in baselines.GAS_PATH.names] + [f"W.{n}" for n in baselines.VARIED]
     t = told.gaspath["time"].values
@@ -416,6 +420,7 @@ def test_a_change_of_health_is_judged_from_its_onset(monkeypatch, best, alarmed,
     assert row["class"] == said
     assert row.get("alarm_time") == (3.2 if alarmed else None)
     assert row["f_eta_t"] == 0.985
+    assert row["score"] == (1.4 if alarmed else 0.4)
 
 
 def test_what_a_loss_of_the_generators_and_a_likelier_factor_say(monkeypatch):

@@ -86,6 +86,11 @@ class JumpTest:
             best[at] = np.maximum(best[at], stat)
         return best
 
+    def evidence(self, result: FilterResult) -> float:
+        """Return the largest statistic of a recording over the threshold; 1 is an alarm."""
+        most = float(self.statistic(result, self.hold).max(initial=0.0))
+        return most / self.threshold(len(result.y))
+
     def first(self, result: FilterResult, start: int) -> tuple[int, int] | None:
         """Return the first alarm at or after sample ``start``: (alarm, onset), or None."""
         e = whitened(result, self.limit)

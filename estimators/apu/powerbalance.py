@@ -147,6 +147,7 @@ class PowerBalance:
         e = dataset({"time": r.t}, {"time": values}, signals=signals)
         e.attrs["alarms"] = str([float(r.t[k]) for k in tracked.alarms])
         e.attrs["onsets"] = str([float(r.t[k]) for k in tracked.onsets])
+        e.attrs["evidence"] = TEST.evidence(r)
         return e
 
     def causes(self, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

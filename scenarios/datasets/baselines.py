@@ -171,10 +171,11 @@ def estimated(run: int, gas: Any, waves: Any) -> dict[str, Any]:
     what the shaft gives more than the loads take, after them.  Of the gas path the change since
     its onset counts, where the filter's test has found one: what all sensors' gain errors leave
     uncertain of a factor is in both, and cancels.  Which factor it is the largest change says,
-    unless a sensor explains it better.
+    unless a sensor explains it better.  Scores are squares over those from which something is told,
+    and one more where it is.
     """
-    out: dict[str, Any] = {"run": run, "class": "healthy", "score": 0.0}
-    health, kind, alarm, lost = _of_gas_path(gas)
+    out: dict[str, Any] = {"run": run, "class": "healthy"}
+    health, kind, alarm, lost, evidence = _of_gas_path(gas)
     machines = {k: _of_machine(waves, k) for k in (1, 2)} if waves is not None else {}
     for n, (v, s, _) in health.items():
         out |= {n: v, f"{n}_sigma": s}
@@ -194,9 +195,8 @@ def estimated(run: int, gas: Any, waves: Any) -> dict[str, Any]:
     elif kind:
         out |= {"class": kind}
     out |= {"alarm_time": alarm} if math.isfinite(alarm) else {}
-    moved = max((abs(change) / s for _, s, change in health.values() if s > 0), default=0.0)
-    out["score"] = max(h / s, moved + (_ALARM if kind or wound else 0.0))
-    return out
+    said = 1.0 if out["class"] != "healthy" else 0.0
+    return out | {"score": max(said + evidence, (max(h, 0.0) / s / _ALARM) ** 2)}
 
 
 Severity = tuple[float, float]
@@ -204,13 +204,14 @@ Severity = tuple[float, float]
 
 def _of_gas_path(
     gas: Any,
-) -> tuple[dict[str, tuple[float, float, float]], str, float, Severity | None]:
+) -> tuple[dict[str, tuple[float, float, float]], str, float, Severity | None, float]:
     """Factors, their sigmas and changes since the onset; class of the change or "", its alarm.
 
-    And the severity that a loss of the generators tells, with its sigma; None if there is none.
+    And the severity that a loss of the generators tells, with its sigma, None if there is none; and
+    how much there is for any change, 1 at an alarm.
     """
     from estimators.apu.powerbalance import OUTPUT
-    from estimators.apu.recorded_estimate import estimate
+    from estimators.apu.recorded_estimate import JUMPS, estimate
     from estimators.apu.recordings.measured import read_recording
 
     data = {"t": gas["time"].to_numpy()}
@@ -222,7 +223,9 @@ def _of_gas_path(
             warnings.simplefilter("ignore", ApuWarning)
             found = estimate(read_recording(data), only="gaspath")
     except ApuError:
-        return {}, "", math.nan, None
+        return {}, "", math.nan, None, 0.0
+    assert found.path is not None and found.balance is not None
+    evidence = max(JUMPS.evidence(found.path[1].result), float(found.balance.attrs["evidence"]))
     e, b, best = found.gaspath, found.balance, [d.best for d in found.diagnoses]
     assert e is not None and b is not None
     onsets = json.loads(e.attrs["onsets"])
@@ -237,12 +240,12 @@ def _of_gas_path(
         for n, v in ((n, e[n].values) for n in HEALTH)
     }
     if any(n.startswith("sensor") for n in best):
-        return health, "sensor", alarm, lost
+        return health, "sensor", alarm, lost, evidence
     kind = max(HEALTH, key=lambda n: abs(health[n][2])) if onsets else ""
     factors = next((d.failure for d in found.diagnoses if d.best == GAS), {})
     told = max(factors, key=lambda n: factors[n], default="")
     kind = told if told in HEALTH else kind
-    return health, kind, alarm, lost
+    return health, kind, alarm, lost, evidence
 
 
 def _of_machine(waves: Any, k: int) -> tuple[str, float, float, str]:
