@@ -7,15 +7,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from apu_casadi.machine.faults.field import FieldShort
 
 from apu_casadi.gaspath.health import HEALTH
+from apu_casadi.machine.faults.fieldshort import FieldShort
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.believable import gas_doubts
+from estimators.apu.creeping import creep
 from estimators.apu.electrical.causes import causes_of_change
 from estimators.apu.electrical.residuals import field_steps
 from estimators.apu.gascauses import causes_of_alarms
@@ -135,6 +136,29 @@ def test_a_shaft_power_that_drifts(gas):
         off = dataclasses.replace(data, u=u)
         found = [*gas_doubts(filt, Tracked(filt.run(off, backend="vm"), (), (), off))]
         assert any(d.startswith("shaft power: it drifts by +") for d in found), found
+
+
+def test_a_drift_that_hardly_shows_is_in_the_band(gas):
+    """By 5 % in 2 s; and where nothing drifts the band is as it was, to a few per cent."""
+    filt, quiet = gas_path_filter(eta=ETA_SIGMA, consider_eta=False), gas[1]
+    truth = dict.fromkeys(HEALTH, 1.0)
+    for seed in range(3):
+        data = filt.recording(quiet, seed)
+        u = data.u.copy()
+        u[filt.model.u.index("PW")] *= 1 + 0.05 * data.t / data.t[-1]
+        r, off = (filt.run(d, backend="vm") for d in (data, dataclasses.replace(data, u=u)))
+        same = creep(filt, Tracked(r, (), (), data)).widened(r)
+        assert np.all(same.variance >= r.variance)
+        assert np.all(same.variance[:, -1] < 1.1 * r.variance[:, -1])
+        found = creep(filt, Tracked(off, (), (), dataclasses.replace(data, u=u)))
+        wide = found.widened(off)
+        k = found.names.index("shaft power")
+        assert found.size[k] == pytest.approx(0.05, abs=4 * found.sigma[k])
+        # what the drift moves is what the filters differ by
+        moved = (off.mean - r.mean)[filt.model.x.index("f_eta_t"), -1]
+        said = -0.05 * found.error[-1, filt.model.x.index("f_eta_t"), k]
+        assert said == pytest.approx(moved, rel=0.3)
+        assert max(abs(wide[n][0][-1] - v) / wide[n][1][-1] for n, v in truth.items()) < 3
 
 
 def told(filt, data, k=55):

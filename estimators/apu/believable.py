@@ -34,15 +34,14 @@ from scipy.special import ndtr, ndtri
 
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
+from estimators.apu.creeping import Creep, creep, quiet_of
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.residuals import field_steps, unexplained_waves
 from estimators.apu.electrical.terminalsignals import PHASES_V
-from estimators.apu.gascauses import causes_of_alarms, jumps_of
-from estimators.apu.gaspath import MODEL_ERROR
+from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.apu.trust import GAS, Doubt, part_of, severity
-from estimators.detection.signatures import linearised
 from estimators.information.innovationtests import Finding, findings, least
 
 if TYPE_CHECKING:
@@ -85,9 +84,7 @@ STEEP_FIT = 0.2  # the same of a fit, which is linearised where it ends
 STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
-FEWEST_INNOVATIONS = 8  # samples in which a drift is looked for
 RECENT = 0.1  # s, before a report, in which a reset is its own
-SETTLED = 0.1  # s after a report, in which its innovations are explained
 SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
 FEWEST_SAMPLES = 100
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
@@ -328,18 +325,19 @@ _GAS_KIND = {"size": "innovations", "window": "innovations", "wild": "wild"}
 
 
 def gas_doubts(
-    filt: GasPathFilter, tracked: Tracked, sides: Sequence[ElectricalSide] = ()
+    filt: GasPathFilter,
+    tracked: Tracked,
+    sides: Sequence[ElectricalSide] = (),
+    drifts: Creep | None = None,
 ) -> Iterator[Doubt]:
     """Say why the gas-path estimate is not to be believed.
 
     Args:
         filt, tracked: the filter and what it said.
         sides: the generators' estimates, of which its shaft power is.
+        drifts: of :func:`~estimators.apu.creeping.creep`, where that was asked already.
     """
-    r = tracked.result
-    quiet = np.ones(r.t.size, bool)
-    for i, k in zip(tracked.onsets, tracked.alarms, strict=True):
-        quiet &= (r.t <= r.t[i] + 1e-9) | (r.t > r.t[k] + SETTLED)
+    r, quiet = tracked.result, quiet_of(tracked)
     z = r.innovation / np.sqrt(r.innovation_variance)
     for k, n in enumerate(r.y.names):
         if s := filt.considered(n):  # that offset is no news
@@ -351,7 +349,7 @@ def gas_doubts(
         *r.x.names
     }:  # freer than a load moves: innovations alternate, sigma is large
         found = [f for f in found if f.test != "colour" or f.value > 0]
-    found += _creeping(filt, tracked, quiet)
+    found += _creeping(creep(filt, tracked) if drifts is None else drifts)
     for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
@@ -375,27 +373,19 @@ def gas_doubts(
     yield from (d for side in sides if changed for d in _hidden(side))
 
 
-def _creeping(filt: GasPathFilter, tracked: Tracked, quiet: np.ndarray) -> list[Finding]:
+def _creeping(found: Creep | None) -> list[Finding]:
     """Test whether a sensor, or the shaft power, drifts against all others.
 
     What that would leave in the innovations of all sensors is known, so that a drift is found which
     hardly shows in any one of them, and still moves the estimates by several sigmas.
     """
-    r = tracked.result
-    jumps, of = jumps_of(filt)
-    names = {n: own for n, (own, _) in of.items() if n != GAS}
-    if quiet.sum() < FEWEST_INNOVATIONS:
+    if found is None:
         return []
-    f = linearised(filt.model, r, tracked.data, [j for j in jumps if j.name not in HEALTH])
-    size, sigma = f.ramps(r.t).evidence(quiet)
-    # in ten minutes a drift by what the model is off is significant, and says nothing
-    sigma = np.hypot(sigma, MODEL_ERROR)
-    z = {n: abs(size[k] / sigma[k]) for n, (own,) in names.items() for k in f.columns([own])}
+    z = np.abs(found.size / found.sigma)
     # others share a part of its signature: the most striking one alone is told
-    most = max(z, key=lambda n: z[n])
-    chance = float(2 * ndtr(-z[most] / math.sqrt(MARGIN))) * len(z)
-    (k,) = f.columns(names[most])
-    return [Finding(most.removeprefix("sensor "), "creep", chance, float(size[k]))]
+    k = int(z.argmax())
+    chance = float(2 * ndtr(-z[k] / math.sqrt(MARGIN))) * len(z)
+    return [Finding(found.names[k], "creep", chance, float(found.size[k]))]
 
 
 def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

@@ -30,6 +30,7 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
 from apu_casadi.unit.events import who
 from estimators.apu.believable import channels_still, gas_causes, gas_doubts, still_causes
+from estimators.apu.creeping import creep
 from estimators.apu.declared import as_declared, tables
 from estimators.apu.diagnosis import Diagnosis, diagnoses
 from estimators.apu.electrical.causes import Causes
@@ -220,10 +221,12 @@ def estimate(
     if gas:
         given = ambient or {}, notes, doubts, backend, start
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
-        e = gas_dataset(filt, tracked)
+        drifts = creep(filt, tracked)
+        # with the power of waveforms it is the joint estimate, whose band it has
+        e = gas_dataset(filt, tracked, None if fused_by else drifts)
         causes[GAS], odd = told(gas_causes(filt, tracked))
         causes[GAS] = (*still_causes(still), *causes[GAS])
-        doubts += about([*gas_doubts(filt, tracked, list(sides.values())), *odd], GAS)
+        doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     lost = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)

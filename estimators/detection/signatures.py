@@ -7,7 +7,7 @@ filter, which is linear, or linearised about its own estimates.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,12 +131,18 @@ class LinearFilter:
 
     def signature(self, onset: int, stop: int | None = None) -> np.ndarray:
         """Return what unit jumps at a sample add to the innovations, shape (K - onset, ny, q)."""
-        e, out = self.state.copy(), []
+        return np.array([g for g, _ in self._course(onset, stop)])
+
+    def errors(self, onset: int = 0) -> np.ndarray:
+        """Return what they add to the prediction errors of the states, (K - onset, nx, q)."""
+        return np.array([e for _, e in self._course(onset, None)])
+
+    def _course(self, onset: int, stop: int | None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        e = self.state.copy()
         for k in range(onset, self.size if stop is None else stop):
             g = self.H[k] @ e + self.output[k]
-            out.append(g)
+            yield g, e
             e = self.A[k] @ e - self.L[k] @ g + self.drift[k]
-        return np.array(out)
 
 
 def linear_filter(

@@ -22,10 +22,10 @@ with the variance that is found, and harmonics have the amplitudes that are foun
 logarithm of the number of readings is taken off for each (Schwarz 1978, Annals of Statistics 6,
 461).
 
-Shorted turns of the field (:mod:`apu_casadi.machine.faults.field`) leave its flux, referred to all
-turns, where it is, and raise what is read of its current, the voltage and the resistance, both so
-referred, by 1/(1 - mu_f).  A current sensor that reads as much more does not: in a machine at rest
-both are alike, and what follows the change tells them apart, or the prior weights do.
+Shorted turns of the field (:mod:`apu_casadi.machine.faults.fieldshort`) leave its flux, referred to
+all turns, where it is, and raise what is read of its current, the voltage and the resistance, both
+so referred, by 1/(1 - mu_f).  A current sensor that reads as much more does not: in a machine at
+rest both are alike to half a unit of log-likelihood, and the prior weights decide.
 """
 
 from __future__ import annotations
