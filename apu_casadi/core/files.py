@@ -6,13 +6,12 @@ file, flushed to the disk, then renamed.  A full disk, a kill or Ctrl-C leave th
 
 from __future__ import annotations
 
-import codecs
 import contextlib
 import errno
 import itertools
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -142,32 +141,6 @@ def read_text(path: str | os.PathLike[str], what: str = "", limit: int = 1 << 28
             f"{raw[e.start]:#04x} in line {line}); save it as UTF-8"
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def table_text(raw: bytes, path: str | os.PathLike[str]) -> str:
-    """Return the text of a table as programs save it: UTF-8, UTF-16 with its mark, or Windows-1252.
-
-    Raises:
-        DataError: damaged UTF-16.
-    """
-    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    try:
-        text = raw.decode("utf-16" if wide else "utf-8-sig")
-    except UnicodeDecodeError as e:
-        if wide:
-            raise DataError(f"{path}: damaged UTF-16 text (byte {e.start})") from None
-        text = raw.decode("cp1252", errors="replace")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def no_commas(cells: Sequence[str]) -> str:
-    """Return why the first row of a table is no cells with commas between; "" where it is."""
-    if cells[0].strip('"').lower().startswith("sep="):
-        return "delete this line, and put commas between the cells if there are others"
-    signs = {";": "semicolons", "\t": "tabs", "|": "bars"}
-    other = next((w for s, w in signs.items() if len(cells) == 1 and s in cells[0]), "")
-    remedy = "; save the table again so, and numbers with points, not decimal commas"
-    return f"cells must be separated by commas, not {other}{remedy}" if other else ""
 
 
 @contextlib.contextmanager
