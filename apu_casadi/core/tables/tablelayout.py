@@ -36,6 +36,8 @@ class TableLayout:
 
     #: Whether columns without a name are left out in silence, rather than refused.
     skips_unnamed: ClassVar[bool] = True
+    #: Whether the first line with a known name is that of the names, whatever stands below.
+    known_head: ClassVar[bool] = True
     #: Whether cells may be missing at the end of a row.
     pads_rows: ClassVar[bool] = False
     #: What to do about a question that the file leaves, by its kind.

@@ -333,6 +333,13 @@ def _by_option(path: Path, row: Row, layout: TableLayout) -> tuple[list[str], li
 def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
     """Line of the names, names, units and the rows below them."""
     path, rows, tell = h.path, h.rows, h.tell
+    at = next((k for k, (_, r) in enumerate(rows) if any(_known(c, h.known) for c in r)), None)
+    if h.layout.known_head and at is not None and not h.layout.names:
+        below = rows[at + 1] if at + 1 < len(rows) else None
+        if below and (all(map(_of_data, filter(None, below[1]))) or not _is_units(below[1])):
+            below = None  # 1 is a number first, then a unit
+        _tell_left_out(h, rows[:at], [rows[at]])
+        return *_named(h, rows[at], below), rows[at + 1 + (below is not None) :]
     start = h.start()
     if h.layout.names:
         start = start or 0
@@ -369,6 +376,11 @@ def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
         named = max(reversed(others), key=lambda r: sum(_known(c, h.known) for c in r[1]))
         tell(f"{path}, line {below[0]}: taken as a row of units")
     _tell_left_out(h, above, [named, below])
+    return *_named(h, named, below), body
+
+
+def _named(h: _Head, named: Row, below: Row | None) -> tuple[int, list[str], list[str | None]]:
+    """Line of the names, names and units."""
     cells = named[1]
     stripped = _COMMENT.sub("", cells[0])
     if stripped and (h.known(header(stripped)[0]) or is_time_name(header(stripped)[0])):
@@ -376,7 +388,7 @@ def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
     pairs = [header(c) for c in cells]
     row = ["" if _bare(c) == "-" else _bare(c) for c in below[1]] if below else []
     units = [u or ((row[i] or None) if i < len(row) else None) for i, (_, u) in enumerate(pairs)]
-    return named[0], [n for n, _ in pairs], units, body
+    return named[0], [n for n, _ in pairs], units
 
 
 def _names_without_units(h: _Head, fit: list[Row]) -> tuple[Row, None]:

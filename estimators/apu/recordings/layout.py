@@ -65,7 +65,7 @@ class Reading(TableLayout):
     sort: bool = False
     engine: GasGenerator = field(default_factory=GasGenerator)
 
-    skips_unnamed = False
+    known_head = skips_unnamed = False
     remedies = {
         **TableLayout.remedies,
         "decimal": "give --decimal comma or point",
