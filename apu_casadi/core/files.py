@@ -10,7 +10,9 @@ import contextlib
 import errno
 import itertools
 import os
+import shutil
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -182,7 +184,7 @@ def whole(
                 os.chmod(target, stat.S_IMODE(mode))
             os.replace(target, real)
     except OSError as e:
-        raise DataError(f"{path}: {refusal}: {reason(e)}") from None
+        raise DataError(f"{path}: {refusal}: {reason(e)}{_amounts(e, target)}") from None
     finally:
         if not device:
             with contextlib.suppress(OSError):
@@ -190,6 +192,17 @@ def whole(
             PARTIAL.discard(str(target))
     if _account:
         WRITTEN[str(path)] = None
+
+
+def _amounts(e: OSError, target: Path) -> str:
+    """Return how much was written and is free, where there was no room; "" elsewhere."""
+    if e.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return ""
+    try:
+        written, free = target.stat().st_size, shutil.disk_usage(target.parent).free
+    except OSError:
+        return ""
+    return f" ({written} bytes of it were written, {free} bytes are free there)"
 
 
 def _mode(real: Path) -> int | None:
@@ -218,6 +231,23 @@ def write_text(
         # a name from the system that is no UTF-8 stands in the text as \udc.., not as an error
         target.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
     return Path(path)
+
+
+@contextlib.contextmanager
+def work_folder() -> Iterator[Path]:
+    """Yield a folder of the system's for what is needed in between; it goes with the block.
+
+    Raises:
+        DataError: there is no room for it; says where it is.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as made:
+            yield Path(made)
+    except OSError as e:
+        raise DataError(
+            f"{tempfile.gettempdir()}: temporary files cannot be written: {reason(e)}; TMPDIR "
+            "names another place for them"
+        ) from None
 
 
 def save_figure(figure: Any, path: str | os.PathLike[str], **options: Any) -> Path:
