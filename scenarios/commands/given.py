@@ -385,7 +385,8 @@ LOOK = """
 """.strip()
 """Options of every command that draws; where FILE is given, its ending tells the format."""
 DRAWN = f"""
---figures NAMES ? =png | formats of the figures, one or several with commas between: png, svg, pdf
+--figures NAMES ?png,svg,pdf =png | formats of the figures, one or several with commas between:
+| png, svg, pdf
 {LOOK}
 """.strip()
 FIGURES = f"{DRAWN}\n--no-figures | draw no figures"
