@@ -246,10 +246,9 @@ def scenario(args: Namespace, name: str) -> Scenario:
     from scenarios import registry
 
     parts(args)
-    s = registry.get(name)
+    s = registry.get(name, **own(args))
     if args.extensions:
         s = s.change(extensions=(*s.extensions, *args.extensions))
-    s = s.change(**own(args))
     tell(args, s.engine, registry.assumed(s))
     return s
 
