@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.backend import compiled
+from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.sharing import kept
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
@@ -37,6 +38,10 @@ class Step(Protocol):
     @property
     def function(self) -> ca.Function:
         """The step as a function; its signature is the filter's."""
+
+    @property
+    def root(self) -> bool:
+        """Whether the step carries roots of covariances."""
 
     @property
     def gives_roots(self) -> bool:
@@ -100,29 +105,53 @@ def block_function(
     where the first P_f is that of the last sample which is not padded: a tenth of the numbers.
     """
     nx, nu, np_, _, ny = step.model.sizes
+    kind = ca.SX if step.function.is_a("SXFunction") else ca.MX
+    half = kind is ca.SX and not step.root  # scalar operations: half of a covariance is enough
+    pattern = ca.Sparsity.lower(nx) if half else ca.Sparsity.dense(nx, nx)
+    sizes = [(nx, 1), pattern, (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)]
     s = [
-        ca.MX.sym(n, *shape)
-        for n, shape in zip(
-            STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
-        )
+        kind.sym(n, *((size,) if size is pattern else size))
+        for n, size in zip(STEP_IN, sizes, strict=True)
     ]
     m, P, u, p, y, R, dt = s
-    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
+    whole = ca.tril2symm(P) if half else P
+    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(m, whole, *s[2:]), strict=False))
     P_f = ca.diag(o["P_f"]) if short else ca.vec(o["P_f"])
     kept = [o["m_f"], P_f, o["nu"], ca.diag(o["S"]), o["stats"]]
     if full:
-        kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
+        kept += [m, ca.vec(whole), ca.vec(o["C"]), ca.vec(o["S"])]
     if step.gives_roots:
         kept += [ca.vec(o[n]) for n in (ROOT_OUT if full else ROOT_OUT[-1:])]
     name = f"{step.function.name()}{'_full' if full else '_short' if short else ''}"
-    carried, now = [m, P], [o["m1"], o["P1"]]
+    carried, now = [m, P], [o["m1"], ca.project(o["P1"], pattern)]
     if short:
-        carried.append(ca.MX.sym("P_last", nx, nx))
-        now.append(ca.if_else(R[0] == PADDED, carried[-1], o["P_f"]))
+        carried.append(kind.sym("P_last", pattern))
+        last = ca.if_else(R[0] == PADDED, carried[-1], ca.project(o["P_f"], pattern))
+        now.append(ca.project(last, pattern))
     out = [*now, *(ca.densify(k) for k in kept)]
-    one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
-    block = block_of(one, name, len(carried))
+    if not half:
+        one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
+        block = block_of(one, name, len(carried))
+        return compiled(block, backend=backend), block
+    # what hangs on the parameters alone is evaluated once in a block
+    out, symbols, constant = ca.extract_parametric(ca.cse(out), p)
+    c, of_p = ca.vertcat(*symbols), ca.Function(f"{name}_constants", [p], [ca.vertcat(*constant)])
+    one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, ca.vertcat(p, c)], out)
+    one = by_reciprocals(one)
+    block = _whole(block_of(one, f"{name}_half", len(carried)), of_p, name, len(carried), pattern)
     return compiled(block, backend=backend), block
+
+
+def _whole(
+    half: ca.Function, of_p: ca.Function, name: str, carried: int, pattern: ca.Sparsity
+) -> ca.Function:
+    """Take and give whole covariances, and p, for a block of their halves and of constants too."""
+    ins = [ca.MX.sym(half.name_in(i), *half.size_in(i)) for i in range(half.n_in() - 1)]
+    p = ca.MX.sym("p", of_p.size1_in(0))
+    given = [ins[0], *(ca.project(P, pattern) for P in ins[1:carried]), *ins[carried:]]
+    out = half.call([*given, ca.vertcat(p, of_p(p))])
+    out[1:carried] = [ca.densify(ca.tril2symm(P)) for P in out[1:carried]]
+    return ca.Function(name, [*ins, p], out)
 
 
 def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:
