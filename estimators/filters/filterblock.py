@@ -13,7 +13,8 @@ from apu_casadi.core.sharing import kept
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["BLOCK", "CHAIN", "PADDED", "ROOT_OUT", "block_function", "block_of", "padded"]
+__all__ = ["BLOCK", "CHAIN", "PADDED", "ROOT_OUT"]
+__all__ += ["block_function", "block_length", "block_of", "padded"]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
@@ -46,6 +47,15 @@ class Step(Protocol):
     @property
     def gives_roots(self) -> bool:
         """Whether the step hands roots of covariances on."""
+
+
+def block_length(model: FilterModel) -> int:
+    """Return how many samples go in one call: fewer of a model that solves equations.
+
+    A recording is filled up to a multiple of that, and such steps take long.
+    """
+    scalar = model.transition.is_a("SXFunction") and model.output.is_a("SXFunction")
+    return BLOCK if scalar else CHAIN
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
@@ -96,7 +106,7 @@ def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) 
 def block_function(
     step: Step, full: bool, short: bool, backend: str | None, _in_use: str
 ) -> tuple[ca.Function, ca.Function]:
-    """``BLOCK`` steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
+    """A block of steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
 
     (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
     before each sample and C, S; matrices as columns.
@@ -131,14 +141,15 @@ def block_function(
     out = [*now, *(ca.densify(k) for k in kept)]
     if not half:
         one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
-        block = block_of(one, name, len(carried))
+        block = block_of(one, name, len(carried), short=block_length(step.model) < BLOCK)
         return compiled(block, backend=backend), block
     # what hangs on the parameters alone is evaluated once in a block
     out, symbols, constant = ca.extract_parametric(ca.cse(out), p)
     c, of_p = ca.vertcat(*symbols), ca.Function(f"{name}_constants", [p], [ca.vertcat(*constant)])
     one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, ca.vertcat(p, c)], out)
     one = by_reciprocals(one)
-    block = _whole(block_of(one, f"{name}_half", len(carried)), of_p, name, len(carried), pattern)
+    of_halves = block_of(one, f"{name}_half", len(carried), short=block_length(step.model) < BLOCK)
+    block = _whole(of_halves, of_p, name, len(carried), pattern)
     return compiled(block, backend=backend), block
 
 

@@ -31,6 +31,7 @@ from estimators.filters.filterblock import (
     STEP_IN,
     STEP_OUT,
     block_function,
+    block_length,
     block_of,
     padded,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "block_of",
     "narrow",
     "padded",
+    "rooted",
     "run",
 ]
 
@@ -294,8 +296,9 @@ def course(
     passes = _Passes(step, prior, full, backend, short=not full and cov_at is None)
     nx, _, _, _, ny = model.sizes
     K = data.size
-    n_blocks = -(-K // BLOCK)
-    pad = n_blocks * BLOCK - K
+    length = block_length(step.shared.model)
+    n_blocks = -(-K // length)
+    pad = n_blocks * length - K
     missing = np.isnan(data.y)
     y, R, u, dt = padded(data, pad)
     p = step.full(data.p)
@@ -306,9 +309,9 @@ def course(
     wanted = np.zeros(0, dtype=int) if cov_at is None else np.asarray(cov_at, dtype=int)
     some = np.empty((wanted.size, nx, nx))
     for b in range(n_blocks):
-        s = slice(b * BLOCK, (b + 1) * BLOCK)
-        n = min(BLOCK, K - b * BLOCK)
-        r = slice(b * BLOCK, b * BLOCK + n)
+        s = slice(b * length, (b + 1) * length)
+        n = min(length, K - b * length)
+        r = slice(b * length, b * length + n)
         out = yield from passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], p)
         for target, source in (
             (mean, out[2]),
@@ -318,14 +321,14 @@ def course(
             (stats, out[6]),
         ):
             target[:, r] = source[:, :n]
-        _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
+        _believable(model, data, stats[:, r], mean[:, r], var[:, r], r.start)
         here = (wanted >= r.start) & (wanted < r.stop)
         if here.any():
             some[here] = out[3].T[wanted[here] - r.start].reshape(-1, nx, nx)
         if kept is not None:
             kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=passes.rooted)
         if progress is not None:
-            progress(b * BLOCK + n, K)
+            progress(r.stop, K)
     last = passes.P_last if passes.short else out[3][:, n - 1].reshape(nx, nx)
     last = (last + last.T) / 2
     np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
@@ -337,11 +340,11 @@ def course(
     more: dict[str, Any] = {} if kept is None else kept.fields()
     more["some_cov"] = None if cov_at is None else some
     if full and step.wide is not None:
-        more["again"] = partial(_rooted, step, prior, data, backend)
+        more["again"] = partial(rooted, step, prior, data, backend)
     return FilterResult(model.x, model.y, data.t, mean, var, nu, S, *told, **more)
 
 
-def _rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
+def rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
     """Run a filter in square-root form from the beginning."""
     assert step.wide is not None
     return run(step.wide(), prior, data, full=True, backend=backend)
@@ -416,7 +419,7 @@ class _Passes:
         out = yield from self._call(u, y, R, dt, p)
         nx = self.m.size
         self.done += 1
-        ends = self.done % 4 == 1
+        ends = self.done % (4 * BLOCK // R.shape[1]) == 1
         if self.step.wide is not None and not self.rooted and lossy(out, R, nx, ends):
             self._root(root_of(self.P))
             out = yield from self._call(u, y, R, dt, p)
