@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import casadi as ca
@@ -13,8 +14,9 @@ from apu_casadi.core.sharing import kept
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["BLOCK", "CHAIN", "PADDED", "ROOT_OUT"]
-__all__ += ["block_function", "block_length", "block_of", "padded"]
+__all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "WIDE"]
+__all__ += ["block_function", "block_length", "block_of", "in_halves", "narrow", "packed_diagonal"]
+__all__ += ["padded", "unpacked"]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
@@ -26,6 +28,8 @@ cross-covariance of filtered state and next state, innovation, its covariance, a
 ROOT_OUT = ["Y", "Z", "Lf"]
 """What a step in square-root form may give beside: roots for the smoother, see
 :mod:`estimators.filters.rootfilter`."""
+WIDE = 1e7  # innovation over noise variance from which a covariance loses more than eight digits
+NARROW = 1e-9  # share of a variance that is left when the other states are known; below: the same
 PADDED = -2.0  # variance of what is not measured in a sample that fills a block up
 
 
@@ -56,6 +60,42 @@ def block_length(model: FilterModel) -> int:
     """
     scalar = model.transition.is_a("SXFunction") and model.output.is_a("SXFunction")
     return BLOCK if scalar else CHAIN
+
+
+def in_halves(step: Step) -> bool:
+    """Whether blocks carry the lower half of a covariance: of scalar operations, without roots."""
+    return step.function.is_a("SXFunction") and not step.root
+
+
+def packed_diagonal(n: int) -> np.ndarray:
+    """Return where the diagonal is in the lower half of a matrix, column by column."""
+    return np.cumsum([0, *range(n, 1, -1)])
+
+
+def unpacked(columns: np.ndarray, n: int) -> np.ndarray:
+    """Return symmetric matrices, (K, n, n), of their lower halves, (n (n + 1)/2, K)."""
+    i, j = np.triu_indices(n)
+    out = np.empty((columns.shape[1], n, n))
+    out[:, i, j] = out[:, j, i] = columns.T
+    return out
+
+
+def narrow(P: np.ndarray, *, root: bool = False) -> bool:
+    """Whether some combination of states is known far better than each of them, or not a number."""
+    if root:
+        size = np.sqrt((P**2).sum(1))
+        rows = size > 0
+        return bool((np.abs(np.diag(P))[rows] < math.sqrt(NARROW) * size[rows]).any())
+    d = P.diagonal()
+    if not (d > 0).all():
+        rows = np.flatnonzero(d > 0)
+        P, d = P[np.ix_(rows, rows)], d[rows]
+    s = 1 / np.sqrt(d)
+    try:
+        pivots = np.linalg.cholesky(P * s * s[:, None]).diagonal()
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((pivots**2 >= NARROW).all())
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
@@ -109,14 +149,15 @@ def block_function(
     """A block of steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
 
     (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
-    before each sample and C, S; matrices as columns.
+    before each sample and C, S; matrices as columns.  Without ``full``, P_f of :func:`in_halves` is
+    its lower half.
 
     If ``short``, (m, P, P_f, u, y, R, dt, p) -> (m1, P1, P_f, m_f, diag P_f, nu, diag S, stats),
     where the first P_f is that of the last sample which is not padded: a tenth of the numbers.
     """
     nx, nu, np_, _, ny = step.model.sizes
     kind = ca.SX if step.function.is_a("SXFunction") else ca.MX
-    half = kind is ca.SX and not step.root  # scalar operations: half of a covariance is enough
+    half = in_halves(step)
     pattern = ca.Sparsity.lower(nx) if half else ca.Sparsity.dense(nx, nx)
     sizes = [(nx, 1), pattern, (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)]
     s = [
@@ -127,6 +168,8 @@ def block_function(
     whole = ca.tril2symm(P) if half else P
     o = dict(zip(STEP_OUT + ROOT_OUT, step.function(m, whole, *s[2:]), strict=False))
     P_f = ca.diag(o["P_f"]) if short else ca.vec(o["P_f"])
+    if half and not (full or short):
+        P_f = ca.vertcat(*ca.project(ca.densify(o["P_f"]), pattern).nonzeros())
     kept = [o["m_f"], P_f, o["nu"], ca.diag(o["S"]), o["stats"]]
     if full:
         kept += [m, ca.vec(whole), ca.vec(o["C"]), ca.vec(o["S"])]

@@ -18,8 +18,8 @@ from apu_casadi.core.calling import Caller, available_threads
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_in_use
 from estimators.filters.belief import Belief
-from estimators.filters.filterblock import BLOCK, block_function, block_length, padded
-from estimators.filters.filtering import STATS, WIDE, FilterResult, FilterStep, narrow
+from estimators.filters.filterblock import BLOCK, WIDE, block_function, block_length, padded
+from estimators.filters.filtering import STATS, FilterResult, FilterStep, narrow
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
