@@ -321,7 +321,8 @@ def inlined(fun: ca.Function, *args: Any) -> list[Any]:
     What is derived of them then shares what they have solved: the derivative of a call would solve
     once more.
     """
-    return fun.call([*args], fun.is_a("MXFunction"), False)
+    results: list[Any] = fun.call([*args], fun.is_a("MXFunction"), False)
+    return results
 
 
 @remade
