@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -173,10 +173,11 @@ class _After:
     data: Recording
     r: FilterResult
     backend: str | None
+    unchanged: dict[int, float] = field(default_factory=dict)  # log-likelihoods by onset
 
     def opened(self, onset: int, names: Sequence[str], size: Sequence[float]) -> float:
         """Log-likelihood gained if states may have jumped by so much."""
-        return self._loglik(onset, names, size) - self._loglik(onset, (), ())
+        return self._loglik(onset, names, size) - self._without(onset)
 
     def blind(self, onset: int, sensor: str) -> float:
         """The same if a sensor is off what the others predict: noise of any size, bias, drift."""
@@ -198,7 +199,12 @@ class _After:
         rest = nu / s - line @ np.linalg.lstsq(line, nu / s, rcond=None)[0]
         drift = -0.5 * float(rest @ rest + np.log(2 * math.pi * s**2).sum()) - math.log(nu.size)
         instead = float(np.logaddexp(instead, drift)) - math.log(2.0)
-        return float(r.loglik - own + instead) - self._loglik(onset, (), ())
+        return float(r.loglik - own + instead) - self._without(onset)
+
+    def _without(self, onset: int) -> float:
+        if onset not in self.unchanged:
+            self.unchanged[onset] = self._loglik(onset, (), ())
+        return self.unchanged[onset]
 
     def _before(self, onset: int) -> Belief:
         assert self.r.mean_pred is not None and self.r.cov_pred is not None

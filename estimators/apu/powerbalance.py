@@ -34,7 +34,8 @@ from estimators.apu.sensors import Sensor
 from estimators.apu.trust import Doubt
 from estimators.apu.unknowns import ETA_SIGMA, Knowledge, of_parameter
 from estimators.filters.belief import Belief
-from estimators.filters.filtering import FilterResult, StepMaker, run
+from estimators.filters.filtering import StepMaker
+from estimators.filters.resuming import Runs
 from estimators.filters.robust import limit_of, robust_ekf_step
 from estimators.models.filtermodel import FilterModel, Unknown
 from estimators.models.recording import Recording, record
@@ -109,20 +110,17 @@ class PowerBalance:
         """That of the filter."""
         return _model()
 
-    def run(
+    def runs(
         self,
-        data: Recording,
         *,
         prior: Belief | None = None,
         step: StepMaker | None = None,
         backend: str | None = None,
-    ) -> FilterResult:
-        """Filter a recording, single wild readings doubted."""
-        share = math.hypot(ETA_SIGMA, METER)
-        start = {"gain": share, "loss": 0.0}
+    ) -> Runs:
+        """Return the filter for recordings that begin alike, single wild readings doubted."""
+        start = {"gain": math.hypot(ETA_SIGMA, METER), "loss": 0.0}
         prior = prior or Belief.of(self.model.x, dict.fromkeys(self.model.x.names, 0.0), start)
-        made = (step or robust_ekf_step)(self.model)
-        return run(made, prior, data, full=True, backend=backend)
+        return Runs((step or robust_ekf_step)(self.model), prior, backend)
 
     def tracked(self, backend: str | None = None) -> Tracked:
         """Find changes of the loss, and follow them."""
