@@ -12,12 +12,13 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.version import installed
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.multirate import simulate_joint
 from estimators.apu.sensors import GAS_PATH
 from scenarios import registry
 from scenarios.datasets import baselines, scoring
 from scenarios.datasets.making import solver_of
-from scenarios.datasets.recipe import CLASSES, Recipe, draw
+from scenarios.datasets.recipe import CLASSES, FIRST_H, Recipe, draw
 from scenarios.figures import datasetplot
 from scenarios.schema import Scenario
 from scenarios.shell.markdown import markdown_table
@@ -52,7 +53,44 @@ def scored(
             )
             for part, mask in masks.items()
         }
+        out[name]["missed"] = _missed(p.values, labels, masks["held"])
     return out
+
+
+def _missed(
+    said: Mapping[str, np.ndarray], labels: Mapping[str, np.ndarray], held: np.ndarray
+) -> dict[str, Any]:
+    """Return losses of one factor, those that were called healthy, and what is known of h."""
+    one = held & np.isin(labels["class"], list(HEALTH))
+    loss = np.max([1 - labels[n] for n in HEALTH], axis=0)
+    none = labels["class"] == "healthy"
+    return {
+        "changes": int(one.sum()),
+        "losses": loss[one & (said["class"] == "healthy")],
+        "sigma": said["h_sigma"][none] if "h_sigma" in said else np.array([np.nan]),
+    }
+
+
+def limits_of(r: Recipe, labels: Mapping[str, np.ndarray], found: Mapping[str, Any]) -> Any:
+    """Return what the page says of runs that nothing tells.
+
+    Args:
+        r, labels: recipe and labels of the set.
+        found: what an estimator missed, of :func:`scored`.
+    """
+    h, over = labels["h"], labels["over"]
+    short, grows = h > 0, (h > 0) & (over > 0)
+    begin = np.minimum(FIRST_H, h[grows] / 2)
+    end = begin * (h[grows] / begin) ** np.minimum(r.waveforms["after"] / over[grows], 1.0)
+    least, losses = 5 * float(np.nanmedian(found["sigma"])), found["losses"]
+    return {
+        "shorts": int(short.sum()), "grown": int(grows.sum()), "hidden": int((end < least).sum()),
+        "least": least, "median": float(np.median(end)) if end.size else 0.0,
+        "lo": float(np.nanmin(found["sigma"])), "hi": float(np.nanmax(found["sigma"])),
+        "missed": int(losses.size), "changes": found["changes"], "after": r.waveforms["after"],
+        "small": float(losses.min(initial=1.0)) if losses.size else 0.0,
+        "large": float(losses.max(initial=0.0)),
+    }  # fmt: skip
 
 
 def exchange_error(r: Recipe) -> tuple[float, str]:
@@ -133,7 +171,8 @@ def _text(r: Recipe, labels: Mapping[str, np.ndarray], scores: Mapping[str, Any]
         right=range(1, len(scores) + 2),
     )
     parts = [text.filled("page", **values), markdown_table(head, cells, right=range(1, len(head)))]
-    parts += [text.raw("class"), table, text.raw("figure")]
+    limits = limits_of(r, labels, scores["estimators"]["missed"])
+    parts += [text.raw("class"), table, text.raw("figure"), text.filled("limits", **limits)]
     return "\n\n".join(parts) + "\n"
 
 

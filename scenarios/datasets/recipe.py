@@ -37,7 +37,7 @@ _TABLES = {
     "waveforms": ("rate", "before", "after"),
 }
 _GROW_LEAST = 0.5  # s over which a fault grows at least
-_FIRST_H = 1e-5  # severity from which a short circuit grows
+FIRST_H = 1e-5  # severity from which a short circuit grows
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def _fault(
         h, mu = _log(rng, r.size["h"]), _digits(rng.uniform(0.02, 0.1))
         phase, generator = "abc"[int(rng.integers(3))], int(rng.integers(1, 3))
         labels |= {"h": h, "mu": mu, "kappa": mu, "phase": phase, "generator": generator}
-        grown = {"kind": "exponential", "from": min(_FIRST_H, h / 2), "to": h, "over": over}
+        grown = {"kind": "exponential", "from": min(FIRST_H, h / 2), "to": h, "over": over}
         severity = h if over is None else grown
         later["fault"] = {"generator": generator, "mu": mu, "h": severity, "phase": phase}
     if kind == "field":
