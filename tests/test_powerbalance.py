@@ -39,8 +39,8 @@ def test_the_severity_of_a_loss_is_that_of_equation_8():
         v = np.sqrt(2) * p.V_rated_rms * np.cos(x)
         i = v * P / 6 / p.V_rated_rms**2
         none = 0.0 * v
-        lost = shunt_loss(p, ibar=Abc(i + h * v / p.r_s, none, none), v=Abc(v, none, none),
-                          h=Abc(h, 0.0, 0.0)).mean()  # fmt: skip
+        ibar, of = Abc(i + h * v / p.r_s, none, none), Abc(h, 0.0, 0.0)
+        lost = shunt_loss(p, ibar=ibar, v=Abc(v, none, none), h=of).mean()
         assert loss_of(APU, h, P) == pytest.approx(lost, rel=1e-9)
         assert severity_of(APU, lost, P) == pytest.approx(h, rel=1e-9)
 
@@ -102,8 +102,8 @@ def test_power_and_waveforms_give_one_answer():
 
 
 def test_a_sensor_that_stands_still_is_a_cause():
-    still = [Still("T5", 2.0, Doubt("sensor", "T5 stands still", "gas path")),
-             Still("i_a_2", 2.0, Doubt("sensor", "i_a_2 stands still", "machine 2"))]  # fmt: skip
+    places = ("T5", "gas path"), ("i_a_2", "machine 2")
+    still = [Still(n, 2.0, Doubt("sensor", "stands still", part)) for n, part in places]
     (c,) = still_causes(still)
     (d,) = diagnoses({"gas path": (c,)})
     assert d.best == "sensor T5" and d.failure == {"stuck": 1.0} and d.t == 2.0

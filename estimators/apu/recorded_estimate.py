@@ -197,8 +197,8 @@ def estimate(
     if only is not None and only not in PARTS:
         raise ParameterError(f"only {only!r} {nearest(only, PARTS)}")
     apu, start = _known(engine, prior)
-    how: dict[str, Any] = {"unknowns": start.unknowns(), "prior": start.severity()}
-    how |= {"efficiency_error": efficiency_error, "backend": backend}
+    how = {"unknowns": start.unknowns(), "prior": start.severity(), "backend": backend}
+    how |= {"efficiency_error": efficiency_error}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
     notes = [*m.notes, *ready.notes]
@@ -213,8 +213,7 @@ def estimate(
         own = electrical_sensors.machine(k)
         waves = Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
-        side = waves.side(begin, lacking, doubts, notes, causes)
-        if side is not None:
+        if (side := waves.side(begin, lacking, doubts, notes, causes)) is not None:
             sides[k] = side
     found_by, e = None, None
     fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
@@ -222,10 +221,9 @@ def estimate(
         given = ambient or {}, notes, doubts, backend, start
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         drifts = creep(filt, tracked)
-        # with the power of waveforms it is the joint estimate, whose band it has
-        e = gas_dataset(filt, tracked, None if fused_by else drifts)
-        causes[GAS], odd = told(gas_causes(filt, tracked))
-        causes[GAS] = (*still_causes(still), *causes[GAS])
+        e = gas_dataset(filt, tracked, None if fused_by else drifts)  # the joint band is its own
+        found_of, odd = told(gas_causes(filt, tracked))
+        causes[GAS] = (*still_causes(still), *found_of)
         doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")

@@ -83,14 +83,13 @@ def limits_of(r: Recipe, labels: Mapping[str, np.ndarray], found: Mapping[str, A
     begin = np.minimum(FIRST_H, h[grows] / 2)
     end = begin * (h[grows] / begin) ** np.minimum(r.waveforms["after"] / over[grows], 1.0)
     least, losses = 5 * float(np.nanmedian(found["sigma"])), found["losses"]
-    return {
-        "shorts": int(short.sum()), "grown": int(grows.sum()), "hidden": int((end < least).sum()),
-        "least": least, "median": float(np.median(end)) if end.size else 0.0,
-        "lo": float(np.nanmin(found["sigma"])), "hi": float(np.nanmax(found["sigma"])),
-        "missed": int(losses.size), "changes": found["changes"], "after": r.waveforms["after"],
-        "small": float(losses.min(initial=1.0)) if losses.size else 0.0,
-        "large": float(losses.max(initial=0.0)),
-    }  # fmt: skip
+    counts = {"shorts": short, "grown": grows, "hidden": end < least}
+    out: dict[str, Any] = {n: int(v.sum()) for n, v in counts.items()}
+    out |= {"least": least, "median": float(np.median(end)) if end.size else 0.0}
+    out |= {"lo": float(np.nanmin(found["sigma"])), "hi": float(np.nanmax(found["sigma"]))}
+    out |= {"missed": int(losses.size), "changes": found["changes"], "after": r.waveforms["after"]}
+    some = losses if losses.size else np.zeros(1)
+    return out | {"small": float(some.min()), "large": float(some.max())}
 
 
 def exchange_error(r: Recipe) -> tuple[float, str]:

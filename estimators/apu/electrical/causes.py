@@ -188,11 +188,10 @@ class _Piece:
         shift = {"gain_i_fd": ratio - 1}
         shift |= {"gain_V_fd": 1 / ratio - 1, "machine.r_fd": r_fd * (ratio - 1)} if turns else {}
         filt, data = self.filter(phases=(), free={"machine.r_fd": Unknown()})
-        size = [shift.get(n, 0.0) for n in filt.model.x.names]
-        along = np.array(size) / (ratio - 1) * TURNS
-        own = np.diag([LOOSE**2 * n.startswith("gain_") * (v != 0.0)
-                       for n, v in zip(filt.model.x.names, size, strict=True)])  # fmt: skip
-        found = self.changed(filt, data, np.outer(along, along) + own, shift)
+        names = filt.model.x.names
+        along = np.array([shift.get(n, 0.0) for n in names]) / (ratio - 1) * TURNS
+        own = [LOOSE**2 * (n in shift and n.startswith("gain_")) for n in names]
+        found = self.changed(filt, data, np.outer(along, along) + np.diag(own), shift)
         likely = math.log(2.0) if turns else 0.0  # turns only raise the current
         return found + likely - 0.5 * ((ratio - 1) / TURNS) ** 2
 

@@ -65,30 +65,24 @@ def track(
     The random walk of h is for slow changes; a step of 1e-3 would take it 0.2 s.  So the
     innovations are watched: where their normalised square, averaged over ``RESET_WINDOW`` samples,
     exceeds ``RESET_LEVEL``, h and fluxes become uncertain again at the window's start
-    (``RESET_SIGMA``), and the filter goes on from there.  The first two windows of a piece are not
-    judged, since a start needs them to settle.
+    (``RESET_SIGMA``).  The first two windows of a piece are not judged: a start needs them.
 
-    Where gains are estimated, they are considered from the first reset on, with what is known of
-    them by then: during the transient of a fault they are learnt falsely, by 18 to 48 claimed
-    standard deviations, and h with them by 6 to 10, at severities of 2.4e-3 to 1e-2 and NIS 4 to 5.
+    Where gains are estimated, they are considered from the first reset on, with what is known then:
+    during the transient of a fault they are learnt falsely, by 18 to 48 claimed deviations, and h
+    with them by 6 to 10, at severities of 2.4e-3 to 1e-2 and NIS 4 to 5.
 
     Args:
-        filt, prior, data, backend: as of the filter.
-        step: makes the filter's step for the model.
+        filt, prior, data, step, backend: as of the filter; ``step`` makes its step.
         max_resets: more than these, and the model is refused.
         own_level: whether a window is compared with those before it (the first four are not judged)
-            instead of with what white innovations give: where gain errors are considered (the
-            default there), or taken as noise, each unit has a level of its own.
+            instead of with white innovations: where gain errors are considered (the default there),
+            or taken as noise, each unit has a level of its own.
         cov_at: samples whose covariances are kept, see :func:`estimators.filters.filtering.run`.
-        common: where gains are unknown, by how much a reset lets all three severities differ from
-            zero together, times sqrt(3).  A fault of h has h/3 of it: with less, the filter is
-            linearised about another angle, and h is held back by a per cent for a tenth of a
-            second.
+        common: what all three h may have in common after a reset, as ``H_BALANCED``.
 
     Returns:
-        result: as from one filter; where gains are unknown, the variances of the three severities,
-            and the final belief, hold what these have in common beside what the filter claims.
-            resets : instants, s.
+        Result as from one filter, and the resets, s; where gains are unknown, variances of the
+        three severities, and the final belief, hold what these have in common beside the claim.
 
     Raises:
         EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
