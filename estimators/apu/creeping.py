@@ -10,7 +10,7 @@ sensor and a size d of standard deviation ``SIZE``,
     variance + sum_i p_i (d_i^2 + s_i^2) (dx/dd_i)^2,
 
 where d_i, s_i are the drift's posterior mean and standard deviation and p_i its probability.  Where
-nothing drifts p_i is 0.005, and the band as it was to a tenth of a per cent or so.
+nothing drifts p_i is some 0.005, and the band as it was to a few per cent at most.
 """
 
 from __future__ import annotations
