@@ -36,7 +36,7 @@ html_math_renderer = "mathml"
 
 autosummary_generate = API
 # a script that runs under a Python of its own
-autodoc_mock_imports = ["openmdao", "pycycle", "sklearn"]
+autodoc_mock_imports = ["dpsimpy", "openmdao", "pycycle", "sklearn"]
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True

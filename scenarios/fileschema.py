@@ -123,10 +123,19 @@ def docs_of(cls: type) -> dict[str, str]:
     text = inspect.cleandoc(cls.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
     found = re.findall(r"(?m)^    (\w[\w, ]*): (.*(?:\n {8}.*)*)", text)
     return {
-        n.strip(): " ".join(doc.split()).rstrip(".")
+        n.strip(): _plain(" ".join(doc.split()).rstrip("."))
         for names, doc in found
         for n in names.split(",")
     }
+
+
+def _plain(text: str) -> str:
+    """Return a text whose names of other parts are without Sphinx's role, which no reader knows."""
+    return re.sub(r":\w+:`~?([\w.]+)`", r"``\1``", text)
+
+
+def _headline(cls: type, kind: str) -> str:
+    return _plain((cls.__doc__ or kind).split("\n")[0])
 
 
 def _object(properties: Table, required: Sequence[str] = (), **more: Any) -> Table:
@@ -172,7 +181,7 @@ def _part(kind: str, keys: Sequence[Key], cls: type, *, optional: bool = False) 
     required = needed if optional else ["kind", *needed]
     own = {k.name: _key(k) if k.choices else _varies(_key(k)) for k in keys}
     table = {"kind": {"const": kind}, **own}
-    return _object(table, required, description=(cls.__doc__ or kind).split("\n")[0])
+    return _object(table, required, description=_headline(cls, kind))
 
 
 def _profile() -> Table:
@@ -189,7 +198,7 @@ def _profile() -> Table:
             needed = [k.name for k in cls.keys if k.default is ... and k.name in own]
             needed = needed or ["file"]
             required = needed if told else ["kind", *needed]
-            words = (cls.__doc__ or kind).split("\n")[0]
+            words = _headline(cls, kind)
             each.append(_object({"kind": {"const": kind}, **own}, required, description=words))
     return {"anyOf": each}
 

@@ -86,6 +86,7 @@ def test_it_is_made_of_the_classes_and_documented(validator, capsys):
     schema = json.loads(capsys.readouterr().out)
     assert schema == json.loads(json.dumps(validator.schema))
     assert tuple(schema["properties"]) == FILE_KEYS
+    assert ":func:" not in json.dumps(schema) and ":class:" not in json.dumps(schema)
     assert all(p["description"] for p in schema["properties"].values())
     power = schema["definitions"]["load"]["anyOf"][0]["oneOf"][0]["properties"].get("power_kW")
     assert power is None or power["description"].endswith("[kW]")
