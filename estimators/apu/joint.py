@@ -385,6 +385,7 @@ def fused(
     courses = shaft_courses(apu, sides)
     streams: dict[str, Any] = {"readings": readings, "max_dt": max_dt}
     tracked: Tracked | None = None
+    told: tuple[np.ndarray, np.ndarray] | None = None
     if spread is not None:
         spread.check(gas.model.x)
     start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
@@ -398,7 +399,9 @@ def fused(
         known = t, np.append(mean, mean[-1]), np.append(white, white[-1])
         data = gas.of_readings(**streams, power=known, inputs=given)
         if speed is not None:
-            data = _with_speed(gas, data, speed, speed_sigma, apu)
+            if told is None:  # the same on all courses
+                told = _speeds(data, speed, speed_sigma, apu)
+            data = better_speed(gas, data, *told)
         # from the window on in which more is known
         k = int(np.searchsorted(data.t, t[first] - 1e-9)) + 1 if first else 0
         now = track_jumps(gas, data, test=test, prior=start, runs=runs)
@@ -412,17 +415,13 @@ def _opening(loss: np.ndarray) -> np.ndarray:
     return np.append(np.sqrt(np.diff(loss**2, prepend=0.0).clip(0.0)), 0.0)
 
 
-def _with_speed(
-    gas: GasPathFilter,
-    data: Recording,
-    speed: tuple[np.ndarray, np.ndarray],
-    sigma: float,
-    apu: Apu,
-) -> Recording:
+def _speeds(
+    data: Recording, speed: tuple[np.ndarray, np.ndarray], sigma: float, apu: Apu
+) -> tuple[np.ndarray, np.ndarray]:
     rows = np.isfinite(data.y).any(axis=0)
     N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
     N[rows], N_sigma[rows] = speed_from_generators(*speed, sigma, data.t[rows], apu)
-    return better_speed(gas, data, N, N_sigma)
+    return N, N_sigma
 
 
 def _gas_filter(

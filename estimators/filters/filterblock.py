@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Protocol
 
 import casadi as ca
@@ -72,9 +73,15 @@ def packed_diagonal(n: int) -> np.ndarray:
     return np.cumsum([0, *range(n, 1, -1)])
 
 
+@lru_cache(maxsize=64)
+def _upper(n: int) -> tuple[np.ndarray, np.ndarray]:
+    i, j = np.triu_indices(n)
+    return i, j
+
+
 def unpacked(columns: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices, (K, n, n), of their lower halves, (n (n + 1)/2, K)."""
-    i, j = np.triu_indices(n)
+    i, j = _upper(n)
     out = np.empty((columns.shape[1], n, n))
     out[:, i, j] = out[:, j, i] = columns.T
     return out
@@ -93,6 +100,21 @@ def narrow(P: np.ndarray, *, root: bool = False) -> bool:
     s = 1 / np.sqrt(d)
     try:
         pivots = np.linalg.cholesky(P * s * s[:, None]).diagonal()
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((pivots**2 >= NARROW).all())
+
+
+def any_narrow(P: np.ndarray) -> bool:
+    """Whether one of some covariances, (k, n, n), is narrow, see :func:`narrow`."""
+    d = P.diagonal(axis1=1, axis2=2)
+    there = d > 0
+    s = np.where(there, 1 / np.sqrt(np.where(there, d, 1.0)), 0.0)
+    Q = P * s[:, :, None] * s[:, None, :]
+    k, i = np.nonzero(~there)
+    Q[k, i, i] = 1.0  # what is known exactly does not count
+    try:
+        pivots = np.linalg.cholesky(Q).diagonal(axis1=1, axis2=2)
     except np.linalg.LinAlgError:
         return True
     return not bool((pivots**2 >= NARROW).all())

@@ -397,7 +397,7 @@ def result_of(
     part = slice(start, start + mean.shape[1])
     missing = np.isnan(data.y[:, part])
     nu[missing], S[missing] = np.nan, np.nan
-    final = Belief(model.x, mean[:, -1].copy(), _tidy(piece.last), None)
+    final = Belief.found(model.x, mean[:, -1].copy(), _tidy(piece.last))
     told = stats[1], stats[3], float(stats[2].sum()), final
     more: dict[str, Any] = {"some_cov": piece.some if some else None}
     return FilterResult(model.x, model.y, data.t[part], mean, var, nu, S, *told, **more)

@@ -7,7 +7,7 @@ square-root form or tells what is wrong.  Up to there the results are the same, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import casadi as ca
@@ -19,8 +19,8 @@ from estimators.filters.filterblock import (
     BLOCK,
     PADDED,
     WIDE,
+    any_narrow,
     block_length,
-    narrow,
     packed_diagonal,
     unpacked,
 )
@@ -50,6 +50,12 @@ class Piece(NamedTuple):
     some: np.ndarray
     last: np.ndarray
     ahead: Belief | None
+
+
+def _copy(of: Sequence[np.ndarray], to: Sequence[np.ndarray]) -> None:
+    """Copy the first arrays, as many as there are to take them."""
+    for a, b in zip(to, of, strict=False):
+        a[:] = b
 
 
 class Sweep:
@@ -110,8 +116,10 @@ class Sweep:
         here = self._wanted[(self._wanted >= start) & (self._wanted < stop)] - start
         some, ends = np.empty((here.size, nx, nx)), []
         call, first = self._call, 3 if self._short else 2
+        given, made = call.inputs[:first], call.outputs
+        m_f, P_f, *rest = made[first : first + 5]
         rows = packed_diagonal(nx)
-        call.inputs[0][:], call.inputs[1][:] = belief.mean, belief.cov
+        given[0][:], given[1][:] = belief.mean, belief.cov
         starts: list[tuple[np.ndarray, ...]] = []
         done = 0
         if self._last is not None and self._last[0] is belief and self._last[1] == start:
@@ -122,40 +130,37 @@ class Sweep:
             for target, source in zip((mean, var, nu, S, stats), known[:5], strict=True):
                 target[:, :done] = source[:, :done]
             some[here < done] = known.some[: int((here < done).sum())]
-            for given, own in zip(call.inputs[:first], before[block], strict=True):
-                given[:] = own
+            _copy(before[block], given)
         for at in range(done, n, length):
             r = slice(at, min(at + length, n))
             self._fill(start + r.start, start + r.stop, more if r.stop == n else 0)
-            starts.append(tuple(a.copy() for a in call.inputs[:first]))
+            starts.append(tuple(a.copy() for a in given))
             call.evaluate()
-            m_f, P_f, *rest = call.outputs[first : first + 5]
             k = r.stop - r.start
             mean[:, r] = m_f[:, :k]
             var[:, r] = (P_f if self._short else P_f[rows])[:, :k]
             for target, source in zip((nu, S, stats), rest, strict=True):
                 target[:, r] = source[:, :k]
-            inside = (here >= r.start) & (here < r.stop)
-            if inside.any():
+            inside = slice(*np.searchsorted(here, (r.start, r.stop)))
+            if inside.stop > inside.start:
                 some[inside] = unpacked(P_f[:, here[inside] - r.start], nx)
             if at // length % (4 * BLOCK // length) == 0:
-                ends.append(call.outputs[1].copy())
+                ends.append(made[1].copy())
             if r.stop < n:
-                for given, made in zip(call.inputs[:first], call.outputs, strict=False):
-                    given[:] = made
+                _copy(made, given)
             if progress is not None:
                 progress(r.stop, n)
         if not self._good(slice(start, stop), mean, var, S, stats, ends):
             return None
-        at_last = k - 1
-        last = call.outputs[2] if self._short else unpacked(P_f[:, [at_last]], nx)[0]
+        # of a short block the covariance of the last sample, which may be the one more
+        last = made[2].copy() if self._short else unpacked(P_f[:, [k - 1]], nx)[0]
         ahead = None
         if more:
-            there = call.outputs[2] if self._short else unpacked(P_f[:, [k]], nx)[0]
-            ahead = Belief(self.model.x, m_f[:, k].copy(), there.copy())
+            there = last if self._short else unpacked(P_f[:, [k]], nx)[0]
+            ahead = Belief.found(self.model.x, m_f[:, k].copy(), there)
         elif stop < K:
-            ahead = Belief(self.model.x, call.outputs[0].ravel().copy(), call.outputs[1].copy())
-        piece = Piece(mean, var, nu, S, stats, some, last.copy(), ahead)
+            ahead = Belief.found(self.model.x, made[0].copy(), made[1].copy())
+        piece = Piece(mean, var, nu, S, stats, some, last, ahead)
         self._last = belief, start, starts, piece
         return piece
 
@@ -185,4 +190,4 @@ class Sweep:
             return True
         if not (WIDE * np.abs(self._R[:, part]) >= S).all():
             return False
-        return not any(narrow(P) for P in ends)
+        return not any_narrow(np.array(ends)) if ends else True
