@@ -105,8 +105,8 @@ def narrow(P: np.ndarray, *, root: bool = False) -> bool:
     return not bool((pivots**2 >= NARROW).all())
 
 
-def any_narrow(P: np.ndarray) -> bool:
-    """Whether one of some covariances, (k, n, n), is narrow, see :func:`narrow`."""
+def narrow_ones(P: np.ndarray) -> np.ndarray:
+    """Tell which of some covariances, (k, n, n), are narrow, as :func:`narrow` tells of one."""
     d = P.diagonal(axis1=1, axis2=2)
     there = d > 0
     s = np.where(there, 1 / np.sqrt(np.where(there, d, 1.0)), 0.0)
@@ -116,8 +116,8 @@ def any_narrow(P: np.ndarray) -> bool:
     try:
         pivots = np.linalg.cholesky(Q).diagonal(axis1=1, axis2=2)
     except np.linalg.LinAlgError:
-        return True
-    return not bool((pivots**2 >= NARROW).all())
+        return np.array([narrow(one) for one in P])
+    return np.asarray(~(pivots**2 >= NARROW).all(1))
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:

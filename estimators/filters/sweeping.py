@@ -19,8 +19,8 @@ from estimators.filters.filterblock import (
     BLOCK,
     PADDED,
     WIDE,
-    any_narrow,
     block_length,
+    narrow_ones,
     packed_diagonal,
     unpacked,
 )
@@ -190,4 +190,4 @@ class Sweep:
             return True
         if not (WIDE * np.abs(self._R[:, part]) >= S).all():
             return False
-        return not any_narrow(np.array(ends)) if ends else True
+        return not ends or not narrow_ones(np.array(ends)).any()
