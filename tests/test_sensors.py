@@ -177,7 +177,7 @@ def test_a_lagging_sensor_is_followed_through_a_load_drop(drop):
         i = believed.y.shape[0] - 1
         believed.y[i] = data.y[i]
         instant.append(filters[1].run(believed).nis[25:].mean())
-    # an error lasts for seconds: a run has few independent ones; 1.00 over 20 seeds, up to 1.7 in one
+    # an error lasts for seconds, so a run has few independent ones: up to 1.7 in one, 1.00 in 20
     assert np.sqrt(np.mean(np.square(errors))) < 1.3
     low, high = band(3 * (t.size - 25), 5, 0.999)
     assert low < np.mean(late) < high
