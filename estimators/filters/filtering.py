@@ -378,6 +378,8 @@ def sweep_of(
     data: Recording,
     cov_at: np.ndarray | None,
     backend: str | None,
+    *,
+    remember: bool = False,
 ) -> Sweep | None:
     """Return the filter over parts of a recording; None if it is not carried by covariances."""
     if not in_halves(step.shared) or prior.root is not None or not step.model.y.names:
@@ -386,7 +388,8 @@ def sweep_of(
     if wide and narrow(prior.cov):
         return None
     block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
-    return Sweep(step.model, block, data, step.full(data.p), wide=wide, cov_at=cov_at)
+    how: dict[str, Any] = {"wide": wide, "cov_at": cov_at, "remember": remember}
+    return Sweep(step.model, block, data, step.full(data.p), **how)
 
 
 def result_of(

@@ -30,6 +30,7 @@ from estimators.models.recording import Recording
 __all__ = ["Piece", "Sweep"]
 
 _STATS = 4
+_LOOK = 32  # blocks between looks at what has been done
 
 
 class Piece(NamedTuple):
@@ -69,6 +70,7 @@ class Sweep:
         p: parameters as the step takes them.
         wide: whether there is a form with roots to go on in.
         cov_at: samples whose covariances are wanted, ascending; None: none.
+        remember: what a piece has done is kept for another one from the same start.
     """
 
     def __init__(
@@ -80,11 +82,12 @@ class Sweep:
         *,
         wide: bool,
         cov_at: np.ndarray | None = None,
+        remember: bool = False,
     ) -> None:
         self.model, self.data, self.wide, self._short = model, data, wide, cov_at is None
         self._wanted = np.array([] if cov_at is None else cov_at, dtype=int)
         self._call = Caller(block, copy=False)
-        self._length = block_length(model)
+        self._length, self._remember = block_length(model), remember
         self._call.inputs[-1].ravel(order="K")[:] = np.ravel(p)
         missing = np.isnan(data.y)
         self._y = np.where(missing, 0.0, data.y)
@@ -100,7 +103,7 @@ class Sweep:
     ) -> Piece | None:
         """Filter samples from start up to stop; None where that needs a closer look.
 
-        What the last call has done from the same start is not done again.
+        What the last call has done from the same start is not done again, if it is remembered.
 
         Args:
             start, stop: numbers of samples.
@@ -121,12 +124,13 @@ class Sweep:
         rows = packed_diagonal(nx)
         given[0][:], given[1][:] = belief.mean, belief.cov
         starts: list[tuple[np.ndarray, ...]] = []
-        done = 0
+        done = judged = 0
         if self._last is not None and self._last[0] is belief and self._last[1] == start:
             # the same beginning: at the last block that is the same
             _, _, before, known = self._last
             block = min((n - 1) // length, len(before) - 1)
-            done, starts = block * length, before[:block]
+            done = judged = block * length
+            starts = before[:block]
             for target, source in zip((mean, var, nu, S, stats), known[:5], strict=True):
                 target[:, :done] = source[:, :done]
             some[here < done] = known.some[: int((here < done).sum())]
@@ -134,7 +138,8 @@ class Sweep:
         for at in range(done, n, length):
             r = slice(at, min(at + length, n))
             self._fill(start + r.start, start + r.stop, more if r.stop == n else 0)
-            starts.append(tuple(a.copy() for a in given))
+            if self._remember:
+                starts.append(tuple(a.copy() for a in given))
             call.evaluate()
             k = r.stop - r.start
             mean[:, r] = m_f[:, :k]
@@ -146,12 +151,14 @@ class Sweep:
                 some[inside] = unpacked(P_f[:, here[inside] - r.start], nx)
             if at // length % (4 * BLOCK // length) == 0:
                 ends.append(made[1].copy())
+            if at == 0 or at // length % _LOOK == 0 or r.stop == n:
+                if not self._good(start, slice(judged, r.stop), (mean, var, S, stats), ends):
+                    return None
+                judged, ends = r.stop, []
             if r.stop < n:
                 _copy(made, given)
             if progress is not None:
                 progress(r.stop, n)
-        if not self._good(slice(start, stop), mean, var, S, stats, ends):
-            return None
         # of a short block the covariance of the last sample, which may be the one more
         last = made[2].copy() if self._short else unpacked(P_f[:, [k - 1]], nx)[0]
         ahead = None
@@ -161,7 +168,8 @@ class Sweep:
         elif stop < K:
             ahead = Belief.found(self.model.x, made[0].copy(), made[1].copy())
         piece = Piece(mean, var, nu, S, stats, some, last, ahead)
-        self._last = belief, start, starts, piece
+        if self._remember:
+            self._last = belief, start, starts, piece
         return piece
 
     def _fill(self, start: int, stop: int, more: int) -> None:
@@ -176,18 +184,15 @@ class Sweep:
             u[:, n], R[:, n], dt[:, n] = self.data.u[:, stop], -1.0, self._dt[stop]
 
     def _good(
-        self,
-        part: slice,
-        mean: np.ndarray,
-        var: np.ndarray,
-        S: np.ndarray,
-        stats: np.ndarray,
-        ends: list[np.ndarray],
+        self, start: int, part: slice, made: Sequence[np.ndarray], ends: list[np.ndarray]
     ) -> bool:
+        """Whether some samples, counted from a start, are to be believed as they are."""
+        mean, var, S, stats = (a[:, part] for a in made)
         if not ((stats[0] <= CHECK_TOL).all() and (var >= 0).all() and np.isfinite(mean).all()):
             return False
         if not self.wide:
             return True
-        if not (WIDE * np.abs(self._R[:, part]) >= S).all():
+        R = self._R[:, start + part.start : start + part.stop]
+        if not (WIDE * np.abs(R) >= S).all():
             return False
         return not ends or not narrow_ones(np.array(ends)).any()
