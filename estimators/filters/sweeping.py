@@ -150,7 +150,7 @@ class Sweep:
             if inside.stop > inside.start:
                 some[inside] = unpacked(P_f[:, here[inside] - r.start], nx)
             if at // length % (4 * BLOCK // length) == 0:
-                ends.append(made[1].copy())
+                ends.append(made[1].reshape(nx, nx).copy())
             if at == 0 or at // length % _LOOK == 0 or r.stop == n:
                 if not self._good(start, slice(judged, r.stop), (mean, var, S, stats), ends):
                     return None
@@ -160,13 +160,13 @@ class Sweep:
             if progress is not None:
                 progress(r.stop, n)
         # of a short block the covariance of the last sample, which may be the one more
-        last = made[2].copy() if self._short else unpacked(P_f[:, [k - 1]], nx)[0]
+        last = made[2].reshape(nx, nx).copy() if self._short else unpacked(P_f[:, [k - 1]], nx)[0]
         ahead = None
         if more:
             there = last if self._short else unpacked(P_f[:, [k]], nx)[0]
             ahead = Belief.found(self.model.x, m_f[:, k].copy(), there)
         elif stop < K:
-            ahead = Belief.found(self.model.x, made[0].copy(), made[1].copy())
+            ahead = Belief.found(self.model.x, made[0].copy(), made[1].reshape(nx, nx).copy())
         piece = Piece(mean, var, nu, S, stats, some, last, ahead)
         if self._remember:
             self._last = belief, start, starts, piece
