@@ -7,14 +7,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from estimation_models import cv_model, gappy, pendulum, pendulum_data, random_belief
+from estimation_models import cv_model, gappy, pendulum, pendulum_data, random_belief, random_linear
 from numpy.testing import assert_allclose
 
 from apu_casadi.core.backend import find_compiler, use_backend
 from apu_casadi.core.errors import DataError, EstimationError, SignalError
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
-from estimators.filters.filtering import BLOCK, STEP_OUT, run
+from estimators.filters.filtering import BLOCK, STEP_OUT, run, sweep_of
 from estimators.filters.resuming import Runs
 from estimators.filters.ukf import ukf_step
 
@@ -82,6 +82,37 @@ def test_recordings_that_begin_alike_are_run_from_where_they_differ(at, monkeypa
     assert_allclose(made.loglik, whole.loglik, rtol=1e-12)
     np.testing.assert_array_equal(made.final.cov, whole.final.cov)
     np.testing.assert_array_equal(made.again().mean, whole.again().mean)
+
+
+def test_covariances_of_some_samples_of_a_single_state():
+    """Of one state, where a matrix is a number; any samples, the last among them."""
+    model = random_linear(0, nx=1, ny=1)[0]
+    prior, data, step = random_belief(0, model), gappy(0, model, BLOCK + 30), ekf_step(model)
+    whole, at = run(step, prior, data, full=True, backend="vm"), np.array([0, BLOCK, BLOCK + 29])
+    some = run(step, prior, data, cov_at=at, backend="vm")
+    np.testing.assert_array_equal(some.some_cov, whole.cov[at])
+    np.testing.assert_array_equal(some.variance, whole.variance)
+    np.testing.assert_array_equal(run(step, prior, data, backend="vm").final.cov, some.final.cov)
+
+
+@pytest.mark.parametrize("cov_at", [None, np.array([3, 180])])
+@pytest.mark.parametrize("cut", [BLOCK - 1, BLOCK, BLOCK + 20])
+def test_pieces_of_a_sweep_are_the_whole(cut, cov_at):
+    """Each begins with the belief that the last one ends with; one is done again up to a cut."""
+    model, K = cv_model(), 2 * BLOCK + 30
+    prior, data, step = random_belief(2, model), gappy(2, model, K), ekf_step(model)
+    whole = run(step, prior, data, cov_at=cov_at, backend="vm")
+    sweep = sweep_of(step, prior, data, cov_at, "vm", remember=True)
+    first = sweep.piece(0, K - 5, prior)
+    again = sweep.piece(0, cut, prior)
+    rest = sweep.piece(cut, K, again.ahead)
+    for name in ("mean", "var", "nu", "S", "stats"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name)[:, :cut], name)
+    np.testing.assert_array_equal(np.hstack([again.mean, rest.mean]), whole.mean)
+    np.testing.assert_array_equal(np.hstack([again.var, rest.var]), whole.variance)
+    np.testing.assert_allclose(rest.last, whole.final.cov, rtol=1e-15)
+    if cov_at is not None:
+        np.testing.assert_array_equal(np.vstack([again.some, rest.some]), whole.some_cov)
 
 
 @every_step

@@ -27,6 +27,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,6 +85,7 @@ __all__ = [
     "ETA_SIGMA",
     "GAIN_SHARE",
     "ElectricalSide",
+    "Pickup",
     "View",
     "beside_truth",
     "better_speed",
@@ -174,6 +176,28 @@ def speed_from_generators(
         N[k] = per * float(inverse[0] @ (A.T @ w_r[i:j]))
         s[k] = per * sigma * math.sqrt(inverse[0, 0])
     return N, s
+
+
+@dataclass(frozen=True, eq=False)
+class Pickup:
+    """A generator's speed pick-up.
+
+    Args:
+        t, w_r: instants, s, and samples, electrical rad/s.
+        sigma: standard deviation of each of them.
+    """
+
+    t: np.ndarray
+    w_r: np.ndarray
+    sigma: float
+
+    def rotor(self, data: Recording, apu: Apu) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rotor speed at each instant with a reading, and its standard deviation."""
+        rows = np.isfinite(data.y).any(axis=0)
+        N, sigma = np.zeros(data.size), np.full(data.size, np.inf)
+        given = self.t, self.w_r, self.sigma, data.t[rows], apu
+        N[rows], sigma[rows] = speed_from_generators(*given)
+        return N, sigma
 
 
 def better_speed(filt: GasPathFilter, data: Recording, N: np.ndarray, s: np.ndarray) -> Recording:
@@ -298,14 +322,12 @@ def estimate_joint(
         number: electrical_side(one, electrical_sensors, measured, t, **also)
         for number, (one, measured) in enumerate(waves, 1)
     }
-    pickup = waves[0][1]["t"], waves[0][1]["w_r"]
+    first = waves[0][1]
+    sigma = electrical_sensors.sigma("w_r", float(np.median(first["w_r"])))
+    pickup = Pickup(first["t"], first["w_r"], sigma) if speed else None
     readings = _read_gas(ds, gas_sensors, gas_gains, noise)
-    gas, tracked = fused(
-        *(apu, [*sides.values()], readings, gas_sensors),
-        speed=pickup if speed else None,
-        speed_sigma=electrical_sensors.sigma("w_r", float(np.median(pickup[1]))),
-        **{**how, "power": power, "step": step},
-    )
+    how |= {"power": power, "step": step, "speed": pickup}
+    gas, tracked = fused(apu, [*sides.values()], readings, gas_sensors, **how)
     return beside_truth(ds, sides, gas, tracked)
 
 
@@ -348,8 +370,7 @@ def fused(
     readings: Mapping[str, tuple[np.ndarray, np.ndarray]],
     sensors: SensorSet = GAS_PATH,
     *,
-    speed: tuple[np.ndarray, np.ndarray] | None = None,
-    speed_sigma: float = math.nan,
+    speed: Pickup | None = None,
     power: bool = True,
     prior: Mapping[str, float] | None = None,
     spread: Prior | None = None,
@@ -369,8 +390,7 @@ def fused(
             the same instants.
         readings: ``{name: (t, values)}`` by gas-path sensor.
         sensors: 1-sigma table of the gas path.
-        speed: instants and samples of a generator's speed pick-up.
-        speed_sigma: standard deviation of each of them.
+        speed: a generator's speed pick-up.
         power: whether the filter gets the shaft power.
         prior: means of the start by state.
         spread: of which the standard deviations are taken.
@@ -385,6 +405,7 @@ def fused(
     courses = shaft_courses(apu, sides)
     streams: dict[str, Any] = {"readings": readings, "max_dt": max_dt}
     tracked: Tracked | None = None
+    told: tuple[np.ndarray, np.ndarray] | None = None
     if spread is not None:
         spread.check(gas.model.x)
     start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
@@ -398,7 +419,9 @@ def fused(
         known = t, np.append(mean, mean[-1]), np.append(white, white[-1])
         data = gas.of_readings(**streams, power=known, inputs=given)
         if speed is not None:
-            data = _with_speed(gas, data, speed, speed_sigma, apu)
+            if told is None:  # the same on all courses
+                told = speed.rotor(data, apu)
+            data = better_speed(gas, data, *told)
         # from the window on in which more is known
         k = int(np.searchsorted(data.t, t[first] - 1e-9)) + 1 if first else 0
         now = track_jumps(gas, data, test=test, prior=start, runs=runs)
@@ -410,19 +433,6 @@ def fused(
 def _opening(loss: np.ndarray) -> np.ndarray:
     """Standard deviations of changes that make a state of variance loss^2, which never falls."""
     return np.append(np.sqrt(np.diff(loss**2, prepend=0.0).clip(0.0)), 0.0)
-
-
-def _with_speed(
-    gas: GasPathFilter,
-    data: Recording,
-    speed: tuple[np.ndarray, np.ndarray],
-    sigma: float,
-    apu: Apu,
-) -> Recording:
-    rows = np.isfinite(data.y).any(axis=0)
-    N, N_sigma = np.zeros(data.size), np.full(data.size, np.inf)
-    N[rows], N_sigma[rows] = speed_from_generators(*speed, sigma, data.t[rows], apu)
-    return better_speed(gas, data, N, N_sigma)
 
 
 def _gas_filter(

@@ -45,7 +45,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
-from estimators.apu.joint import ElectricalSide, fused, unit_of
+from estimators.apu.joint import ElectricalSide, Pickup, fused, unit_of
 from estimators.apu.machinepowers import fusable
 from estimators.apu.peers import compared_sides
 from estimators.apu.powerbalance import OUTPUT, balance
@@ -393,7 +393,8 @@ class _GasPath:
             inside = (own[0] >= span[0] - 1e-9) & (own[0] <= span[1] + 1e-9)
             # as the first machine's would be
             ratio = self.apu.w_r(1.0) / unit_of(self.apu, first).w_r(1.0)
-            own = own[0][inside], ratio * own[1][inside]
+            w_r = ratio * own[1][inside]
+            sigma = electrical.sigma("w_r", float(np.median(w_r)))
             if "PW" in sensors:  # of which the sensor is not used
                 plain = dataclasses.replace(sensors["PW"], tau=0.0)
                 sensors = SensorSet(tuple(plain if s.name == "PW" else s for s in sensors.sensors))
@@ -402,8 +403,7 @@ class _GasPath:
                 sides,
                 readings,
                 sensors,
-                speed=own,
-                speed_sigma=electrical.sigma("w_r", float(np.median(own[1]))),
+                speed=Pickup(own[0][inside], w_r, sigma),
                 prior=self._start(readings, sensors) | dict(self.prior.of_gas_path().mean),
                 spread=self.prior.of_gas_path(),
                 unknowns=self.prior.unknowns(),

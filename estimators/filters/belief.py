@@ -91,6 +91,13 @@ class Belief:
         )  # a standard deviation has no default
         return cls(x, x.pack(mean), np.diag(s.pack(sigma) ** 2))
 
+    @classmethod
+    def found(cls, x: Signals, mean: np.ndarray, cov: np.ndarray) -> Belief:
+        """Return what a filter has found, which it judges itself: nothing is checked."""
+        made = object.__new__(cls)
+        made.__dict__.update(x=x, mean=mean, cov=cov, root=None)
+        return made
+
     @property
     def sigma(self) -> np.ndarray:
         """Standard deviations, shape (nx,)."""

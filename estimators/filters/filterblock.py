@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Protocol
 
 import casadi as ca
@@ -72,9 +73,15 @@ def packed_diagonal(n: int) -> np.ndarray:
     return np.cumsum([0, *range(n, 1, -1)])
 
 
+@lru_cache(maxsize=64)
+def _upper(n: int) -> tuple[np.ndarray, np.ndarray]:
+    i, j = np.triu_indices(n)
+    return i, j
+
+
 def unpacked(columns: np.ndarray, n: int) -> np.ndarray:
     """Return symmetric matrices, (K, n, n), of their lower halves, (n (n + 1)/2, K)."""
-    i, j = np.triu_indices(n)
+    i, j = _upper(n)
     out = np.empty((columns.shape[1], n, n))
     out[:, i, j] = out[:, j, i] = columns.T
     return out
@@ -96,6 +103,21 @@ def narrow(P: np.ndarray, *, root: bool = False) -> bool:
     except np.linalg.LinAlgError:
         return True
     return not bool((pivots**2 >= NARROW).all())
+
+
+def narrow_ones(P: np.ndarray) -> np.ndarray:
+    """Tell which of some covariances, (k, n, n), are narrow, as :func:`narrow` tells of one."""
+    d = P.diagonal(axis1=1, axis2=2)
+    there = d > 0
+    s = np.where(there, 1 / np.sqrt(np.where(there, d, 1.0)), 0.0)
+    Q = P * s[:, :, None] * s[:, None, :]
+    k, i = np.nonzero(~there)
+    Q[k, i, i] = 1.0  # what is known exactly does not count
+    try:
+        pivots = np.linalg.cholesky(Q).diagonal(axis1=1, axis2=2)
+    except np.linalg.LinAlgError:
+        return np.array([narrow(one) for one in P])
+    return np.asarray(~(pivots**2 >= NARROW).all(1))
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:

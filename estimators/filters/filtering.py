@@ -378,6 +378,8 @@ def sweep_of(
     data: Recording,
     cov_at: np.ndarray | None,
     backend: str | None,
+    *,
+    remember: bool = False,
 ) -> Sweep | None:
     """Return the filter over parts of a recording; None if it is not carried by covariances."""
     if not in_halves(step.shared) or prior.root is not None or not step.model.y.names:
@@ -386,7 +388,8 @@ def sweep_of(
     if wide and narrow(prior.cov):
         return None
     block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
-    return Sweep(step.model, block, data, step.full(data.p), wide=wide, cov_at=cov_at)
+    how: dict[str, Any] = {"wide": wide, "cov_at": cov_at, "remember": remember}
+    return Sweep(step.model, block, data, step.full(data.p), **how)
 
 
 def result_of(
@@ -397,7 +400,7 @@ def result_of(
     part = slice(start, start + mean.shape[1])
     missing = np.isnan(data.y[:, part])
     nu[missing], S[missing] = np.nan, np.nan
-    final = Belief(model.x, mean[:, -1].copy(), _tidy(piece.last), None)
+    final = Belief.found(model.x, mean[:, -1].copy(), _tidy(piece.last))
     told = stats[1], stats[3], float(stats[2].sum()), final
     more: dict[str, Any] = {"some_cov": piece.some if some else None}
     return FilterResult(model.x, model.y, data.t[part], mean, var, nu, S, *told, **more)

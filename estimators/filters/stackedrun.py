@@ -18,7 +18,14 @@ from apu_casadi.core.calling import Caller, available_threads
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_in_use
 from estimators.filters.belief import Belief
-from estimators.filters.filterblock import BLOCK, WIDE, block_function, block_length, padded
+from estimators.filters.filterblock import (
+    BLOCK,
+    WIDE,
+    block_function,
+    block_length,
+    narrow_ones,
+    padded,
+)
 from estimators.filters.filtering import STATS, FilterResult, FilterStep, narrow
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
@@ -126,7 +133,7 @@ def _run_pack(
             target[pack, s] = part
         stack.good[pack] &= _good(parts, stack.given[2][pack, s], model, wide)
         if wide and b % (4 * BLOCK // length) == 0:
-            stack.good[pack] &= _not_narrow(out[1][:n].reshape(n, *stack.P.shape[1:]))
+            stack.good[pack] &= ~narrow_ones(out[1][:n].reshape(n, *stack.P.shape[1:]))
         if not stack.good[pack].any():
             return
         for view, o in zip(views[:3], out[:3], strict=True):
@@ -147,10 +154,6 @@ def _good(parts: Sequence[np.ndarray], R: np.ndarray, model: FilterModel, wide: 
     return made
 
 
-def _not_narrow(P: np.ndarray) -> np.ndarray:
-    return np.array([not narrow(one) for one in P])
-
-
 def _result(
     stack: _Stack, k: int, step: FilterStep, prior: Belief, data: Recording
 ) -> FilterResult:
@@ -162,6 +165,6 @@ def _result(
     nu[missing], S[missing] = np.nan, np.nan
     last = (stack.P_last[k] + stack.P_last[k].T) / 2
     np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
-    final = Belief(model.x, mean[:, -1].copy(), last, None)
+    final = Belief.found(model.x, mean[:, -1].copy(), last)
     told = stats[1], stats[3], float(stats[2].sum()), final
     return FilterResult(model.x, model.y, data.t, mean, var, nu, S, *told)

@@ -7,7 +7,7 @@ square-root form or tells what is wrong.  Up to there the results are the same, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import casadi as ca
@@ -20,7 +20,7 @@ from estimators.filters.filterblock import (
     PADDED,
     WIDE,
     block_length,
-    narrow,
+    narrow_ones,
     packed_diagonal,
     unpacked,
 )
@@ -30,6 +30,7 @@ from estimators.models.recording import Recording
 __all__ = ["Piece", "Sweep"]
 
 _STATS = 4
+_LOOK = 32  # blocks between looks at what has been done
 
 
 class Piece(NamedTuple):
@@ -52,6 +53,12 @@ class Piece(NamedTuple):
     ahead: Belief | None
 
 
+def _copy(of: Sequence[np.ndarray], to: Sequence[np.ndarray]) -> None:
+    """Copy the first arrays, as many as there are to take them."""
+    for a, b in zip(to, of, strict=False):
+        a[:] = b
+
+
 class Sweep:
     """A filter over parts of one recording.
 
@@ -63,6 +70,7 @@ class Sweep:
         p: parameters as the step takes them.
         wide: whether there is a form with roots to go on in.
         cov_at: samples whose covariances are wanted, ascending; None: none.
+        remember: what a piece has done is kept for another one from the same start.
     """
 
     def __init__(
@@ -74,11 +82,12 @@ class Sweep:
         *,
         wide: bool,
         cov_at: np.ndarray | None = None,
+        remember: bool = False,
     ) -> None:
         self.model, self.data, self.wide, self._short = model, data, wide, cov_at is None
         self._wanted = np.array([] if cov_at is None else cov_at, dtype=int)
         self._call = Caller(block, copy=False)
-        self._length = block_length(model)
+        self._length, self._remember = block_length(model), remember
         self._call.inputs[-1].ravel(order="K")[:] = np.ravel(p)
         missing = np.isnan(data.y)
         self._y = np.where(missing, 0.0, data.y)
@@ -94,7 +103,7 @@ class Sweep:
     ) -> Piece | None:
         """Filter samples from start up to stop; None where that needs a closer look.
 
-        What the last call has done from the same start is not done again.
+        What the last call has done from the same start is not done again, if it is remembered.
 
         Args:
             start, stop: numbers of samples.
@@ -110,53 +119,57 @@ class Sweep:
         here = self._wanted[(self._wanted >= start) & (self._wanted < stop)] - start
         some, ends = np.empty((here.size, nx, nx)), []
         call, first = self._call, 3 if self._short else 2
+        given, made = call.inputs[:first], call.outputs
+        m_f, P_f, *rest = made[first : first + 5]
         rows = packed_diagonal(nx)
-        call.inputs[0][:], call.inputs[1][:] = belief.mean, belief.cov
+        given[0][:], given[1][:] = belief.mean, belief.cov
         starts: list[tuple[np.ndarray, ...]] = []
-        done = 0
+        done = judged = 0
         if self._last is not None and self._last[0] is belief and self._last[1] == start:
             # the same beginning: at the last block that is the same
             _, _, before, known = self._last
             block = min((n - 1) // length, len(before) - 1)
-            done, starts = block * length, before[:block]
+            done = judged = block * length
+            starts = before[:block]
             for target, source in zip((mean, var, nu, S, stats), known[:5], strict=True):
                 target[:, :done] = source[:, :done]
             some[here < done] = known.some[: int((here < done).sum())]
-            for given, own in zip(call.inputs[:first], before[block], strict=True):
-                given[:] = own
+            _copy(before[block], given)
         for at in range(done, n, length):
             r = slice(at, min(at + length, n))
             self._fill(start + r.start, start + r.stop, more if r.stop == n else 0)
-            starts.append(tuple(a.copy() for a in call.inputs[:first]))
+            if self._remember:
+                starts.append(tuple(a.copy() for a in given))
             call.evaluate()
-            m_f, P_f, *rest = call.outputs[first : first + 5]
             k = r.stop - r.start
             mean[:, r] = m_f[:, :k]
             var[:, r] = (P_f if self._short else P_f[rows])[:, :k]
             for target, source in zip((nu, S, stats), rest, strict=True):
                 target[:, r] = source[:, :k]
-            inside = (here >= r.start) & (here < r.stop)
-            if inside.any():
+            inside = slice(*np.searchsorted(here, (r.start, r.stop)))
+            if inside.stop > inside.start:
                 some[inside] = unpacked(P_f[:, here[inside] - r.start], nx)
             if at // length % (4 * BLOCK // length) == 0:
-                ends.append(call.outputs[1].copy())
+                ends.append(made[1].reshape(nx, nx).copy())
+            if at == 0 or at // length % _LOOK == 0 or r.stop == n:
+                if not self._good(start, slice(judged, r.stop), (mean, var, S, stats), ends):
+                    return None
+                judged, ends = r.stop, []
             if r.stop < n:
-                for given, made in zip(call.inputs[:first], call.outputs, strict=False):
-                    given[:] = made
+                _copy(made, given)
             if progress is not None:
                 progress(r.stop, n)
-        if not self._good(slice(start, stop), mean, var, S, stats, ends):
-            return None
-        at_last = k - 1
-        last = call.outputs[2] if self._short else unpacked(P_f[:, [at_last]], nx)[0]
+        # of a short block the covariance of the last sample, which may be the one more
+        last = made[2].reshape(nx, nx).copy() if self._short else unpacked(P_f[:, [k - 1]], nx)[0]
         ahead = None
         if more:
-            there = call.outputs[2] if self._short else unpacked(P_f[:, [k]], nx)[0]
-            ahead = Belief(self.model.x, m_f[:, k].copy(), there.copy())
+            there = last if self._short else unpacked(P_f[:, [k]], nx)[0]
+            ahead = Belief.found(self.model.x, m_f[:, k].copy(), there)
         elif stop < K:
-            ahead = Belief(self.model.x, call.outputs[0].ravel().copy(), call.outputs[1].copy())
-        piece = Piece(mean, var, nu, S, stats, some, last.copy(), ahead)
-        self._last = belief, start, starts, piece
+            ahead = Belief.found(self.model.x, made[0].copy(), made[1].reshape(nx, nx).copy())
+        piece = Piece(mean, var, nu, S, stats, some, last, ahead)
+        if self._remember:
+            self._last = belief, start, starts, piece
         return piece
 
     def _fill(self, start: int, stop: int, more: int) -> None:
@@ -171,18 +184,15 @@ class Sweep:
             u[:, n], R[:, n], dt[:, n] = self.data.u[:, stop], -1.0, self._dt[stop]
 
     def _good(
-        self,
-        part: slice,
-        mean: np.ndarray,
-        var: np.ndarray,
-        S: np.ndarray,
-        stats: np.ndarray,
-        ends: list[np.ndarray],
+        self, start: int, part: slice, made: Sequence[np.ndarray], ends: list[np.ndarray]
     ) -> bool:
+        """Whether some samples, counted from a start, are to be believed as they are."""
+        mean, var, S, stats = (a[:, part] for a in made)
         if not ((stats[0] <= CHECK_TOL).all() and (var >= 0).all() and np.isfinite(mean).all()):
             return False
         if not self.wide:
             return True
-        if not (WIDE * np.abs(self._R[:, part]) >= S).all():
+        R = self._R[:, start + part.start : start + part.stop]
+        if not (WIDE * np.abs(R) >= S).all():
             return False
-        return not any(narrow(P) for P in ends)
+        return not ends or not narrow_ones(np.array(ends)).any()

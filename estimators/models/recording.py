@@ -161,10 +161,18 @@ class Recording:
                 f"the recording has {got[0]}, {got[1]} and {got[2]}"
             )
 
-    def part(self, start: int, stop: int) -> Recording:
-        """Return the instants start <= k < stop."""
-        s = slice(start, stop)
-        return Recording(self.t[s], self.u[:, s], self.y[:, s], self.variance[:, s], self.p)
+    def part(self, start: int, stop: int, p: np.ndarray | None = None) -> Recording:
+        """Return the instants start <= k < stop; with other known parameters, if they are given."""
+        made, s = object.__new__(type(self)), slice(start, stop)
+        p = self.p if p is None else p
+        if not 0 <= start < stop <= self.size or not np.isfinite(p).all():  # told as always
+            return Recording(self.t[s], self.u[:, s], self.y[:, s], self.variance[:, s], p)
+        # checked already
+        made.__dict__.update(
+            {n: getattr(self, n)[..., s].copy() for n in ("t", "u", "y", "variance")}
+        )
+        made.__dict__["p"] = p.copy()
+        return made
 
 
 def _stamped(name: str, data: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -287,10 +287,10 @@ class _Filters:
         """Beliefs of a filter with severities, from an instant on, up to one."""
         of = self.of(phases)
         own = {n: v[self.measured["t"] >= begin - 1e-9] for n, v in self.measured.items()}
-        part = base.part(*np.searchsorted(base.t, [begin - 1e-9, end + 1e-9]))
-        u = part.u.copy()
+        i, j = np.searchsorted(base.t, [begin - 1e-9, end + 1e-9]).tolist()
+        data = base.part(i, j, of.model.p.pack({}))
+        u = data.u
         u[of.model.u.index("dt_last"), 0] = 0.0
-        data = dataclasses.replace(part, u=u, p=of.model.p.pack({}))
         starts = np.flatnonzero(u[of.model.u.index("keep")] == 0.0)
         r, resets = track(
             of,

@@ -178,7 +178,7 @@ def _sweep(
     """Return the filter over parts of the recording, each of which begins where one has ended."""
     m = made.model
     free = not (np.isfinite(m.lower).any() or np.isfinite(m.upper).any())
-    return sweep_of(made, prior, data, cov_at, backend) if free else None
+    return sweep_of(made, prior, data, cov_at, backend, remember=True) if free else None
 
 
 def _filtered(
