@@ -235,6 +235,7 @@ class Course(Generic[F]):
                 f"{self.ss.name}: load or fault change by {jump:.1e} of the transition matrices "
                 f"in a step, {fast.smooth:g} at most"
             )
+        fast.expect(jump)
         spike = self._spike(pieces, s, float(first))
         if spike > fast.spike:
             raise NotApplicable(

@@ -256,6 +256,7 @@ class Machines:
         if self._wide is None or self._wide[0] != layouts:
             links = [g.link for g in self.groups]
             self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
+        self._wide[1].machines = fast  # of the same layouts, with what is expected of them now
         severity: list[list[np.ndarray]] = [[] for _ in self.groups]
 
         def held() -> Iterator[list[Any]]:
