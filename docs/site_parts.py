@@ -10,6 +10,7 @@ from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
+from apu_casadi.core import files
 from scenarios import cli
 from scenarios.fileschema import file_schema
 
@@ -99,9 +100,8 @@ def write_pages(app: Sphinx) -> None:
             path.unlink()
     for name, text in pages.items():
         path = MADE / name
-        path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+            files.write_text(path, text)
 
 
 def lead(app: Sphinx, name: str, source: list[str]) -> None:

@@ -16,6 +16,7 @@ from apu_casadi.core.profiles.points import FILE_KEYS as FILE_KEYS_OF_POINTS
 from apu_casadi.core.profiles.points import OfPoints
 from apu_casadi.core.profiles.profile import PROFILES
 from apu_casadi.core.register import Key
+from apu_casadi.core.tables.tablelayout import DECIMALS
 from apu_casadi.core.units import ALL_UNITS
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH_FACTORS
@@ -182,7 +183,7 @@ def _profile() -> Table:
     for kind, cls in PROFILES.items():
         ways = [{k.name: _key(k) for k in cls.keys}]
         if issubclass(cls, OfPoints):
-            ways = [{"times": numbers, "values": numbers}, dict.fromkeys(FILE_KEYS_OF_POINTS, text)]
+            ways = [{"times": numbers, "values": numbers}, _of_files(text)]
         told = cls.told_by(dict.fromkeys((*ways[0], "file")))
         for own in ways:
             needed = [k.name for k in cls.keys if k.default is ... and k.name in own]
@@ -191,6 +192,12 @@ def _profile() -> Table:
             words = (cls.__doc__ or kind).split("\n")[0]
             each.append(_object({"kind": {"const": kind}, **own}, required, description=words))
     return {"anyOf": each}
+
+
+def _of_files(text: Table) -> Table:
+    cell = {"type": ["number", "string"]}
+    own = {"decimal": {"enum": list(DECIMALS)}, "missing": {"type": "array", "items": cell}}
+    return dict.fromkeys(FILE_KEYS_OF_POINTS, text) | own
 
 
 def _load() -> Table:

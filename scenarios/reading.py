@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import ApuError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import Profile, Varying, profile_from_table
+from apu_casadi.core.units import split_unit, unit_of
+from apu_casadi.gaspath.conditions import CONDITIONS
+from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.faults.fault import FAULTS, Fault, fault_from_table, fault_of
 from apu_casadi.machine.loads.load import LOADS, Load, load_from_table, load_of
 from apu_casadi.unit.events import MOST
@@ -122,7 +125,21 @@ def read_profile(value: Any, place: str, folder: str = "") -> Any:
     if not isinstance(value, Mapping):
         return value
     with inside(place):
-        return profile_from_table(value, place, folder)
+        return profile_from_table(value, place, folder, _unit(place))
+
+
+def _unit(key: str) -> str:
+    """Return the unit of a key of a scenario file: of the day, of loads and faults; "" if none."""
+    own = split_unit(key, lambda name: name != key)
+    if own is not None:  # power_kW, N_ref_rpm
+        return own[1]
+    if key in CONDITIONS:
+        return CONDITIONS[key].unit
+    if key in HEALTH:
+        return "1"
+    loads = (k for c in LOADS.classes for keys in c.tables.values() for k in keys)
+    every = (*loads, *(k for c in FAULTS.classes for k in c.keys))
+    return next((k.unit for k in every if k.name == key and unit_of(k.unit)), "")
 
 
 def files_seen_from(folder: Path, value: Any) -> Any:

@@ -72,11 +72,12 @@ def list_scenarios() -> list[Scenario]:
     return sorted(_library().values(), key=lambda s: (s.name != "joint", s.name))
 
 
-def get(name_or_path: str | os.PathLike[str]) -> Scenario:
+def get(name_or_path: str | os.PathLike[str], **instead: Any) -> Scenario:
     """Return a scenario of the library, or read a ``.toml`` or ``.py`` file.
 
     Something is taken as a file if it ends in ``.toml`` or ``.py`` or has a folder in it.  A Python
-    file is executed: run only what you trust.
+    file is executed: run only what you trust.  ``instead`` are attributes that go before those of
+    the file, such as ``engine``: a fault of its third generator is none of the default unit.
 
     Raises:
         ScenarioError: unknown name (the nearest is named), missing file, wrong key or value.
@@ -88,13 +89,13 @@ def get(name_or_path: str | os.PathLike[str]) -> Scenario:
     path = Path(text)
     if path.suffix in (".py", ".toml"):
         read = Scenario.from_python if path.suffix == ".py" else Scenario.from_toml
-        s = read(path)
+        s = read(path, instead)
         for words in implausible(s):
             warnings.warn(ApuWarning(f"{path}: {words}"), stacklevel=2)
         return s
     library = _library()
     if text in library:
-        return library[text]
+        return library[text].change(**instead)
     if path.name != text or path.exists():
         raise ScenarioError(f"{text}: a scenario file ends in .toml or .py")
     raise ScenarioError(f"unknown scenario {text!r} {nearest(text, library)}")
@@ -127,7 +128,8 @@ def run(
         ScenarioError, ParameterError: a wrong description; OperatingPointError, SimulationError :
             the unit cannot run so; DataError : ``out`` cannot be written.
     """
-    s = scenario if isinstance(scenario, Scenario) else get(scenario)
+    unit = {n: v for n, v in overrides.items() if n in ("engine", "governor")}
+    s = scenario if isinstance(scenario, Scenario) else get(scenario, **unit)
     if overrides:
         s = s.change(**overrides)
     if out is not None:

@@ -261,7 +261,12 @@ class Scenario(Plain):
 
     @classmethod
     def from_dict(
-        cls, data: Any, source: str = "", *, folder: str | os.PathLike[str] | None = None
+        cls,
+        data: Any,
+        source: str = "",
+        *,
+        folder: str | os.PathLike[str] | None = None,
+        instead: Mapping[str, Any] = MappingProxyType({}),
     ) -> Self:
         """Make a scenario from nested tables, as a TOML file gives them.
 
@@ -269,6 +274,7 @@ class Scenario(Plain):
             data: the tables.
             source: name of the file, for messages.
             folder: from which the files that it names are seen; the current one if not given.
+            instead: attributes that go before the tables': another engine, another governor.
 
         Raises:
             ScenarioError: with the file, the place in it, and the nearest valid name.
@@ -284,13 +290,15 @@ class Scenario(Plain):
                 made["waveform_dt"] = None
             if folder is not None:
                 _seen_from(Path(folder), made)
-            return cls(**made)
+            return cls(**made | dict(instead))
         except ScenarioError as e:
             raise ScenarioError(f"{source}: {e}" if source else str(e)) from None
 
     @classmethod
-    def from_toml(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a TOML file.
+    def from_toml(
+        cls, path: str | os.PathLike[str], instead: Mapping[str, Any] = MappingProxyType({})
+    ) -> Self:
+        """Read a TOML file; ``instead`` as in :meth:`from_dict`.
 
         Raises:
             ScenarioError: no such file, no TOML (with line and column), or a wrong key or value.
@@ -299,16 +307,22 @@ class Scenario(Plain):
             text = files.read_text(path, "scenario file", LARGEST_FILE)
         except DataError as e:
             raise ScenarioError(str(e)) from None
-        return cls.from_toml_text(text, os.fspath(path), folder=Path(path).parent)
+        folder = Path(path).parent
+        return cls.from_toml_text(text, os.fspath(path), folder=folder, instead=instead)
 
     @classmethod
     def from_toml_text(
-        cls, text: str, source: str = "", *, folder: str | os.PathLike[str] | None = None
+        cls,
+        text: str,
+        source: str = "",
+        *,
+        folder: str | os.PathLike[str] | None = None,
+        instead: Mapping[str, Any] = MappingProxyType({}),
     ) -> Self:
         """Read TOML text; arguments as :meth:`from_dict`, errors as :meth:`from_toml`."""
         try:
             data = tomllib.loads(text)
-            return cls.from_dict(data, source, folder=folder)
+            return cls.from_dict(data, source, folder=folder, instead=instead)
         except RecursionError:
             raise ScenarioError(f"{source or 'TOML'}: nested too deeply to be a scenario") from None
         except ScenarioError:
@@ -317,7 +331,9 @@ class Scenario(Plain):
             raise ScenarioError(f"{source or 'TOML'}: not valid TOML: {e}") from None
 
     @classmethod
-    def from_python(cls, path: str | os.PathLike[str]) -> Scenario:
+    def from_python(
+        cls, path: str | os.PathLike[str], instead: Mapping[str, Any] = MappingProxyType({})
+    ) -> Scenario:
         """Run a Python file that defines ``scenario``, a :class:`Scenario` or its tables.
 
         The file is executed with your rights, like any program: run only what you trust.
@@ -327,9 +343,9 @@ class Scenario(Plain):
         """
         found = extensions.execute(path, "__scenario__", "scenario file").get("scenario")
         if isinstance(found, Scenario):
-            return found
+            return found.change(**instead)
         if isinstance(found, Mapping):
-            return cls.from_dict(found, str(path), folder=Path(path).parent)
+            return cls.from_dict(found, str(path), folder=Path(path).parent, instead=instead)
         what = "defines no 'scenario'" if found is None else f"'scenario' is {found!r}"
         raise ScenarioError(f"{path}: {what}; a Scenario or a dictionary is expected")
 

@@ -173,13 +173,20 @@ def test_points_file(gg, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "first line must be point,role,name,value,sigma"),
+        ("", "p.csv: empty"),
+        ("point,role,name,value\na,fixed,N,1\n", "first line must be point,role,name,value,sigma"),
         ("point,role,name,value,sigma\n", "no points"),
         ("point,role,name,value,sigma\na,fixt,N,1,", "line 2: role 'fixt' .did you mean 'fixed'"),
-        ("point,role,name,value,sigma\na,fixed,N,x,", "line 2: N: 'x' is not a number"),
+        (
+            "point,role,name,value,sigma\na,fixed,N,x,",
+            "line 2, column value: 'x' is no number",
+        ),
         ("point,role,name,value,sigma\na,measured,T3,500,", "line 2: T3: a standard deviation"),
         ("point,role,name,value,sigma\n# c\na,fixed,N,1,\na,fixed,N,2,", "line 4: N: given twice"),
-        ("point,role,name,value,sigma\na,fixed,N,1,,9", "line 2: 6 columns"),
+        (
+            "point,role,name,value,sigma\na,fixed,N,1,,9",
+            "line 2: 6 cells, but 5 columns are",
+        ),
     ],
 )
 def test_bad_files_are_refused_by_line(tmp_path, text, message):

@@ -180,3 +180,36 @@ def test_failed_simulation_is_status_1_and_interrupt_130(fake, capsys, monkeypat
     monkeypatch.setattr(registry, "_simulate", interrupted)
     assert cli.main(["run", "joint"]) == 130
     assert "interrupted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "figures", "left"),
+    [
+        (["--figures", "run.csv"], "png", ["run.csv"]),
+        (["--figures", "svg", "run.csv"], "svg", ["run.csv"]),
+        (["--figures", "png,pdf", "run.csv"], "png,pdf", ["run.csv"]),
+        (["run.csv", "--figures"], "png", ["run.csv"]),
+        (["--figures", "folder/png.csv", "b.csv"], "png", ["folder/png.csv", "b.csv"]),
+        (["--figures", "--", "run.csv"], "png", ["run.csv"]),
+        (["--figures", "pgn", "run.csv"], "pgn", ["run.csv"]),
+        (["--", "--figures", "run.csv"], "png", ["--figures", "run.csv"]),
+    ],
+)
+def test_an_option_with_an_optional_value_takes_no_file_name(words, figures, left):
+    args = cli.parser().parse_args(["estimate", "data", *words])
+    assert (args.figures, args.files) == (figures, left)
+
+
+def test_every_optional_value_names_its_words():
+    """Else the option would swallow the name of a file that follows it."""
+
+    def parsers(p):
+        yield p
+        for a in p._actions:
+            for q in getattr(a, "choices", None) or ():
+                if isinstance(a.choices, dict):
+                    yield from parsers(a.choices[q])
+
+    options = [a for p in parsers(cli.parser()) for a in p._actions if a.option_strings]
+    asked = [a for a in options if a.nargs in ("?", "*")]
+    assert asked and all(getattr(a, "words", ()) for a in asked)

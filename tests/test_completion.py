@@ -96,3 +96,7 @@ def test_validation_fits_the_terminal():
         lines = validate.table(rows, width).splitlines()
         assert max(map(len, lines)) <= width
         assert " ".join(" ".join(lines).split()).count("of many words") == 6
+    numbers = (221.8215, 221.82, 1e-5, 1e-4)
+    rows.append(Row("mean of 15 rows that are", "kg/(kW.h)", *numbers, "w", "check"))
+    lines = validate.table(rows, 80).splitlines()
+    assert max(map(len, lines)) <= 80 and "check, tolerance 1e-04: w" in lines[-1]

@@ -203,7 +203,10 @@ def test_scores_against_numbers_by_hand(tmp_path):
         (lambda rows: [*rows, {"run": 9, "class": "ttsc"}], "1 runs are not in the data set: 9"),
         (lambda rows: [{**r, "class": "tstc"} for r in rows], r"'tstc' \(did you mean 'ttsc'"),
         (lambda rows: [{**r, "hh": 1} for r in rows], r"column 'hh' \(did you mean 'h'"),
-        (lambda rows: [{**r, "h": "big"} for r in rows], "line 2: h = 'big' is no number"),
+        (
+            lambda rows: [{**r, "h": "big"} for r in rows],
+            "line 2, column h: 'big' is no number: leave",
+        ),
         (lambda rows: [{"run": r["run"]} for r in rows], "column class is missing"),
         (
             lambda rows: [{**r, "class": float("nan")} for r in rows],
@@ -211,13 +214,13 @@ def test_scores_against_numbers_by_hand(tmp_path):
         ),
         (lambda rows: [{**r, "run": -1} for r in rows], "run '-1' is no whole number"),
         (lambda rows: [{**r, "run": r["run"] + 0.5} for r in rows], "'0.5' is no whole number"),
-        (lambda rows: [{**r, "h": "inf"} for r in rows], "line 2: h = 'inf' is no finite number"),
+        (lambda rows: [{**r, "h": "inf"} for r in rows], "line 2, column h: 'inf' is no number"),
         (lambda rows: [{**r, "score": "NaN"} for r in rows], "score = 'NaN' is no finite number"),
         (lambda rows: [{**r, "h": 0, "h_sigma": -1} for r in rows], "h_sigma = '-1' must be > 0"),
         (lambda rows: [{**r, "h_sigma": 1} for r in rows], "column h is missing for h_sigma"),
         (lambda rows: [{**r, "generator": 1.5} for r in rows], "generator '1.5' is no whole"),
         (lambda rows: [{**r, "phase": "d"} for r in rows], "phase 'd': a, b, c or nothing"),
-        (lambda rows: [], "column run is missing"),
+        (lambda rows: [], "p.csv: empty"),
     ],
 )
 def test_predictions_that_do_not_fit_are_refused(tmp_path, change, words):

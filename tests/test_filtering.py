@@ -15,6 +15,7 @@ from apu_casadi.core.errors import DataError, EstimationError, SignalError
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import BLOCK, STEP_OUT, run
+from estimators.filters.resuming import Runs
 from estimators.filters.ukf import ukf_step
 
 STEPS = {"ekf": ekf_step, "ukf": ukf_step}
@@ -52,6 +53,35 @@ def test_blocks_are_the_step_sample_by_sample(name, K):
         assert_allclose(getattr(short, field), getattr(r, field), rtol=1e-13, err_msg=field)
     assert_allclose(short.final.cov, r.final.cov, rtol=1e-13)
     assert short.cov is None and short.cross is None and short.innovation_cov is None
+
+
+@pytest.mark.parametrize("at", [0, 7, 30])
+def test_recordings_that_begin_alike_are_run_from_where_they_differ(at, monkeypatch):
+    """Bit for bit what a run from the beginning says; the common part is not run again."""
+    model = cv_model()
+    prior, data = random_belief(1, model), gappy(1, model, 31)
+    data.y[0, at], data.variance[0, at] = 0.3, 0.1
+    y = data.y.copy()
+    y[0, at] += 1.0
+    other = dataclasses.replace(data, y=y)
+    step, sizes = ekf_step(model), []
+
+    def counted(step, prior, data, **how):
+        sizes.append(data.size)
+        return run(step, prior, data, **how)
+
+    monkeypatch.setattr("estimators.filters.resuming.run", counted)
+    runs = Runs(step, prior, "vm")
+    runs(data)
+    made, whole = runs(other), run(step, prior, other, full=True, backend="vm")
+    assert runs(data) is not made and sizes == [31, 31 - at]
+    for f in dataclasses.fields(made):
+        got, want = getattr(made, f.name), getattr(whole, f.name)
+        if isinstance(want, np.ndarray):
+            np.testing.assert_array_equal(got, want, f.name)
+    assert_allclose(made.loglik, whole.loglik, rtol=1e-12)
+    np.testing.assert_array_equal(made.final.cov, whole.final.cov)
+    np.testing.assert_array_equal(made.again().mean, whole.again().mean)
 
 
 @every_step

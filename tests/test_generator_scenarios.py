@@ -227,3 +227,24 @@ def test_random_faults_stay_in_their_generator():
     assert all(len(f) == 1 and f[0].generator == 2 for f in faults)
     plain = random_faults(3, seed=1, base="joint")
     assert [f[0].fault for f in faults] == [s.phases[3].fault for s in plain]
+
+
+def test_a_file_may_be_of_the_unit_that_is_named_beside_it(tmp_path):
+    """A fault of the fourth generator, where --engine has four; none of the default unit's two."""
+    (tmp_path / "four.toml").write_text("[generator]\ncount = 4\n")
+    (tmp_path / "s.toml").write_text(
+        'name = "s"\nduration = 0.1\n[[phase]]\nname = "p"\nstart = 0.0\n'
+        'load = { kind = "R", power_kW = 50.0 }\n'
+        'fault = { generator = 4, mu = 0.05, k_rf = 20.0, phase = "b" }\n'
+    )
+    (tmp_path / "s.py").write_text(
+        "import tomllib, pathlib\n"
+        "scenario = tomllib.loads((pathlib.Path(__file__).parent / 's.toml').read_text())\n"
+    )
+    engine = str(tmp_path / "four.toml")
+    for name in ("s.toml", "s.py"):
+        s = registry.get(tmp_path / name, engine=engine)
+        assert len(registry.unit_for(s).machines) == 4
+        with pytest.raises(ScenarioError, match="generator 4, but the unit has 1 to 2"):
+            registry.get(tmp_path / name)
+    assert registry.get("quiet", engine=engine).engine == engine

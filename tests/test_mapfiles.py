@@ -234,9 +234,9 @@ def without(*which: int):
         (replaced(3, "beta", "Beta"), DataError, r"line 3: column beta missing.*'Beta'.*'beta'"),
         (replaced(3, "PR,", ""), DataError, "line 3: column PR missing"),
         (replaced(3, ",eta", ",eta,x"), DataError, "line 3: the header must hold"),
-        (replaced(6, "0.5,", "half,"), DataError, "line 6, column N: a number .*, got 'half'"),
-        (replaced(6, "0.5,", ",0.5,"), DataError, "line 6: 5 values expected .*, got 6"),
-        (replaced(6, "0.5,", "nan,"), DataError, "line 6, column N: 'nan' is not finite"),
+        (replaced(6, "0.5,", "half,"), DataError, "line 6, column N: 'half' is no number"),
+        (replaced(6, "0.5,", ",0.5,"), DataError, "line 6: 6 cells, but 5 columns .* too many"),
+        (replaced(6, "0.5,", "nan,"), DataError, "line 6, column N: no number .*fill the cell"),
         (replaced(9, "0.5,1.2,", "0.5,1.2,-"), MapError, "line 9, column W: -.*must be > 0"),
         (replaced(9, ",0.7", ",1.7"), MapError, r"line 9, column eta: 1.7.*in \(0, 1\]"),
         (replaced(9, ",1.93", ",0.93"), MapError, "line 9, column PR: 0.93.*must be > 1"),
@@ -250,9 +250,6 @@ def without(*which: int):
         (replaced(36, "3.0", "0.9"), MapError, "line 36, column W_surge: 0.9 does not rise"),
         (replaced(34, "PR_surge", "PR"), DataError, "line 34: column PR_surge missing"),
         (lambda lines: lines[:3], DataError, "no map rows"),
-        (lambda lines: [t.replace(",", ";") for t in lines], DataError, "line 3: .*not semicolons"),
-        (lambda lines: [t.replace(",", "\t") for t in lines], DataError, "line 3: .*not tabs"),
-        (lambda lines: [*lines[:2], "sep=,", *lines[2:]], DataError, "line 3: delete this line"),
         (lambda lines: ["# kind: turbine", "hello"], DataError, "neither a CSV map"),
         (lambda lines: [""], DataError, "file is empty"),
         (lambda t: [*t[:1], "# N_ref: one", *t[1:]], DataError, "line 2, N_ref: a number"),
@@ -318,7 +315,7 @@ def test_numbers_are_written_plainly(write, cell):
     """float() would take an underscore and digits of other scripts."""
     lines = csv_lines()
     lines[3] = lines[3].replace(f"{W[0, 0]:.6f}", cell)
-    with pytest.raises(DataError, match="line 4, column W: a number expected"):
+    with pytest.raises(DataError, match=r"line 4, column W: .* is no number: correct it"):
         read_map(write(lines))
 
 
@@ -326,7 +323,7 @@ def test_an_overlong_cell_is_no_traceback(write):
     """The csv module refuses cells beyond 128 KiB with an error of its own."""
     lines = csv_lines()
     lines[5] = "1" * 200_000
-    with pytest.raises(DataError, match="line 6: no row of numbers"):
+    with pytest.raises(DataError, match="line 6: no CSV file: field larger"):
         read_map(write(lines))
 
 

@@ -181,7 +181,7 @@ def test_damaged_netcdf(tmp_path):
 
 def test_parquet_names_what_to_install(tmp_path, monkeypatch):
     """Without an engine nothing is guessed."""
-    import estimators.apu.recordings.binaryfiles as module
+    import apu_casadi.core.tables.binaryfiles as module
 
     path = tmp_path / "run.parquet"
     path.write_bytes(b"PAR1")

@@ -554,10 +554,10 @@ def test_calibration_points_have_the_same_ranges(tmp_path, capsys):
     start = "point,role,name,value,sigma\nA,fixed,N,3775.1,\nA,fixed,PW,4e5,\n"
     for line, words in (
         ("A,measured,P3,802,1\n", "point 'A': P3 = 802 Pa is not plausible (40000 to 2e+06)"),
-        ("A,measured,P3,nan,1\n", "line 4: P3: 'nan' is not a number"),
-        ("A,measured,P3,8_0,1\n", "line 4: P3: '8_0' is not a number"),
-        ("A,measured,P3,8e5," + "1" * 200_000 + "\n", "line 4: no line of a CSV"),
-        ('A,measured,P3,"8e5,1\nA,measured,T3,560,1\n', "line 4: no line of a CSV"),
+        ("A,measured,P3,nan,1\n", "line 4: P3: no number stands there"),
+        ("A,measured,P3,8_0,1\n", "line 4, column value: '8_0' is no number"),
+        ("A,measured,P3,8e5," + "1" * 200_000 + "\n", "line 4: no CSV file: field"),
+        ('A,measured,P3,"8e5,1\nA,measured,T3,560,1\n', "a quoted cell runs over several"),
         ("A,measured,P3,8e5,-1\n", "points.csv: A: measured P3"),
     ):
         path.write_text(start + line, encoding="utf-8")

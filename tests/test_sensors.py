@@ -161,23 +161,25 @@ def test_a_power_that_lags_is_followed_through_a_load_drop(drop, tmp_path):
 @pytest.mark.long
 def test_a_lagging_sensor_is_followed_through_a_load_drop(drop):
     """The filter is consistent; one that takes the thermocouple for instantaneous is not."""
-    late, instant = ([], [])
+    late, instant, errors = ([], [], [])
     quick = dataclasses.replace(THERMOCOUPLE, tau=0.0)
     plain = GAS_PATH.add(quick)
     filters = [gas_path_filter(GG, s, gains=False, inertia=None) for s in (WITH_TC, plain)]
-    for seed in range(8):
+    t, rows = samples(drop)
+    true = respond(drop["time"].values, drop["T41"].values, THERMOCOUPLE.tau)[rows]
+    for seed in range(3):
         data = filters[0].recording(drop, seed)
         r = filters[0].run(data)
         late.append(r.nis[25:].mean())
+        mean, sigma = r["T41_tc"]
+        errors.append(((mean - true) / sigma)[25:])
         believed = filters[1].recording(drop, seed)
         i = believed.y.shape[0] - 1
         believed.y[i] = data.y[i]
         instant.append(filters[1].run(believed).nis[25:].mean())
-    t, rows = samples(drop)
-    true = respond(drop["time"].values, drop["T41"].values, THERMOCOUPLE.tau)[rows]
-    mean, sigma = r["T41_tc"]
-    assert np.sqrt(np.mean(((mean - true) / sigma)[25:] ** 2)) < 1.3
-    low, high = band(8 * (t.size - 25), 5, 0.999)
+    # an error lasts for seconds, so a run has few independent ones: up to 1.7 in one, 1.00 in 20
+    assert np.sqrt(np.mean(np.square(errors))) < 1.3
+    low, high = band(3 * (t.size - 25), 5, 0.999)
     assert low < np.mean(late) < high
     assert np.mean(instant) > 1.5 * high
     # tau dx/dt = v - x, summed: the area between gas and thermocouple is tau times the fall

@@ -6,13 +6,14 @@ file, flushed to the disk, then renamed.  A full disk, a kill or Ctrl-C leave th
 
 from __future__ import annotations
 
-import codecs
 import contextlib
 import errno
 import itertools
 import os
+import shutil
 import stat
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -144,32 +145,6 @@ def read_text(path: str | os.PathLike[str], what: str = "", limit: int = 1 << 28
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def table_text(raw: bytes, path: str | os.PathLike[str]) -> str:
-    """Return the text of a table as programs save it: UTF-8, UTF-16 with its mark, or Windows-1252.
-
-    Raises:
-        DataError: damaged UTF-16.
-    """
-    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    try:
-        text = raw.decode("utf-16" if wide else "utf-8-sig")
-    except UnicodeDecodeError as e:
-        if wide:
-            raise DataError(f"{path}: damaged UTF-16 text (byte {e.start})") from None
-        text = raw.decode("cp1252", errors="replace")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def no_commas(cells: Sequence[str]) -> str:
-    """Return why the first row of a table is no cells with commas between; "" where it is."""
-    if cells[0].strip('"').lower().startswith("sep="):
-        return "delete this line, and put commas between the cells if there are others"
-    signs = {";": "semicolons", "\t": "tabs", "|": "bars"}
-    other = next((w for s, w in signs.items() if len(cells) == 1 and s in cells[0]), "")
-    remedy = "; save the table again so, and numbers with points, not decimal commas"
-    return f"cells must be separated by commas, not {other}{remedy}" if other else ""
-
-
 @contextlib.contextmanager
 def whole(
     path: str | os.PathLike[str], *, make_folder: bool = True, refusal: str = "cannot be written"
@@ -209,7 +184,7 @@ def whole(
                 os.chmod(target, stat.S_IMODE(mode))
             os.replace(target, real)
     except OSError as e:
-        raise DataError(f"{path}: {refusal}: {reason(e)}") from None
+        raise DataError(f"{path}: {refusal}: {reason(e)}{_amounts(e, target)}") from None
     finally:
         if not device:
             with contextlib.suppress(OSError):
@@ -217,6 +192,17 @@ def whole(
             PARTIAL.discard(str(target))
     if _account:
         WRITTEN[str(path)] = None
+
+
+def _amounts(e: OSError, target: Path) -> str:
+    """Return how much was written and is free, where there was no room; "" elsewhere."""
+    if e.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return ""
+    try:
+        written, free = target.stat().st_size, shutil.disk_usage(target.parent).free
+    except OSError:
+        return ""
+    return f" ({written} bytes of it were written, {free} bytes are free there)"
 
 
 def _mode(real: Path) -> int | None:
@@ -245,6 +231,23 @@ def write_text(
         # a name from the system that is no UTF-8 stands in the text as \udc.., not as an error
         target.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
     return Path(path)
+
+
+@contextlib.contextmanager
+def work_folder() -> Iterator[Path]:
+    """Yield a folder of the system's for what is needed in between; it goes with the block.
+
+    Raises:
+        DataError: there is no room for it; says where it is.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as made:
+            yield Path(made)
+    except OSError as e:
+        raise DataError(
+            f"{tempfile.gettempdir()}: temporary files cannot be written: {reason(e)}; TMPDIR "
+            "names another place for them"
+        ) from None
 
 
 def save_figure(figure: Any, path: str | os.PathLike[str], **options: Any) -> Path:

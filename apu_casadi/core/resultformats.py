@@ -5,6 +5,7 @@ netCDF 3, exact and without further packages, is that of :func:`apu_casadi.core.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -74,13 +75,20 @@ def _netcdf4(ds: xr.Dataset, path: Path) -> list[Path]:
     told = cf.described(ds)
     if WAVEFORMS in ds.dims:
         told.attrs["precision"] = PRECISION
+    try:
+        h5netcdf: Any = import_module("h5netcdf")
+    except ImportError as e:
+        raise DataError(
+            f"{target}: netCDF 4 needs: pip install 'apu-casadi[netcdf4]' ({e})"
+        ) from None
+    from xarray.backends import H5NetCDFStore
+
+    # in memory first: HDF5 ends the process where a disk gets full
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as f:
+        told.dump_to_store(H5NetCDFStore(f), encoding=encoding)
     with files.whole(target) as part:
-        try:
-            told.to_netcdf(part, engine="h5netcdf", encoding=encoding)
-        except (ImportError, ValueError) as e:
-            raise DataError(
-                f"{target}: netCDF 4 needs: pip install 'apu-casadi[netcdf4]' ({e})"
-            ) from None
+        part.write_bytes(buffer.getbuffer())
     return [target]
 
 

@@ -1,12 +1,14 @@
 """Results in CSV, Parquet and MAT files as datasets again: what ``apu run --format`` wrote.
 
-Files of instruments are another matter: :mod:`estimators.apu.recordings`.
+CSV as a spreadsheet saved it again is read, too (:mod:`apu_casadi.core.tables.numbertable`); what
+instruments write needs more questions answered: :mod:`estimators.apu.recordings`.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +17,15 @@ import numpy as np
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.tables.numbertable import read_numbers
+from apu_casadi.core.tables.sentinels import sentinel
 from apu_casadi.core.units import header
 
 if TYPE_CHECKING:
     import xarray as xr
 
 WAVES = "time_w"
+_TIMES = ("time", "t", WAVES)
 
 
 def read(path: Path) -> xr.Dataset:
@@ -52,6 +57,11 @@ def _dataset(path: Path, columns: Mapping[str, Any], units: Mapping[str, str], d
             raise DataError(
                 f"{path}, column {name}: no numbers; a recording is read by read_recording"
             )
+        if a.dtype.kind == "f" and (code := sentinel(a, ordered=None)) is not None:
+            raise DataError(
+                f"{path}, column {name}, row {code + 1}: {a[code]:.9g} stands for no reading in "
+                "many files; read_recording with missing = ... reads such files"
+            )
         told = {"units": units[name]} if units.get(name) else {}
         made[name] = (dim, a.astype(float), told)
     return made.set_coords([dim])
@@ -59,26 +69,51 @@ def _dataset(path: Path, columns: Mapping[str, Any], units: Mapping[str, str], d
 
 def _table(path: Path) -> Any:
     pandas: Any = import_module("pandas")
-    raw = io.BytesIO(files.read_bytes(path))
+    text = files.read_bytes(path)
+    csv = path.suffix.lower() == ".csv"
+    if csv and text and not re.match(rb"\w+ \[s\](,[^,;\n\"]+ \[[^,;\n]*\])*\r?\n", text):
+        return _spreadsheet(path)
+    raw = io.BytesIO(text)
     try:
-        csv = path.suffix.lower() == ".csv"
         frame = pandas.read_csv(raw) if csv else pandas.read_parquet(raw)
     except ImportError as e:
         raise DataError(f"{path} needs: pip install 'apu-casadi[parquet]' ({e})") from None
     except Exception as e:  # damaged files fail with any type
         raise DataError(f"{path}: damaged ({type(e).__name__}: {e})") from None
+    if frame.index.name is not None:
+        frame = frame.reset_index()
     pairs = [header(str(c)) for c in frame]
     names = [n for n, _ in pairs]
-    dim = next((n for n in names if n in ("time", "t", WAVES)), None)
-    if dim is None or frame.empty:
+    dim = _time_of(path, [] if frame.empty else names)
+    columns = {n: frame.iloc[:, k].to_numpy() for k, n in enumerate(names)}
+    return _dataset(path, columns, {n: u or "" for n, u in pairs}, dim)
+
+
+def _time_of(path: Path, names: Sequence[str]) -> str:
+    dim = next((n for n in names if n in _TIMES), None)
+    if dim is None:
         raise DataError(
             f"{path}: no result of a run: a column 'time [s]' is expected; recordings of other "
             "forms are read by estimators.apu.recordings.measured.read_recording"
         )
     if len(set(names)) < len(names):
         raise DataError(f"{path}: two columns have one name")
-    columns = {n: frame.iloc[:, k].to_numpy() for k, n in enumerate(names)}
-    return _dataset(path, columns, {n: u or "" for n, u in pairs}, dim)
+    return dim
+
+
+def _spreadsheet(path: Path) -> Any:
+    """Read a CSV file that is not as it was written: semicolons, decimal commas, another coding."""
+    table = read_numbers(path, _TIMES.__contains__, what="result")
+    dim = _time_of(path, table.names if table.size else [])
+    units = {c.name: c.unit for c in table.columns}
+    units[dim] = "s"
+    own = {n: "s" if n == dim else u or "" for n, u in units.items()}
+    if words := [c for c in table.columns if c.problem and c.name != dim]:
+        raise DataError(
+            f"{path}, column {words[0].name}: no numbers; a recording is read by read_recording"
+        )
+    columns = {n: table.numbers(n, own[n], gaps=n != dim, codes=True) for n in table.names}
+    return _dataset(path, columns, units, dim)
 
 
 def _mat(path: Path) -> Any:

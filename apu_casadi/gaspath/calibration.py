@@ -33,6 +33,8 @@ from apu_casadi.core.errors import (
     SignalError,
     nearest,
 )
+from apu_casadi.core.tables.numbertable import read_numbers
+from apu_casadi.core.tables.tablelayout import TableLayout
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.maps.scaledmaps import MapCalibration
@@ -371,10 +373,17 @@ def _determined(J: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, float,
     return root @ root.T, condition, weak
 
 
-def read_points(path: str | Path) -> list[CalibrationPoint]:
-    """Read points from a CSV file with one quantity on each line.
+class _Layout(TableLayout):
+    """A row of an ambient or fixed quantity may end before its sigma."""
 
-    Columns ``point, role, name, value, sigma``; lines that begin with ``#`` are comments.  ``role``
+    pads_rows = True
+
+
+def read_points(path: str | Path) -> list[CalibrationPoint]:
+    """Read points from a file with one quantity on each line.
+
+    Columns ``point, role, name, value, sigma``; lines that begin with ``#`` are comments.  What
+    spreadsheets write is read (:mod:`apu_casadi.core.tables.numbertable`).  ``role``
     is ambient, health, fixed (two for each point) or measured; ``sigma``, the standard deviation,
     is for measured ones only.  SI units, names as in :attr:`GasGenerator.Y`::
 
@@ -388,33 +397,24 @@ def read_points(path: str | Path) -> list[CalibrationPoint]:
         DataError: no such file, a wrong header, or a line that cannot be read; says which.
         SignalError: a point with unknown names, or not two held quantities.
     """
-    path = Path(path)
-    text = files.read_text(path)
-    lines = [(k, x) for k, x in enumerate(text.split("\n"), 1) if x.strip() and x[0] != "#"]
-    rows = []
-    for k, x in lines:
-        try:
-            rows += list(csv.reader([x], strict=True))
-        except csv.Error as e:  # a quotation mark left open, a cell beyond csv's limit
-            raise DataError(f"{path}, line {k}: no line of a CSV file ({e})") from None
-    if not rows or tuple(c.strip() for c in rows[0]) != COLUMNS:
+    table = read_numbers(path, COLUMNS.__contains__, layout=_Layout())
+    if not set(COLUMNS) <= set(table.names):
         raise DataError(f"{path}: the first line must be {','.join(COLUMNS)}")
     found: dict[str, dict[str, dict[str, Any]]] = {}
-    for (k, _), row in zip(lines[1:], rows[1:], strict=True):
-        cells = [c.strip() for c in row] + [""] * (len(COLUMNS) - len(row))
-        if len(cells) > len(COLUMNS):
-            raise DataError(f"{path}, line {k}: {len(cells)} columns, {len(COLUMNS)} expected")
-        point, role, name, value, sigma = cells
+    values, sigmas = (table.numbers(n, gaps=True, ordered=False) for n in ("value", "sigma"))
+    words = zip(*(table.texts(n) for n in COLUMNS[:3]), strict=True)
+    for k, (point, role, name) in enumerate(words):
         if role not in ROLES:
-            raise DataError(f"{path}, line {k}: role {role!r} {nearest(role, ROLES)}")
-        where = f"{path}, line {k}: {name}"
-        if (role == "measured") != bool(sigma):
+            raise DataError(f"{table.place(k)}: role {role!r} {nearest(role, ROLES)}")
+        where, value, sigma = f"{table.place(k)}: {name}", float(values[k]), float(sigmas[k])
+        if (role == "measured") == math.isnan(sigma):
             raise DataError(f"{where}: a standard deviation goes with measured quantities, only")
+        if math.isnan(value):
+            raise DataError(f"{where}: no number stands there: complete the row, or delete it")
         group = found.setdefault(point, {r: {} for r in ROLES})[role]
         if name in group:
             raise DataError(f"{where}: given twice for point {point!r}")
-        v = _number(value, where)
-        group[name] = (v, _number(sigma, where)) if role == "measured" else v
+        group[name] = (value, sigma) if role == "measured" else value
     if not found:
         raise DataError(f"{path}: no points below the header")
     try:
@@ -438,13 +438,3 @@ def write_points(points: Iterable[CalibrationPoint], path: str | Path) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     files.write_text(path, text.getvalue())
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        value = float(text) if text.isascii() and "_" not in text else math.nan
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise DataError(f"{where}: {text[:40]!r} is not a number")
-    return value

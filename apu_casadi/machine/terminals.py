@@ -305,31 +305,43 @@ def before(
     Returns:
         Predictions, shape (n, K).
     """
+    each = [continued(t, x, w_r, m, periods=periods) for m in ((1,) if space else harmonics)]
+    out: np.ndarray = sum(each[1:], each[0])
+    return out if space else out.real
+
+
+def continued(
+    t: np.ndarray, x: np.ndarray, w_r: np.ndarray, m: int, *, periods: float = 2.0
+) -> np.ndarray:
+    """Return one harmonic of :func:`before`, complex: its real part is the prediction, (n, K)."""
     K = t.size
     dt = np.append(np.diff(t), 0.0)
     angle = np.concatenate([[0.0], np.cumsum(w_r[:-1] * dt[:-1])])
     rate = float(np.median(np.abs((w_r * dt)[:-1]))) if K > 1 else 1.0
     n = min(K, max(4, round(periods * 2 * math.pi / max(rate, 1e-3))))
+    turn = np.exp(1j * m * angle)
+    part = _moving_mean(x * (turn.conj() * (2.0 if m else 1.0)), np.ones(K, bool), n)
     # the first use the first n, themselves among them
-    late = np.maximum(np.arange(K) - 2, 0)
-    out = np.zeros(x.shape, dtype=complex)
-    for m in (1,) if space else harmonics:
-        turn = np.exp(1j * m * angle)
-        part = _moving_mean(x * turn.conj() * (2.0 if m else 1.0), np.ones(K, bool), n)
-        out += part[:, late] * turn
-    return out if space else out.real
+    out = np.empty_like(part)
+    np.multiply(part[:, : max(K - 2, 0)], turn[2:], out=out[:, 2:])
+    out[:, :2] = part[:, :1] * turn[:2]
+    return out
 
 
 def _moving_mean(x: np.ndarray, good: np.ndarray, n: int) -> np.ndarray:
     """Mean of the last n columns that count, of the first n where there are fewer before."""
-    total = np.cumsum(np.concatenate([np.zeros((x.shape[0], 1)), x], axis=1), axis=1)
+    rows, K = x.shape
+    m = min(n, K)
+    total = np.zeros((rows, K + 1), x.dtype)
+    np.cumsum(x, axis=1, out=total[:, 1:])
     count = np.concatenate([[0], np.cumsum(good)])
-    stop = np.maximum(np.arange(1, x.shape[1] + 1), min(n, x.shape[1]))
-    start = np.maximum(stop - n, 0)
-    counted = np.maximum(count[stop] - count[start], 1)
     # few good ones say little: what is missing counts as zero
-    made: np.ndarray = (total[:, stop] - total[:, start]) / np.maximum(counted, n // 2)
-    return made
+    counted = np.maximum(np.maximum(count[m:] - count[:-m], 1), n // 2)
+    out = np.empty_like(x)
+    np.subtract(total[:, m:], total[:, :-m], out=out[:, m - 1 :])
+    out[:, m - 1 :] /= counted
+    out[:, : m - 1] = out[:, [m - 1]]
+    return out
 
 
 def voltage_weight(w_r: Any, dt: Any) -> Any:

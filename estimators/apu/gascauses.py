@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -153,10 +153,11 @@ class _After:
     data: Recording
     r: FilterResult
     backend: str | None
+    unchanged: dict[int, float] = field(default_factory=dict)  # log-likelihoods by onset
 
     def opened(self, onset: int, names: Sequence[str], size: Sequence[float]) -> float:
         """Log-likelihood gained if states may have jumped by so much."""
-        return self._loglik(onset, names, size) - self._loglik(onset, (), ())
+        return self._loglik(onset, names, size) - self._without(onset)
 
     def blind(self, onset: int, sensor: str) -> float:
         """The same if a sensor is noise of any size about what the others predict."""
@@ -171,7 +172,12 @@ class _After:
         # its noise is found: half the logarithm of the number of readings for that
         white = max(float(np.mean(nu**2)), float(np.min(self.data.variance[row, onset:])))
         instead = -0.5 * nu.size * (1 + math.log(2 * math.pi * white)) - 0.5 * math.log(nu.size)
-        return float(r.loglik - own + instead) - self._loglik(onset, (), ())
+        return float(r.loglik - own + instead) - self._without(onset)
+
+    def _without(self, onset: int) -> float:
+        if onset not in self.unchanged:
+            self.unchanged[onset] = self._loglik(onset, (), ())
+        return self.unchanged[onset]
 
     def _before(self, onset: int) -> Belief:
         assert self.r.mean_pred is not None and self.r.cov_pred is not None

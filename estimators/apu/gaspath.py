@@ -47,6 +47,7 @@ from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filtering import FilterResult, StepMaker, run
+from estimators.filters.resuming import Runs
 from estimators.models.filtermodel import FilterModel, Unknown
 from estimators.models.recording import Recording, record
 
@@ -297,6 +298,17 @@ class GasPathFilter(Parametric):
         """
         of = ekf_step(self.model, iterations, iterated) if step is None else step(self.model)
         return run(of, self.prior() if prior is None else prior, data, full=full, backend=backend)
+
+    def runs(
+        self,
+        *,
+        prior: Belief | None = None,
+        step: StepMaker | None = None,
+        backend: str | None = None,
+    ) -> Runs:
+        """Return the filter for recordings that begin alike; arguments as of :meth:`run`."""
+        of = ekf_step(self.model, ITERATIONS, ITERATED) if step is None else step(self.model)
+        return Runs(of, self.prior() if prior is None else prior, backend)
 
 
 def gas_path_filter(

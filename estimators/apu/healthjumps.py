@@ -18,6 +18,7 @@ from estimators.apu.gaspath import JUMP, GasPathFilter
 from estimators.apu.gaspathmodel import DT
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult, StepMaker
+from estimators.filters.resuming import Runs
 from estimators.information.consistency import exceeded
 from estimators.models.recording import Recording
 
@@ -125,6 +126,7 @@ def track_jumps(
     step: StepMaker | None = None,
     backend: str | None = None,
     most: int = 8,
+    runs: Runs | None = None,
 ) -> Tracked:
     """Filter a recording; where the innovations demand it, go back and let the health jump.
 
@@ -136,9 +138,11 @@ def track_jumps(
         test: the test; :class:`JumpTest`'s defaults.
         prior, step, backend: as for :meth:`GasPathFilter.run`.
         most: largest number of jumps; further alarms are not acted on.
+        runs: the filter with what it was run over before, see :meth:`GasPathFilter.runs`.
     """
     test = JumpTest() if test is None else test
-    result = filt.run(data, prior=prior, step=step, backend=backend)
+    again = filt.runs(prior=prior, step=step, backend=backend) if runs is None else runs
+    result = again(data)
     alarms: list[int] = []
     onsets: list[int] = []
     row = filt.model.u.index("jump")
@@ -153,7 +157,7 @@ def track_jumps(
         u = data.u.copy()
         u[row, onset - 1] = JUMP  # acts in the step that ends at the onset
         data = Recording(data.t, u, data.y, data.variance, data.p)
-        result = _spliced(result, filt.run(data, prior=prior, step=step, backend=backend), k)
+        result = _spliced(result, again(data), k)
         start = k + test.hold
     return Tracked(result, tuple(alarms), tuple(onsets), data, prior)
 

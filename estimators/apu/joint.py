@@ -388,6 +388,7 @@ def fused(
     if spread is not None:
         spread.check(gas.model.x)
     start = gas.prior(None if spread is None else spread.sigma, **(prior or {}))
+    runs = gas.runs(prior=start, step=step, backend=backend)
     for first, mean, white, loss in courses:
         given = dict(inputs or {})
         if "jump_loss" in gas.model.u.names:
@@ -400,7 +401,7 @@ def fused(
             data = _with_speed(gas, data, speed, speed_sigma, apu)
         # from the window on in which more is known
         k = int(np.searchsorted(data.t, t[first] - 1e-9)) + 1 if first else 0
-        now = track_jumps(gas, data, test=test, prior=start, step=step, backend=backend)
+        now = track_jumps(gas, data, test=test, prior=start, runs=runs)
         tracked = now if tracked is None else spliced(tracked, now, k)
     assert tracked is not None
     return gas, tracked

@@ -20,7 +20,8 @@ import numpy as np
 
 from apu_casadi.core.errors import EstimationError, ParameterError
 from estimators.filters.belief import Belief
-from estimators.filters.filtering import NARROW, FilterResult
+from estimators.filters.filterblock import NARROW
+from estimators.filters.filtering import FilterResult
 from estimators.models.recording import SAME_TIME
 
 __all__ = ["fixed_lag_smoother", "rts_smoother", "smoothing_gain"]

@@ -19,7 +19,7 @@ from apu_casadi.core.calling import mapped
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
 from apu_casadi.core.sharing import keep
 from estimators.filters.filtering import FilterResult
-from estimators.models.filtermodel import FilterModel
+from estimators.models.filtermodel import FilterModel, inlined
 from estimators.models.recording import Recording, plain_numbers
 
 __all__ = ["Jump", "LinearFilter", "columns_of", "linear_filter", "linearised", "project"]
@@ -291,8 +291,8 @@ def _build_jacobians(
     for j, i in enumerate(model.p.indices(names)):
         spread[i, j] = 1
     moved = p + ca.mtimes(spread, d)
-    x1, _ = model.transition(x, u, moved, w, dt)
-    y, _ = model.output(x, u, moved, w)
+    x1, _ = inlined(model.transition, x, u, moved, w, dt)
+    y, _ = inlined(model.output, x, u, moved, w)
 
     def made(name: str, args: list[Any], of: list[Any]) -> Any:
         columns = [ca.vec(ca.densify(e)) for e in of]

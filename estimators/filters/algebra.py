@@ -21,6 +21,7 @@ __all__ = [
     "forward",
     "graded_lower",
     "qr_lower",
+    "root_and_inverse",
     "root_of",
     "root_update",
     "symmetric",
@@ -69,8 +70,26 @@ def cholesky_semidefinite(S: ca.SX) -> ca.SX:
     return L
 
 
-def forward(L: ca.SX, B: ca.SX) -> ca.SX:
-    """Return L^-1 B for lower triangular L."""
+def root_and_inverse(S: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return L of :func:`cholesky`, and the inverses of its diagonal; it divides by these alone."""
+    n = S.shape[0]
+    L, inverse = ca.SX(n, n), ca.SX(n, 1)
+    for j in range(n):
+        d = S[j, j]
+        for k in range(j):
+            d = d - L[j, k] ** 2
+        L[j, j] = ca.sqrt(d)
+        inverse[j] = 1 / L[j, j]
+        for i in range(j + 1, n):
+            v = S[i, j]
+            for k in range(j):
+                v = v - L[i, k] * L[j, k]
+            L[i, j] = v * inverse[j]
+    return L, inverse
+
+
+def forward(L: ca.SX, B: ca.SX, inverse: ca.SX | None = None) -> ca.SX:
+    """Return L^-1 B for lower triangular L; ``inverse`` of its diagonal, if it is there."""
     n, m = B.shape
     X = ca.SX(n, m)
     for c in range(m):
@@ -78,7 +97,7 @@ def forward(L: ca.SX, B: ca.SX) -> ca.SX:
             v = B[i, c]
             for k in range(i):
                 v = v - L[i, k] * X[k, c]
-            X[i, c] = v / L[i, i]
+            X[i, c] = v / L[i, i] if inverse is None else v * inverse[i]
     return X
 
 

@@ -28,7 +28,7 @@ import casadi as ca
 
 from apu_casadi.core.errors import ParameterError, nearest
 from apu_casadi.core.sharing import kept, of_family, once
-from estimators.filters.algebra import backward, cholesky, forward, symmetric
+from estimators.filters.algebra import backward, cholesky, forward, root_and_inverse, symmetric
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
 from estimators.filters.rootfilter import ekf_root_step
@@ -140,6 +140,64 @@ def correct(P: Any, H: Any, nu: Any, R: Any, fixed: tuple[int, ...] = ()) -> Cor
     return Corrected(*_kernel(P_at, H_at, fixed)(P, H, nu, R))
 
 
+class _Factored(NamedTuple):
+    """A Gaussian after a linear update as :class:`Corrected` has it, and what it lost: B'B."""
+
+    d: Any
+    P: Any
+    S: Any
+    nis: Any
+    loglik: Any
+    measured: Any
+    B: Any
+
+
+def _factored(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) -> _Factored:
+    """Update state and noise: with S = L L' and B = L^-1 H P, the covariance loses B'B.
+
+    No Joseph form: of a sample far better than the belief, variances lose as many digits as it is
+    better, see :data:`estimators.filters.filtering.WIDE`.  What is considered keeps its own.
+    """
+    nx, n, ny = P.shape[0], H.shape[1], H.shape[0]
+    there = R >= 0
+    H = ca.diag(there) @ H
+    PH = ca.vertcat(P @ H[:, :nx].T, H[:, nx:].T)
+    S = symmetric(H @ PH + ca.diag(ca.if_else(there, R, 1)))
+    L, inverse = root_and_inverse(S)
+    a, B = forward(L, there * nu, inverse), forward(L, PH.T, inverse)
+    d = B.T @ a
+    off = symmetric(B.T @ B)
+    held = list(fixed)
+    if held:
+        d[held] = 0
+        off[held, held] = 0
+    Pa = ca.diagcat(P, ca.SX.eye(n - nx))
+    nis, measured = ca.dot(a, a), ca.sum1(there)
+    logdet = 2 * sum((ca.log(L[i, i]) for i in range(ny)), ca.SX(0))
+    loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
+    return _Factored(d, Pa - off, S, nis, loglik, measured, B)
+
+
+def _carried(P: ca.SX, F: ca.SX, B: ca.SX, fixed: tuple[int, ...]) -> tuple[ca.SX, ca.SX]:
+    """Covariance of state and next state, and of the next state, of :func:`_factored`.
+
+    With the columns f of F that have a gain, c of considered states, G = F_f B_f', D = F_c B_c':
+
+        F P_f F' = F P F' - G (G + D)' - D G'.
+    """
+    nx, n = P.shape[0], F.shape[1]
+    held = list(fixed)
+    free = [i for i in range(n) if i not in fixed]
+    G, D = F[:, free] @ B[:, free].T, F[:, held] @ B[:, held].T
+    X = F[:, :nx] @ P
+    P1 = X @ F[:, :nx].T + F[:, nx:] @ F[:, nx:].T - (G @ (G + D).T + D @ G.T)
+    C = X.T - B[:, :nx].T @ (G + D).T
+    if held:
+        # of what is considered the covariance with itself stays
+        C[held, :] = X[:, held].T - B[:, held].T @ G.T
+    return C, P1
+
+
 @kept
 @of_family
 def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> FilterStep:
@@ -171,15 +229,20 @@ def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> 
 
     outputs, forecast = linearisation(model, kind, u, p, dt)
 
-    def update(H: Any, e: Any) -> Corrected:
-        return correct(Pa, H, e, R, fixed)
+    scalar = kind is ca.SX and iterations == 1
+
+    def update(H: Any, e: Any) -> Any:
+        return _factored(P, H, e, R, fixed) if scalar else correct(Pa, H, e, R, fixed)
 
     found = iterated_update(model, outputs, update, prior, (u, p, y), iterations, iterated)
     moved, check, nu, first, done = found
     at = projected(moved, done.P, model.lower, model.upper, fixed)
     x1, F, c = forecast(at, u, p, dt)
-    C = done.P[:nx, :] @ F.T
-    P1 = ca.mtimes(F, done.P @ F.T) + ca.diag(ca.DM(model.walk**2)) * dt
+    if scalar:
+        C, P1 = _carried(P, F, done.B, fixed)
+    else:
+        C, P1 = done.P[:nx, :] @ F.T, ca.mtimes(F, done.P @ F.T)
+    P1 = P1 + ca.diag(ca.DM(model.walk**2)) * dt
     P1 = ca.tril(P1) + ca.tril(P1, False).T  # half the work, exactly symmetric
     nu = ca.if_else(R >= 0, nu, 0)
     stats = ca.vertcat(check + c, first.nis, first.loglik, first.measured)

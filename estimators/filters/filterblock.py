@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
 from apu_casadi.core.backend import compiled
+from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.sharing import kept
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["BLOCK", "CHAIN", "PADDED", "ROOT_OUT", "block_function", "block_of", "padded"]
+__all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "WIDE"]
+__all__ += ["block_function", "block_length", "block_of", "in_halves", "narrow", "packed_diagonal"]
+__all__ += ["padded", "unpacked"]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
@@ -24,6 +28,8 @@ cross-covariance of filtered state and next state, innovation, its covariance, a
 ROOT_OUT = ["Y", "Z", "Lf"]
 """What a step in square-root form may give beside: roots for the smoother, see
 :mod:`estimators.filters.rootfilter`."""
+WIDE = 1e7  # innovation over noise variance from which a covariance loses more than eight digits
+NARROW = 1e-9  # share of a variance that is left when the other states are known; below: the same
 PADDED = -2.0  # variance of what is not measured in a sample that fills a block up
 
 
@@ -39,8 +45,57 @@ class Step(Protocol):
         """The step as a function; its signature is the filter's."""
 
     @property
+    def root(self) -> bool:
+        """Whether the step carries roots of covariances."""
+
+    @property
     def gives_roots(self) -> bool:
         """Whether the step hands roots of covariances on."""
+
+
+def block_length(model: FilterModel) -> int:
+    """Return how many samples go in one call: fewer of a model that solves equations.
+
+    A recording is filled up to a multiple of that, and such steps take long.
+    """
+    scalar = model.transition.is_a("SXFunction") and model.output.is_a("SXFunction")
+    return BLOCK if scalar else CHAIN
+
+
+def in_halves(step: Step) -> bool:
+    """Whether blocks carry the lower half of a covariance: of scalar operations, without roots."""
+    return step.function.is_a("SXFunction") and not step.root
+
+
+def packed_diagonal(n: int) -> np.ndarray:
+    """Return where the diagonal is in the lower half of a matrix, column by column."""
+    return np.cumsum([0, *range(n, 1, -1)])
+
+
+def unpacked(columns: np.ndarray, n: int) -> np.ndarray:
+    """Return symmetric matrices, (K, n, n), of their lower halves, (n (n + 1)/2, K)."""
+    i, j = np.triu_indices(n)
+    out = np.empty((columns.shape[1], n, n))
+    out[:, i, j] = out[:, j, i] = columns.T
+    return out
+
+
+def narrow(P: np.ndarray, *, root: bool = False) -> bool:
+    """Whether some combination of states is known far better than each of them, or not a number."""
+    if root:
+        size = np.sqrt((P**2).sum(1))
+        rows = size > 0
+        return bool((np.abs(np.diag(P))[rows] < math.sqrt(NARROW) * size[rows]).any())
+    d = P.diagonal()
+    if not (d > 0).all():
+        rows = np.flatnonzero(d > 0)
+        P, d = P[np.ix_(rows, rows)], d[rows]
+    s = 1 / np.sqrt(d)
+    try:
+        pivots = np.linalg.cholesky(P * s * s[:, None]).diagonal()
+    except np.linalg.LinAlgError:
+        return True
+    return not bool((pivots**2 >= NARROW).all())
 
 
 def _chained(f: ca.Function, n: int, name: str, carried: int, kept: int) -> ca.Function:
@@ -91,38 +146,66 @@ def block_of(one: ca.Function, name: str, carried: int, *, short: bool = False) 
 def block_function(
     step: Step, full: bool, short: bool, backend: str | None, _in_use: str
 ) -> tuple[ca.Function, ca.Function]:
-    """``BLOCK`` steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
+    """A block of steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
 
     (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
-    before each sample and C, S; matrices as columns.
+    before each sample and C, S; matrices as columns.  Without ``full``, P_f of :func:`in_halves` is
+    its lower half.
 
     If ``short``, (m, P, P_f, u, y, R, dt, p) -> (m1, P1, P_f, m_f, diag P_f, nu, diag S, stats),
     where the first P_f is that of the last sample which is not padded: a tenth of the numbers.
     """
     nx, nu, np_, _, ny = step.model.sizes
+    kind = ca.SX if step.function.is_a("SXFunction") else ca.MX
+    half = in_halves(step)
+    pattern = ca.Sparsity.lower(nx) if half else ca.Sparsity.dense(nx, nx)
+    sizes = [(nx, 1), pattern, (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)]
     s = [
-        ca.MX.sym(n, *shape)
-        for n, shape in zip(
-            STEP_IN, [(nx, 1), (nx, nx), (nu, 1), (np_, 1), (ny, 1), (ny, 1), (1, 1)], strict=True
-        )
+        kind.sym(n, *((size,) if size is pattern else size))
+        for n, size in zip(STEP_IN, sizes, strict=True)
     ]
     m, P, u, p, y, R, dt = s
-    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(*s), strict=False))
+    whole = ca.tril2symm(P) if half else P
+    o = dict(zip(STEP_OUT + ROOT_OUT, step.function(m, whole, *s[2:]), strict=False))
     P_f = ca.diag(o["P_f"]) if short else ca.vec(o["P_f"])
+    if half and not (full or short):
+        P_f = ca.vertcat(*ca.project(ca.densify(o["P_f"]), pattern).nonzeros())
     kept = [o["m_f"], P_f, o["nu"], ca.diag(o["S"]), o["stats"]]
     if full:
-        kept += [m, ca.vec(P), ca.vec(o["C"]), ca.vec(o["S"])]
+        kept += [m, ca.vec(whole), ca.vec(o["C"]), ca.vec(o["S"])]
     if step.gives_roots:
         kept += [ca.vec(o[n]) for n in (ROOT_OUT if full else ROOT_OUT[-1:])]
     name = f"{step.function.name()}{'_full' if full else '_short' if short else ''}"
-    carried, now = [m, P], [o["m1"], o["P1"]]
+    carried, now = [m, P], [o["m1"], ca.project(o["P1"], pattern)]
     if short:
-        carried.append(ca.MX.sym("P_last", nx, nx))
-        now.append(ca.if_else(R[0] == PADDED, carried[-1], o["P_f"]))
+        carried.append(kind.sym("P_last", pattern))
+        last = ca.if_else(R[0] == PADDED, carried[-1], ca.project(o["P_f"], pattern))
+        now.append(ca.project(last, pattern))
     out = [*now, *(ca.densify(k) for k in kept)]
-    one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
-    block = block_of(one, name, len(carried))
+    if not half:
+        one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
+        block = block_of(one, name, len(carried), short=block_length(step.model) < BLOCK)
+        return compiled(block, backend=backend), block
+    # what hangs on the parameters alone is evaluated once in a block
+    out, symbols, constant = ca.extract_parametric(ca.cse(out), p)
+    c, of_p = ca.vertcat(*symbols), ca.Function(f"{name}_constants", [p], [ca.vertcat(*constant)])
+    one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, ca.vertcat(p, c)], out)
+    one = by_reciprocals(one)
+    of_halves = block_of(one, f"{name}_half", len(carried), short=block_length(step.model) < BLOCK)
+    block = _whole(of_halves, of_p, name, len(carried), pattern)
     return compiled(block, backend=backend), block
+
+
+def _whole(
+    half: ca.Function, of_p: ca.Function, name: str, carried: int, pattern: ca.Sparsity
+) -> ca.Function:
+    """Take and give whole covariances, and p, for a block of their halves and of constants too."""
+    ins = [ca.MX.sym(half.name_in(i), *half.size_in(i)) for i in range(half.n_in() - 1)]
+    p = ca.MX.sym("p", of_p.size1_in(0))
+    given = [ins[0], *(ca.project(P, pattern) for P in ins[1:carried]), *ins[carried:]]
+    out = half.call([*given, ca.vertcat(p, of_p(p))])
+    out[1:carried] = [ca.densify(ca.tril2symm(P)) for P in out[1:carried]]
+    return ca.Function(name, [*ins, p], out)
 
 
 def padded(data: Recording, pad: int) -> tuple[np.ndarray, ...]:

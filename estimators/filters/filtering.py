@@ -7,7 +7,6 @@ where there is a compiler; Python is not crossed for each sample.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,7 +17,7 @@ import numpy as np
 
 from apu_casadi.core.backend import backend_in_use
 from apu_casadi.core.errors import EstimationError, SignalError
-from apu_casadi.core.lanes.together import Course, Question, Together, alone
+from apu_casadi.core.lanes.together import Course, Question, Together, alone, asking
 from apu_casadi.core.results import dataset
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.core.signals import Signal, Signals
@@ -30,10 +29,17 @@ from estimators.filters.filterblock import (
     ROOT_OUT,
     STEP_IN,
     STEP_OUT,
+    WIDE,
     block_function,
+    block_length,
     block_of,
+    in_halves,
+    narrow,
+    packed_diagonal,
     padded,
+    unpacked,
 )
+from estimators.filters.sweeping import Piece, Sweep
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
@@ -52,12 +58,13 @@ __all__ = [
     "block_of",
     "narrow",
     "padded",
+    "result_of",
+    "rooted",
     "run",
+    "sweep_of",
 ]
 
 STATS = ("check", "nis", "loglik", "measured")
-WIDE = 1e7  # innovation over noise variance from which a covariance loses more than eight digits
-NARROW = 1e-9  # share of a variance that is left when the other states are known; below: the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,11 +298,16 @@ def course(
         raise SignalError(
             f"prior of {', '.join(prior.x.names)}; {model.name} has {', '.join(model.x.names)}"
         )
+    if not (full or asking()):
+        made = _swept(step, prior, data, cov_at, backend, progress)
+        if made is not None:
+            return made
     passes = _Passes(step, prior, full, backend, short=not full and cov_at is None)
     nx, _, _, _, ny = model.sizes
     K = data.size
-    n_blocks = -(-K // BLOCK)
-    pad = n_blocks * BLOCK - K
+    length = block_length(step.shared.model)
+    n_blocks = -(-K // length)
+    pad = n_blocks * length - K
     missing = np.isnan(data.y)
     y, R, u, dt = padded(data, pad)
     p = step.full(data.p)
@@ -306,29 +318,27 @@ def course(
     wanted = np.zeros(0, dtype=int) if cov_at is None else np.asarray(cov_at, dtype=int)
     some = np.empty((wanted.size, nx, nx))
     for b in range(n_blocks):
-        s = slice(b * BLOCK, (b + 1) * BLOCK)
-        n = min(BLOCK, K - b * BLOCK)
-        r = slice(b * BLOCK, b * BLOCK + n)
+        s = slice(b * length, (b + 1) * length)
+        n = min(length, K - b * length)
+        r = slice(b * length, b * length + n)
         out = yield from passes.block(u[:, s], y[:, s], R[:, s], dt[:, s], p)
         for target, source in (
             (mean, out[2]),
-            (var, out[3] if passes.short else out[3][:: nx + 1]),
+            (var, out[3] if passes.short else out[3][passes.diagonal]),
             (nu, out[4]),
             (S, out[5]),
             (stats, out[6]),
         ):
             target[:, r] = source[:, :n]
-        _believable(model, data, stats[:, r], mean[:, r], var[:, r], b * BLOCK)
+        _believable(model, data, stats[:, r], mean[:, r], var[:, r], r.start)
         here = (wanted >= r.start) & (wanted < r.stop)
         if here.any():
-            some[here] = out[3].T[wanted[here] - r.start].reshape(-1, nx, nx)
+            some[here] = passes.whole(out[3][:, wanted[here] - r.start])
         if kept is not None:
             kept.put(r, [o[:, :n] for o in (out[3], *out[7:])], root=passes.rooted)
         if progress is not None:
-            progress(b * BLOCK + n, K)
-    last = passes.P_last if passes.short else out[3][:, n - 1].reshape(nx, nx)
-    last = (last + last.T) / 2
-    np.fill_diagonal(last, np.maximum(np.diag(last), 0.0))
+            progress(r.stop, K)
+    last = _tidy(passes.P_last if passes.short else passes.whole(out[3][:, [n - 1]])[0])
     root = None if not passes.now.gives_roots else out[-1][:, n - 1].reshape(nx, nx).T.copy()
     np.maximum(var, 0.0, out=var)  # rounding, judged above
     nu[missing], S[missing] = np.nan, np.nan
@@ -337,11 +347,63 @@ def course(
     more: dict[str, Any] = {} if kept is None else kept.fields()
     more["some_cov"] = None if cov_at is None else some
     if full and step.wide is not None:
-        more["again"] = partial(_rooted, step, prior, data, backend)
+        more["again"] = partial(rooted, step, prior, data, backend)
     return FilterResult(model.x, model.y, data.t, mean, var, nu, S, *told, **more)
 
 
-def _rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
+def _tidy(P: np.ndarray) -> np.ndarray:
+    """Return a covariance without what rounding leaves."""
+    out: np.ndarray = (P + P.T) / 2
+    np.fill_diagonal(out, np.maximum(np.diag(out), 0.0))
+    return out
+
+
+def _swept(
+    step: FilterStep,
+    prior: Belief,
+    data: Recording,
+    cov_at: np.ndarray | None,
+    backend: str | None,
+    progress: Callable[[int, int], None] | None,
+) -> FilterResult | None:
+    """Run a filter without Python between its blocks; None where more is needed."""
+    sweep = sweep_of(step, prior, data, cov_at, backend)
+    piece = None if sweep is None else sweep.piece(0, data.size, prior, progress)
+    return None if piece is None else result_of(step.model, data, 0, piece, cov_at is not None)
+
+
+def sweep_of(
+    step: FilterStep,
+    prior: Belief,
+    data: Recording,
+    cov_at: np.ndarray | None,
+    backend: str | None,
+) -> Sweep | None:
+    """Return the filter over parts of a recording; None if it is not carried by covariances."""
+    if not in_halves(step.shared) or prior.root is not None or not step.model.y.names:
+        return None
+    wide = step.wide is not None
+    if wide and narrow(prior.cov):
+        return None
+    block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
+    return Sweep(step.model, block, data, step.full(data.p), wide=wide, cov_at=cov_at)
+
+
+def result_of(
+    model: FilterModel, data: Recording, start: int, piece: Piece, some: bool
+) -> FilterResult:
+    """Return what a sweep over a part of a recording says."""
+    mean, var, nu, S, stats = piece[:5]
+    part = slice(start, start + mean.shape[1])
+    missing = np.isnan(data.y[:, part])
+    nu[missing], S[missing] = np.nan, np.nan
+    final = Belief(model.x, mean[:, -1].copy(), _tidy(piece.last), None)
+    told = stats[1], stats[3], float(stats[2].sum()), final
+    more: dict[str, Any] = {"some_cov": piece.some if some else None}
+    return FilterResult(model.x, model.y, data.t[part], mean, var, nu, S, *told, **more)
+
+
+def rooted(step: FilterStep, prior: Belief, data: Recording, backend: str | None) -> FilterResult:
     """Run a filter in square-root form from the beginning."""
     assert step.wide is not None
     return run(step.wide(), prior, data, full=True, backend=backend)
@@ -382,6 +444,21 @@ class _Passes:
         """Whether blocks return variances instead of covariances: not those that give roots."""
         return self._short and not self.now.gives_roots and bool(self.now.model.y.names)
 
+    @property
+    def diagonal(self) -> Any:
+        """Rows of the variances where blocks return covariances."""
+        nx = self.m.size
+        halves = not self.full and in_halves(self.now.shared)
+        return packed_diagonal(nx) if halves else slice(None, None, nx + 1)
+
+    def whole(self, columns: np.ndarray) -> np.ndarray:
+        """Covariances of some samples, (n, nx, nx), of what blocks return."""
+        nx = self.m.size
+        if not self.full and in_halves(self.now.shared):
+            return unpacked(columns, nx)
+        made: np.ndarray = columns.T.reshape(-1, nx, nx)
+        return made
+
     def _root(self, L: np.ndarray) -> None:
         self.P = L
         if not self.step.root:
@@ -416,30 +493,12 @@ class _Passes:
         out = yield from self._call(u, y, R, dt, p)
         nx = self.m.size
         self.done += 1
-        ends = self.done % 4 == 1
+        ends = self.done % (4 * BLOCK // R.shape[1]) == 1
         if self.step.wide is not None and not self.rooted and lossy(out, R, nx, ends):
             self._root(root_of(self.P))
             out = yield from self._call(u, y, R, dt, p)
         self.m, self.P = out[0].ravel().copy(), out[1].reshape(nx, nx).copy()
         return out
-
-
-def narrow(P: np.ndarray, *, root: bool = False) -> bool:
-    """Whether some combination of states is known far better than each of them, or not a number."""
-    if root:
-        size = np.sqrt((P**2).sum(1))
-        rows = size > 0
-        return bool((np.abs(np.diag(P))[rows] < math.sqrt(NARROW) * size[rows]).any())
-    d = P.diagonal()
-    if not (d > 0).all():
-        rows = np.flatnonzero(d > 0)
-        P, d = P[np.ix_(rows, rows)], d[rows]
-    s = 1 / np.sqrt(d)
-    try:
-        pivots = np.linalg.cholesky(P * s * s[:, None]).diagonal()
-    except np.linalg.LinAlgError:
-        return True
-    return not bool((pivots**2 >= NARROW).all())
 
 
 def lossy(out: Sequence[np.ndarray], R: np.ndarray, nx: int, ends: bool) -> bool:

@@ -35,17 +35,8 @@ from apu_casadi.core.signals import Signals
 from estimators.filters.algebra import root_of
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
-from estimators.filters.filtering import (
-    BLOCK,
-    NARROW,
-    WIDE,
-    FilterResult,
-    FilterStep,
-    block_of,
-    narrow,
-    padded,
-    run,
-)
+from estimators.filters.filterblock import BLOCK, NARROW, WIDE, block_of, narrow, padded
+from estimators.filters.filtering import FilterResult, FilterStep, run
 from estimators.filters.mixing import log_sum, plain_mixer, root_mixer, squared, stacks
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording

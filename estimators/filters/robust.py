@@ -69,18 +69,19 @@ def robustly(step: FilterStep, chance: float = CHANCE) -> FilterStep:
     limit, f = limit_of(chance) ** 2, step.function
     kind = ca.SX if f.is_a("SXFunction") else ca.MX
     m, P, u, p, y, R, dt = (kind.sym(n, *f.size_in(n)) for n in STEP_IN)
-    first = dict(zip(f.name_out(), f.call([m, P, u, p, y, R, dt]), strict=True))
+    given = [m, P, u, p, y, R, dt]
+    # written out, so that of the first only what is asked for is evaluated
+    first = dict(zip(f.name_out(), f.call(given, True, False), strict=True))
     size = ca.diag(first["S"])
     over = ca.fmax(first["nu"] ** 2 / size / limit, 1.0)
     doubted = ca.if_else(R >= 0, R + size * (over - 1.0), R)
-    out = dict(zip(f.name_out(), f.call([m, P, u, p, y, doubted, dt]), strict=True))
+    out = dict(zip(f.name_out(), f.call([m, P, u, p, y, doubted, dt], True, False), strict=True))
     checks = STATS.index("check")
     stats = ca.vertsplit(first["stats"])
-    stats[checks] = out["stats"][checks] + stats[checks]
+    stats[checks] = out["stats"][checks]
     out |= {"nu": first["nu"], "S": first["S"], "stats": ca.vertcat(*stats)}
     made = [ca.densify(out[n]) for n in f.name_out()]
-    if kind is ca.SX:
-        made = ca.cse(made)
+    made = ca.cse(made)
     name = f"robust_{f.name()}"
     function = ca.Function(name, [m, P, u, p, y, R, dt], made, STEP_IN, f.name_out())
     wide = None if step.wide is None else partial(_wide, step, chance)

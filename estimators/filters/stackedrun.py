@@ -18,8 +18,8 @@ from apu_casadi.core.calling import Caller, available_threads
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_in_use
 from estimators.filters.belief import Belief
-from estimators.filters.filterblock import BLOCK, block_function, padded
-from estimators.filters.filtering import STATS, WIDE, FilterResult, FilterStep, narrow
+from estimators.filters.filterblock import BLOCK, WIDE, block_function, block_length, padded
+from estimators.filters.filtering import STATS, FilterResult, FilterStep, narrow
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
@@ -58,7 +58,7 @@ class _Stack:
     def of(cls, filters: Sequence[One]) -> _Stack:
         nx, _, _, _, ny = filters[0][0].model.sizes
         K = filters[0][2].size
-        pad = -K % BLOCK
+        pad = -K % block_length(filters[0][0].shared.model)
         ready = [padded(data, pad) for _, _, data in filters]
         y, R, u, dt = (np.stack([r[i].T for r in ready]) for i in range(4))
         n = len(filters)
@@ -92,7 +92,7 @@ def run_stacked(
     stack = _Stack.of(filters)
     packs = [slice(i, min(i + lanes, len(filters))) for i in range(0, len(filters), lanes)]
     threads = min(available_threads() if n_threads is None else n_threads, len(packs))
-    how = (call, stack, step.model, step.wide is not None)
+    how = (call, stack, step.shared.model, step.wide is not None)
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(lambda pack: _run_pack(pack, lanes, *how), packs))
@@ -115,16 +115,17 @@ def _run_pack(
     for view, a in zip(views, (stack.m, stack.P, stack.P_last), strict=False):
         view[:] = a[rows].reshape(lanes, -1)
     views[-1][:] = stack.p[rows]
-    for b, start in enumerate(range(0, stack.kept[0].shape[1], BLOCK)):
-        s = slice(start, start + BLOCK)
+    length = block_length(model)
+    for b, start in enumerate(range(0, stack.kept[0].shape[1], length)):
+        s = slice(start, start + length)
         for view, a in zip(views[3:-1], stack.given, strict=True):
-            view.reshape(lanes, BLOCK, a.shape[2])[:] = a[rows, s]
+            view.reshape(lanes, length, a.shape[2])[:] = a[rows, s]
         call.evaluate()
-        parts = [o[:n].reshape(n, BLOCK, -1) for o in out[3:]]
+        parts = [o[:n].reshape(n, length, -1) for o in out[3:]]
         for target, part in zip(stack.kept, parts, strict=True):
             target[pack, s] = part
         stack.good[pack] &= _good(parts, stack.given[2][pack, s], model, wide)
-        if wide and b % 4 == 0:
+        if wide and b % (4 * BLOCK // length) == 0:
             stack.good[pack] &= _not_narrow(out[1][:n].reshape(n, *stack.P.shape[1:]))
         if not stack.good[pack].any():
             return

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from estimators.filters.filtering import STEP_IN
-from estimators.models.filtermodel import FilterModel
+from estimators.models.filtermodel import FilterModel, inlined
 
 __all__ = [
     "iterated_update",
@@ -76,8 +76,8 @@ def linearisation(
     """
     nx, _, _, nw, _ = model.sizes
     s = kind.sym("s", nx + nw)
-    y, check_y = model.output(s[:nx], u, p, s[nx:])
-    x1, check_x = model.transition(s[:nx], u, p, s[nx:], dt)
+    y, check_y = inlined(model.output, s[:nx], u, p, s[nx:])
+    x1, check_x = inlined(model.transition, s[:nx], u, p, s[nx:], dt)
     return (
         ca.Function("outputs", [s, u, p], [y, ca.jacobian(y, s), check_y]),
         ca.Function("forecast", [s, u, p, dt], [x1, ca.jacobian(x1, s), check_x]),

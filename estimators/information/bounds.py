@@ -35,7 +35,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
-from estimators.models.filtermodel import CHECK_TOL, FilterModel
+from estimators.models.filtermodel import CHECK_TOL, FilterModel, inlined
 from estimators.models.recording import Recording
 
 __all__ = ["error_model", "expected_bound", "linearisations", "posterior_bound", "snapshot_bound"]
@@ -173,8 +173,8 @@ def posterior_bound(
 def _jacobians(model: FilterModel) -> ca.Function:
     """Function (x, u, p, dt) -> (H, F, check), both over state and noise, at w = 0."""
     x, u, p, w, dt = model.symbols()
-    y, c_y = model.output(x, u, p, w)
-    x1, c_f = model.transition(x, u, p, w, dt)
+    y, c_y = inlined(model.output, x, u, p, w)
+    x1, c_f = inlined(model.transition, x, u, p, w, dt)
     out = [
         ca.horzcat(ca.jacobian(y, x), ca.jacobian(y, w)),
         ca.horzcat(ca.jacobian(x1, x), ca.jacobian(x1, w)),

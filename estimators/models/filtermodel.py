@@ -49,6 +49,7 @@ __all__ = [
     "biases",
     "discretise",
     "gains",
+    "inlined",
     "lagging",
     "measure",
     "measured_inputs",
@@ -312,6 +313,16 @@ class FilterModel(Parametric):
 
 def _among(angles: tuple[tuple[str, float], ...], y: Signals) -> tuple[tuple[str, float], ...]:
     return tuple((n, period) for n, period in angles if n in y)
+
+
+def inlined(fun: ca.Function, *args: Any) -> list[Any]:
+    """Return a function's results in the symbols ``args`` as its own expressions, not as a call.
+
+    What is derived of them then shares what they have solved: the derivative of a call would solve
+    once more.
+    """
+    results: list[Any] = fun.call([*args], fun.is_a("MXFunction"), False)
+    return results
 
 
 @remade

@@ -303,7 +303,7 @@ def _ignored(
     tables: Sequence[Table], sensors: SensorSet, gg: GasGenerator, time: str | None
 ) -> list[str]:
     """Columns that the fit does not use, with a guess of what they may be."""
-    from estimators.apu.recordings.timestamps import is_time_name
+    from apu_casadi.core.tables.timestamps import is_time_name
 
     out: dict[str, None] = {}
     for table in tables:

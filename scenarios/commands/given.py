@@ -246,10 +246,9 @@ def scenario(args: Namespace, name: str) -> Scenario:
     from scenarios import registry
 
     parts(args)
-    s = registry.get(name)
+    s = registry.get(name, **own(args))
     if args.extensions:
         s = s.change(extensions=(*s.extensions, *args.extensions))
-    s = s.change(**own(args))
     tell(args, s.engine, registry.assumed(s))
     return s
 
@@ -385,7 +384,8 @@ LOOK = """
 """.strip()
 """Options of every command that draws; where FILE is given, its ending tells the format."""
 DRAWN = f"""
---figures NAMES ? =png | formats of the figures, one or several with commas between: png, svg, pdf
+--figures NAMES ?png,svg,pdf =png | formats of the figures, one or several with commas between:
+| png, svg, pdf
 {LOOK}
 """.strip()
 FIGURES = f"{DRAWN}\n--no-figures | draw no figures"

@@ -96,8 +96,13 @@ def table(rows: list[Row], width: int | None = None) -> str:
         width: letters a line; the last column is broken to it. None breaks nothing.
     """
     body = [HEAD, *(_cells(r) for r in rows)]
-    widths = [max(len(row[k]) for row in body) for k in range(len(HEAD) - 1)]
-    right = [">" if 2 <= k <= 5 else "<" for k in range(len(HEAD) - 1)]
+    n = len(HEAD) - 1
+    widths = [max(len(row[k]) for row in body) for k in range(n)]
+    if width is not None and sum(widths) + 2 * n > width:  # tolerance and kind go below, too
+        body = [[*r[:5], r[7], f"{r[6]}, tolerance {r[5]}: {r[8]}"] for r in body]
+        body[0][-1] = "kind, tolerance: why this tolerance"
+        n, widths = 6, [*widths[:5], widths[7]]
+    right = [">" if 2 <= k <= min(n - 2, 5) else "<" for k in range(n)]
     made = []
     for *cells, why in body:
         line = "  " + "  ".join(map("{:{}{}}".format, cells, right, widths)) + "  "

@@ -1,13 +1,13 @@
 """Score predictions about a data set: detection, latency, classes, severities, coverage.
 
-Predictions are a CSV file with one row a run: ``run`` and ``class`` are needed; ``score`` (higher
-is more faulty), ``alarm_time`` (s, empty for none), ``phase``, ``generator``, severities (``h``,
-``f_eta_c``, ...) and their standard deviations (``h_sigma``, ...) are scored where they are given.
+Predictions are a file, CSV or Parquet, with one row a run: ``run`` and ``class`` are needed;
+``score`` (higher is more faulty), ``alarm_time`` (s, empty for none), ``phase``, ``generator``,
+severities (``h``, ``f_eta_c``, ...) and their standard deviations (``h_sigma``, ...) are scored
+where they are given.
 """
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 import re
@@ -21,6 +21,8 @@ import numpy as np
 
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.tables.numbertable import NumberTable, numbers_of, read_numbers
+from apu_casadi.core.tables.tablelayout import TableLayout
 from apu_casadi.gaspath.health import HEALTH
 from scenarios.datasets.making import RUNS
 from scenarios.datasets.recipe import CLASSES, SPLITS
@@ -70,38 +72,74 @@ def read_predictions(path: str | Path, labels: Mapping[str, np.ndarray]) -> Pred
         DataError: an unknown column or class, a run that is missing, doubled or not there, no
             number; with line and value.
     """
-    return parsed(path, files.read_text(path), labels)
+    return _predictions(read_numbers(path, COLUMNS.__contains__, layout=_Layout()), labels)
 
 
 def parsed(path: str | Path, text: str, labels: Mapping[str, np.ndarray]) -> Predictions:
     """Read predictions out of the text of a file; see :func:`read_predictions`."""
-    rows = list(csv.reader(io.StringIO(text)))
-    if not rows:
-        raise DataError(f"{path}: empty")
-    head = [h.strip() for h in rows[0]]
+    return _predictions(numbers_of(path, text, COLUMNS.__contains__, _Layout()), labels)
+
+
+class _Layout(TableLayout):
+    remedies = {
+        **TableLayout.remedies,
+        "gap": ": leave the cell empty where nothing is said",
+        "sentinel": "leave the cell empty where nothing is said",
+        "unit": "this column has none: delete it",
+    }
+
+
+def _predictions(table: NumberTable, labels: Mapping[str, np.ndarray]) -> Predictions:
+    path, head = table.path, table.names
     for h in head:
         if h not in COLUMNS:
-            raise DataError(f"{path}: column {h!r} {nearest(h, COLUMNS)}")
+            raise DataError(f"{path}: column {h!r} {nearest(h, COLUMNS)}: rename or delete it")
     if twice := [h for k, h in enumerate(head) if h in head[:k]]:
         raise DataError(f"{path}: column {twice[0]} is there twice")
     if missing := [n for n in ("run", "class") if n not in head]:
         raise DataError(f"{path}: column {missing[0]} is missing")
     if alone := [n for n in SEVERITIES if f"{n}_sigma" in head and n not in head]:
         raise DataError(f"{path}: column {alone[0]} is missing for {alone[0]}_sigma")
-    found: dict[int, dict[str, Any]] = {}
-    for line, row in enumerate(rows[1:], 2):
-        if not any(c.strip() for c in row):
-            continue
-        if len(row) != len(head):
-            raise DataError(f"{path}: line {line} has {len(row)} cells, {len(head)} are expected")
-        cells = {n: _cell(path, line, n, c.strip()) for n, c in zip(head, row, strict=True)}
-        run = cells["run"]
-        if run in found:
-            raise DataError(f"{path}: line {line}: run {run} is there twice")
-        found[run] = cells
-    runs = [int(n) for n in labels["run"]]
-    _compare(path, found, runs)
-    return Predictions({n: np.array([found[k][n] for k in runs]) for n in head})
+    columns = {n: _column(table, n) for n in head}
+    runs, at = [int(n) for n in labels["run"]], dict[int, int]()
+    for k, run in enumerate(columns["run"]):
+        if run in at:
+            raise DataError(f"{table.place(k)}: run {run} is there twice")
+        at[run] = k
+    _compare(path, at, runs)
+    return Predictions({n: np.array([columns[n][at[r]] for r in runs]) for n in head})
+
+
+def _column(table: NumberTable, name: str) -> Sequence[Any]:
+    """Return the cells of a column as they are scored."""
+    words = table.texts(name)
+    for k, word in enumerate(words):
+        where = table.place(k)
+        if name == "class" and not word:
+            raise DataError(f"{where}: class {word!r} of a run is missing")
+        if name == "class" and word not in CLASSES:
+            raise DataError(f"{where}: class {word!r} {nearest(word, CLASSES)}")
+        if name == "phase" and word not in ("", "a", "b", "c"):
+            raise DataError(f"{where}: phase {word!r}: a, b, c or nothing is expected")
+        if name == "run" or (name == "generator" and word):
+            whole = r"\d+" if name == "run" and name in table.words else r"\d+(\.0)?"
+            if not re.fullmatch(whole, word):
+                raise DataError(f"{where}: {name} {word!r} is no whole number")
+    if name in ("class", "phase"):
+        return words
+    if name in ("run", "generator"):
+        return [int(float(w)) if w else math.nan for w in words]
+    unit = "s" if name == "alarm_time" else "1" if name != "score" else ""
+    values = table.numbers(name, unit, gaps=True, ordered=name == "score")
+    for k, word in enumerate(words):
+        if word and not math.isfinite(values[k]):
+            raise DataError(
+                f"{table.place(k)}: {name} = {word!r} is no finite number: leave the cell empty "
+                "where nothing is said"
+            )
+        if name.endswith("_sigma") and values[k] <= 0:
+            raise DataError(f"{table.place(k)}: {name} = {word!r} must be > 0")
+    return list(values)
 
 
 def _compare(path: str | Path, found: Mapping[int, Any], runs: Sequence[int]) -> None:
@@ -112,35 +150,6 @@ def _compare(path: str | Path, found: Mapping[int, Any], runs: Sequence[int]) ->
         if odd:
             some = ", ".join(map(str, odd[:5])) + (", ..." if len(odd) > 5 else "")
             raise DataError(f"{path}: {len(odd)} runs {what}: {some}")
-
-
-def _cell(path: str | Path, line: int, name: str, text: str) -> Any:
-    if name == "class":
-        if not text:
-            raise DataError(f"{path}: line {line}: class {text!r} of a run is missing")
-        if text not in CLASSES:
-            raise DataError(f"{path}: line {line}: class {text!r} {nearest(text, CLASSES)}")
-        return text
-    if name == "phase":
-        if text not in ("", "a", "b", "c"):
-            raise DataError(f"{path}: line {line}: phase {text!r}: a, b, c or nothing is expected")
-        return text
-    if name == "run" or (name == "generator" and text):
-        if not re.fullmatch(r"\d+", text) and not (name != "run" and re.fullmatch(r"\d+\.0", text)):
-            raise DataError(f"{path}: line {line}: {name} {text!r} is no whole number")
-        return int(float(text))
-    try:
-        value = float(text) if text else math.nan
-    except ValueError:
-        raise DataError(f"{path}: line {line}: {name} = {text!r} is no number") from None
-    if text and not math.isfinite(value):
-        raise DataError(
-            f"{path}: line {line}: {name} = {text!r} is no finite number: leave the cell empty "
-            "where nothing is said"
-        )
-    if name.endswith("_sigma") and value <= 0:
-        raise DataError(f"{path}: line {line}: {name} = {text!r} must be > 0")
-    return value
 
 
 # ------------------------------------------------------------------------------ scores

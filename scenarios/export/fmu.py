@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 import subprocess
 import sys
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from importlib.resources import files as resources
@@ -147,16 +146,16 @@ def _library(name: str, texts: dict[str, str], compiled: Sequence[str]) -> bytes
             f"{name}: no C compiler found for the FMU's library; install one, set CC, or make an "
             "FMU of sources alone"
         )
-    with tempfile.TemporaryDirectory() as folder:
+    with files.work_folder() as folder:
         for n, t in texts.items():
-            (Path(folder) / n).write_text(t, encoding="utf-8")
+            (folder / n).write_text(t, encoding="utf-8")
         line = [*command, *_FLAGS, *compiled, "-o", "library", "-lm"]
         done = subprocess.run(
             line, cwd=folder, capture_output=True, text=True, timeout=_TIMEOUT, check=False
         )
         if done.returncode:
             raise BackendError(f"{name}: {command[0]}: {' '.join(done.stderr.split())[:300]}")
-        return (Path(folder) / "library").read_bytes()
+        return (folder / "library").read_bytes()
 
 
 def _build_description(model: FmuModel) -> str:

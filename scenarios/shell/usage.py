@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
 import re
 import sys
@@ -31,7 +32,8 @@ class Parser(argparse.ArgumentParser):
             # argparse takes the two dashes away and then misses the value
             if re.fullmatch(r"--[^=]+=--", text):
                 self.error(f"argument {text[:-3]}: a value is expected, got '--'")
-        first = next(iter(sys.argv[1:] if args is None else args), "")
+        args = self._own_values(sys.argv[1:] if args is None else args)
+        first = next(iter(args), "")
         if self._subparsers and first.startswith("--") and first not in self._option_string_actions:
             self._unknown([first])  # before a command is missed
         found, rest = super().parse_known_args(args, namespace)
@@ -39,6 +41,22 @@ class Parser(argparse.ArgumentParser):
         if unknown:
             self._unknown(unknown)
         return found, rest
+
+    def _own_values(self, args: Sequence[str]) -> list[str]:
+        """Write ``--figures run.csv`` as ``--figures=png run.csv``: the file is none of its words.
+
+        A word that is near one of them is taken as such, and refused later.
+        """
+        out = list(args)
+        end = out.index("--") if "--" in out else len(out)
+        for k in range(end - 1):
+            action = self._option_string_actions.get(out[k])
+            known = getattr(action, "words", ())
+            given = out[k + 1].split(",")
+            near = all(difflib.get_close_matches(w.strip().lower(), known) for w in given)
+            if action is not None and known and not out[k + 1].startswith("-") and not near:
+                out[k] = f"{out[k]}={action.const}"
+        return out
 
     def _unknown(self, arguments: Sequence[str]) -> NoReturn:
         """End with status 2: options that there are not, and the nearest one there is."""
@@ -98,9 +116,10 @@ def declare(parser: argparse.ArgumentParser, table: str) -> None:
 
     Left of the bar stand, separated by blanks, the flags (or the name of an argument), and any of:
     a metavar; ``int`` or ``float``; ``{a,b}``, the choices; ``=VALUE``, the default; ``?`` or
-    ``+``, how many; ``...``, may be given again; ``>name``, the attribute.  An option without
-    metavar and type is a switch, with ``=on`` one that ``--no-...`` turns off.  A line that begins
-    with the bar continues the help above it.
+    ``+``, how many; ``?a,b``, of an option: words of which its value is made, if it has one;
+    ``...``, may be given again; ``>name``, the attribute.  An option without metavar and type is a
+    switch, with ``=on`` one that ``--no-...`` turns off.  A line that begins with the bar continues
+    the help above it.
     """
     rows: list[tuple[str, str]] = []
     for line in table.strip().splitlines():
@@ -108,7 +127,8 @@ def declare(parser: argparse.ArgumentParser, table: str) -> None:
         rows.append((what, text) if what else (rows[-1][0], f"{rows.pop()[1]} {text}"))
     for what, text in rows:
         flags, options = _option(what.split())
-        parser.add_argument(*flags, **options, help=text)
+        words = options.pop("words", ())
+        parser.add_argument(*flags, **options, help=text).words = words  # type: ignore[attr-defined]
 
 
 def actions(
@@ -163,6 +183,8 @@ def _option(words: list[str]) -> tuple[list[str], dict[str, Any]]:
             options |= {"action": "append", "default": []}
         elif word in ("?", "+"):
             options["nargs"] = word
+        elif word[0] == "?":
+            options |= {"nargs": "?", "words": tuple(word[1:].split(","))}
         elif word[0] == "=":
             options["default"] = word[1:]
         elif word[0] == ">":

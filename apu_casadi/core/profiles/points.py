@@ -1,7 +1,6 @@
 """Profiles by points: a table of times and values, from a list or a file, in lines or in steps.
 
-A file has commas between its cells and a header with the names of its columns, one of them
-``time``, s::
+A file has a line with the names of its columns, one of them ``time``, s::
 
     time,altitude,Mach
     0,0,0.2
@@ -9,32 +8,33 @@ A file has commas between its cells and a header with the names of its columns, 
     1800,11000,0.55
 
 Empty lines, and lines that begin with ``#``, count for nothing.  Two rows of one time are a jump.
+Cells may be separated by semicolons, tabs or bars, numbers have decimal commas, names a unit,
+``altitude [ft]``, or a row of units below; Parquet and netCDF are read by their endings.  A number
+that stands for no value, such as -999 or 9999, is refused until ``missing`` tells what it is.
 """
 
 from __future__ import annotations
 
-import csv
 import itertools
-import math
 import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from apu_casadi.core import files
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import PROFILES, Profile, in_run
 from apu_casadi.core.register import Key
 from apu_casadi.core.sharing import Parametric, derived
-from apu_casadi.core.units import unit_of
+from apu_casadi.core.tables.numbertable import read_numbers
+from apu_casadi.core.tables.tablelayout import DECIMALS, TableLayout
+from apu_casadi.core.units import header
 
-FILE_KEYS = ("file", "column", "time")
-"""Keys of a profile that is read from a file; the last two have defaults."""
+FILE_KEYS = ("file", "column", "time", "decimal", "missing")
+"""Keys of a profile that is read from a file; all but the first have defaults."""
 LARGEST_FILE = 1 << 26
 """Largest file of a profile, bytes."""
 _BEFORE = "is before the profile begins; its time counts from 0 s, where its phase or event starts"
@@ -56,6 +56,7 @@ class OfPoints(Parametric, Profile):
     source: str = field(default="", compare=False)
 
     by_value = True
+    from_files = True
     keys: ClassVar[tuple[Key, ...]] = (
         Key("times", "s", "times, never decreasing"),
         Key("values", "", "a value for each time"),
@@ -110,8 +111,10 @@ class OfPoints(Parametric, Profile):
         return "file" in table or ("times" in table and "values" in table)
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any], name: str, folder: str = "") -> Self:
-        """Make it from times and values, or from file and column."""
+    def from_table(
+        cls, table: Mapping[str, Any], name: str, folder: str = "", unit: str = ""
+    ) -> Self:
+        """Make it from times and values, or from file and column; ``unit`` is the wanted one."""
         known = {"file": FILE_KEYS, "times": ("times", "values")}
         keys = known["file" if "file" in table else "times"]
         for k in table:
@@ -122,115 +125,96 @@ class OfPoints(Parametric, Profile):
                 if k not in table:
                     raise ScenarioError(f"{k}: missing: a {cls.word!r} profile needs it")
             return cls(table["times"], table["values"])
+        missing = table.get("missing")
+        if missing is not None and not _cells(missing):
+            raise ScenarioError(
+                f"missing: a list of numbers and texts is expected, got {missing!r}"
+            )
         texts = {"column": name, "time": "time", **table}
         for k, v in texts.items():
-            if not isinstance(v, str) or not v:
+            if k != "missing" and (not isinstance(v, str) or not v):
                 raise ScenarioError(f"{k}: a text is expected, got {v!r}")
-        return cls.from_csv(Path(folder) / texts["file"], texts["column"], time=texts["time"])
+        if texts.get("decimal", "point") not in DECIMALS:
+            raise ScenarioError(f"decimal: point or comma is expected, got {texts['decimal']!r}")
+        path, column = Path(folder) / texts["file"], texts["column"]
+        how: dict[str, Any] = {"decimal": texts.get("decimal"), "missing": missing}
+        return cls.from_csv(path, column, time=texts["time"], unit=unit, **how)
 
     def to_table(self) -> dict[str, Any]:
         """Return times and values: what is written down is complete without the file."""
         return {"kind": self.word, "times": list(self.times), "values": list(self.points)}
 
     @classmethod
-    def from_csv(cls, path: str | os.PathLike[str], column: str, *, time: str = "time") -> Self:
+    def from_csv(
+        cls,
+        path: str | os.PathLike[str],
+        column: str,
+        *,
+        time: str = "time",
+        unit: str = "",
+        decimal: str | None = None,
+        missing: Sequence[float | str] | None = None,
+    ) -> Self:
         """Read a column of a file.
 
         Args:
             path: see the module's text.
             column, time: names of the columns of the values and of the times, s.
+            unit: of the values wanted; "" where a unit in the file is refused.
+            decimal: ``"point"`` or ``"comma"``, where the file leaves it open.
+            missing: numbers and words that stand for no value: such rows are left out, as are
+                empty ones.  None refuses them.
 
         Raises:
             DataError: the file cannot be read, lacks a column, or has a cell that is no finite
-                number or a time before the last one; with row and column.
+                number, a number that stands for none, or a time before the last one; with row and
+                column.
         """
-        rows = _read(path, (time, column))
-        row, (t, _) = rows[0]
-        if t < 0:
-            raise DataError(f"{path}: row {row}, column {time!r}: {t:g} s {_BEFORE}")
-        for (_, (before, _)), (row, (t, _)) in itertools.pairwise(rows):
-            if t < before:
+        (time, _), (column, own) = header(time), header(column)
+        unit = unit or own or ""  # who names the unit of the column in column = "..." means it
+        layout = _Layout(decimal=decimal, missing=tuple(missing or ()))
+        table = read_numbers(
+            path, (time, column).__contains__, what="profile", layout=layout, limit=LARGEST_FILE
+        )
+        gaps = {"gaps": missing is not None, "codes": missing is not None}
+        times, values = table.numbers(time, "s"), table.numbers(column, unit, **gaps)
+        there = np.flatnonzero(np.isfinite(values)).tolist()
+        if not there:
+            raise DataError(f"{path}: no rows: names {time} and {column}, then numbers")
+        t = {k: float(times[k]) for k in there}
+        if t[there[0]] < 0:
+            raise DataError(f"{table.place(there[0], time)}: {t[there[0]]:g} s {_BEFORE}")
+        for i, k in itertools.pairwise(there):
+            if t[k] < t[i]:
                 raise DataError(
-                    f"{path}: row {row}, column {time!r}: {t:g} s is before {before:g} s in the "
-                    "row before; sort the rows by time"
+                    f"{table.place(k, time)}: {t[k]:g} s is before {t[i]:g} s in the row before; "
+                    "sort the rows by time"
                 )
-        times, points = zip(*(cells for _, cells in rows), strict=True)
-        for (_, (first, _)), (row, (t, _)) in zip(rows, rows[2:], strict=False):
-            if t == first:
-                raise DataError(f"{path}: row {row}, column {time!r}: {t:g} s {_THRICE}")
-        return cls(times, points, f"{Path(path).name}, {column}")
+        for i, k in zip(there, there[2:], strict=False):
+            if t[k] == t[i]:
+                raise DataError(f"{table.place(k, time)}: {t[k]:g} s {_THRICE}")
+        points = tuple(float(values[k]) for k in there)
+        return cls(tuple(t.values()), points, f"{Path(path).name}, {column}")
 
 
-def _read(path: str | os.PathLike[str], wanted: tuple[str, str]) -> list[tuple[int, list[float]]]:
-    """Return two columns of a file, each row with its number in the file."""
-    text = files.table_text(files.read_bytes(path, "profile", LARGEST_FILE), path)
-    header, rows = None, []
-    for row, cells in _cells(path, text):
-        cells = [c.strip() for c in cells]
-        if not any(cells) or cells[0].startswith("#"):
-            continue
-        if header is None:
-            header = cells
-            at = [_column(path, row, header, name) for name in wanted]
-            continue
-        if len(cells) != len(header):
-            raise DataError(
-                f"{path}: row {row}: {len(cells)} cells, the header has {len(header)} columns"
-            )
-        rows.append(
-            (row, [_number(path, row, n, cells[k]) for n, k in zip(wanted, at, strict=True)])
-        )
-    if not rows:
-        raise DataError(f"{path}: no rows: a header with {' and '.join(wanted)}, then numbers")
-    return rows
+def _cells(missing: Any) -> bool:
+    kinds = isinstance(missing, list) and all(isinstance(m, int | float | str) for m in missing)
+    return kinds and not any(isinstance(m, bool) for m in missing)
 
 
-def _cells(path: Any, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each row."""
-    row = 0
-    try:
-        for row, cells in enumerate(csv.reader(text.split("\n")), 1):
-            yield row, cells
-    except csv.Error as e:
-        raise DataError(f"{path}: row {row + 1}: no cells with commas between: {e}") from None
+@dataclass(frozen=True)
+class _Layout(TableLayout):
+    """What the keys of a profile say of its file."""
 
-
-def _column(path: Any, row: int, header: list[str], name: str) -> int:
-    if header.count(name) == 1:
-        return header.index(name)
-    if name in header:
-        raise DataError(f"{path}: row {row}: column {name!r} stands {header.count(name)} times")
-    if wrong := files.no_commas(header):
-        raise DataError(f"{path}: row {row}: {wrong}")
-    if own := next((h for h in header if re.fullmatch(rf"{re.escape(name)}\s*[\[({{].*", h)), ""):
-        raise DataError(
-            f"{path}: row {row}: column {own!r} has a unit; profiles are in the unit of the "
-            f"scenario's key: convert the values and name it {name!r}, or give column = {own!r} if "
-            "it is that unit"
-        )
-    raise DataError(f"{path}: row {row}: no column {name!r} {nearest(name, header)}")
-
-
-def _number(path: Any, row: int, column: str, text: str) -> float:
-    where = f"{path}: row {row}, column {column!r}"
-    try:
-        value = float(text)
-    except ValueError:
-        raise DataError(f"{where}: a number is expected, got {text!r}{_remedy(text)}") from None
-    if not math.isfinite(value):
-        raise DataError(f"{where}: must be finite, got {text!r}")
-    return value
-
-
-def _remedy(cell: str) -> str:
-    """Return what to do about a cell that is no number, where that can be told."""
-    if unit_of(cell.strip("[]() ")) is not None:
-        return ": delete the row of units; a profile is in the unit of the scenario's key"
-    if re.match(r"\d{1,4}[-/.]\d\d?[-/.]\d", cell) or cell.count(":") > 1:
-        return ": times are seconds from the start of the phase, not dates"
-    if re.fullmatch(r"[-+\u2212]?[\d,. ']+", cell):
-        return ": write numbers with a point and without signs between thousands"
-    return ": complete the row, or delete it" if not cell else ""
+    remedies = {
+        **TableLayout.remedies,
+        "decimal": 'give decimal = "comma" or "point" beside file',
+        "gap": ": correct it, or give missing = [{}] beside file to leave such rows out",
+        "empty": "complete the row, delete it, or give missing = [] beside file to leave it out",
+        "sentinel": "give missing = [{0}] beside file to leave such rows out, or missing = [] if "
+        "{0} is right",
+        "unit": "profiles are in the unit of the scenario's key: convert the values, and delete it",
+    }
 
 
 @PROFILES.add("table")

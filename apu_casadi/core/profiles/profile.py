@@ -47,6 +47,8 @@ class Profile(ABC):
     #: Whether it has many bends, so that what depends on it is better told by its value than by
     #: the time.
     by_value: ClassVar[bool] = False
+    #: Whether a table may name a file; ``from_table`` then takes the unit that is wanted.
+    from_files: ClassVar[bool] = False
 
     @overload
     def __call__(self, t: float) -> float: ...
@@ -112,13 +114,14 @@ PROFILES: Register[type[Profile]] = Register("profile", "apu_casadi.core.profile
 
 
 def profile_from_table(
-    table: Mapping[str, Any], name: str, folder: str | os.PathLike[str] = ""
+    table: Mapping[str, Any], name: str, folder: str | os.PathLike[str] = "", unit: str = ""
 ) -> Profile:
     """Return the profile that a table of a scenario file describes.
 
     Args:
         name: what it stands for, such as ``"altitude"``: the column of a file that names none.
         folder: from which the files that it names are seen; the current one if empty.
+        unit: of the values, into which those of a file are brought.
 
     Raises:
         ScenarioError: no kind has such keys, or a wrong key or value; the text starts with the key.
@@ -129,7 +132,7 @@ def profile_from_table(
         if table["kind"] not in PROFILES:
             hint = nearest(str(table["kind"]), PROFILES)
             raise ScenarioError(f"kind: unknown profile {table['kind']!r} {hint}")
-        return PROFILES[table["kind"]].from_table(rest, name, os.fspath(folder))
+        return _made(PROFILES[table["kind"]], rest, name, os.fspath(folder), unit)
     found = next((cls for cls in PROFILES.classes if cls.told_by(table)), None)
     if found is None:
         known = dict.fromkeys(k.name for cls in PROFILES.classes for k in cls.keys) | {"file": None}
@@ -140,7 +143,13 @@ def profile_from_table(
             f"{c.word}: {', '.join(k.name for k in c.keys)}" for c in PROFILES.classes
         )
         raise ScenarioError(f"kind: missing, and the keys tell no profile (known are {words})")
-    return found.from_table(rest, name, os.fspath(folder))
+    return _made(found, rest, name, os.fspath(folder), unit)
+
+
+def _made(cls: Any, table: Mapping[str, Any], name: str, folder: str, unit: str) -> Profile:
+    own = {"unit": unit} if cls.from_files else {}
+    made: Profile = cls.from_table(table, name, folder, **own)
+    return made
 
 
 def in_run(times: Iterable[float], duration: float) -> tuple[float, ...]:

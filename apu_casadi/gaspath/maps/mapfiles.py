@@ -20,7 +20,8 @@ rising::
     ...
 
 Columns may stand in any order; empty lines and empty cells at the end of a line, as spreadsheets
-write them, are ignored.
+write them, are ignored.  Semicolons, tabs or bars may separate the cells, with decimal commas in
+the numbers (``# decimal: comma`` where that is open); units may stand in names or a row below.
 
 **GasTurb/GSP.**  See :mod:`apu_casadi.gaspath.maps.gasturbmaps`.
 
@@ -31,7 +32,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -41,6 +43,9 @@ import numpy as np
 from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, MapError, nearest
 from apu_casadi.core.sharing import once
+from apu_casadi.core.tables.numbertable import numbers_of
+from apu_casadi.core.tables.tablelayout import TableLayout
+from apu_casadi.core.units import header
 from apu_casadi.gaspath.maps.gasturbmaps import read_map_gasturb, section_of
 from apu_casadi.gaspath.maps.mapcheck import Finding
 from apu_casadi.gaspath.maps.mapreading import file_lines, number, one_line, table_of
@@ -157,66 +162,72 @@ def read_map_csv(path: str | Path, *, check: bool = True) -> MapTable:
 _Rows = list[tuple[int, list[float]]]
 
 
+@dataclass(frozen=True)
+class _Layout(TableLayout):
+    """What to do about questions that a map file leaves."""
+
+    remedies = {
+        **TableLayout.remedies,
+        "decimal": "write decimal points, or a line '# decimal: comma' (or point) at the top",
+        "empty": "maps may have no holes: fill the cell or remove the whole speed or beta line",
+        "sentinel": "maps may have no holes: remove the whole speed or beta line; if {0} is right, "
+        "write it with one digit more",
+    }
+
+
 def _csv_blocks(path: str | Path) -> tuple[dict[str, tuple[str, int]], _Rows, _Rows]:
     """Return the keys of comments, the rows of grid and surge line, each with its line."""
+    lines = file_lines(path)
+    body = [(k, x) for k, x in enumerate(lines, 1) if x.strip()]
+    at, free = next(((k, x) for k, x in body if not x.lstrip(' "').startswith("#")), (0, ""))
+    first = re.fullmatch(r'\s*"?sep=(.)"?\s*', free, re.IGNORECASE)
+    sep = first[1] if first else next((d for d in ";\t|" if d in free), ",")
+    body = [(k, x) for k, x in body if not (first and k == at)]
+    body = [(k, x.rstrip(f"{sep} ")) for k, x in body if x.strip(f"{sep} ")]
     meta: dict[str, tuple[str, int]] = {}
-    grid: _Rows = []
-    surge: _Rows = []
-    columns: list[str] = []  # of the block being read; empty before the first header
-    rows = grid
-    for k, cells in _csv_rows(path):
-        row = [c.strip() for c in cells]
-        while row and not row[-1]:
-            row.pop()
-        if not row:
-            continue
-        if row[0].startswith("#"):
-            key, colon, value = ", ".join(row).lstrip("# ").partition(":")
+    heads: list[int] = []  # lines of the headers: of the grid, and of each surge line
+    for k, x in body:
+        if x.lstrip(' "').startswith("#"):
+            key, colon, value = ", ".join(_cells(path, k, x, sep)).lstrip("# ").partition(":")
             if colon:
                 meta.setdefault(key.strip().lower(), (value.strip(), k))
-            continue
-        if not columns:
-            columns, rows = _csv_header(path, k, row, GRID_COLUMNS), grid
-            continue
-        if "W_surge" in row or "PR_surge" in row:
-            columns, rows = _csv_header(path, k, row, SURGE_COLUMNS), surge
-            continue
-        if len(row) != len(columns):
-            raise DataError(
-                f"{path}, line {k}: {len(columns)} values expected ({','.join(columns)}), "
-                f"got {len(row)}"
-            )
-        values = {}
-        for name, cell in zip(columns, row, strict=True):
-            values[name] = number(cell, f"{path}, line {k}, column {name}")
-            if wrong := fault(name, values[name]):
-                raise MapError(f"{path}, line {k}, column {name}: {cell}; {wrong}")
-        wanted = GRID_COLUMNS if rows is grid else SURGE_COLUMNS
-        rows.append((k, [values[name] for name in wanted]))
-    return meta, grid, surge
+        elif not heads or "W_surge" in x or "PR_surge" in x:
+            heads.append(k)
+    kept = {k: x for k, x in body if not x.lstrip(' "').startswith("#")}
+    blocks: list[_Rows] = [[], []]
+    decimal = meta["decimal"][0].lower() if "decimal" in meta else None
+    for i, (k, end) in enumerate(pairwise([*heads, len(lines) + 1])):
+        wanted = GRID_COLUMNS if i == 0 else SURGE_COLUMNS
+        _csv_header(path, k, [header(c)[0] for c in _cells(path, k, kept[k], sep)], wanted)
+        text = "\n".join(kept.get(n, "") if n >= k else "" for n in range(1, end))
+        if i and decimal is None and sep != "," and "," in kept.get(k - 1, "") + kept[heads[0] + 1]:
+            decimal = "comma"  # as in the grid, which has been read
+        blocks[min(i, 1)] += _csv_block(path, text, wanted, _Layout(delimiter=sep, decimal=decimal))
+    return meta, blocks[0], blocks[1]
 
 
-def _csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
-    """Return the cells of each line with its number.
-
-    Raises:
-        DataError: a cell that is longer than any number, such as one behind an open quotation mark.
-    """
-    reader, k = csv.reader(file_lines(path)), 0
-    while True:
-        k += 1
-        try:
-            row = next(reader, None)
-        except csv.Error as e:
-            raise DataError(f"{path}, line {k}: no row of numbers; {e}") from None
-        if row is None:
-            return
-        yield k, row
+def _csv_block(path: str | Path, text: str, wanted: Sequence[str], layout: TableLayout) -> _Rows:
+    """Return the rows below a header, each with its line; a percent is a hundredth."""
+    table = numbers_of(path, text, wanted.__contains__, layout)
+    columns = []
+    for name in wanted:
+        own = table.column(name).unit if name in ("N", "W", "W_surge") else "1"
+        columns.append(table.numbers(name, own or "", codes=False).tolist())
+        for k, value in enumerate(columns[-1]):
+            if wrong := fault(name, value):
+                raise MapError(f"{table.place(k, name)}: {value:.9g}; {wrong}")
+    rows = zip(*columns, strict=True)
+    return [(line, list(row)) for line, row in zip(table.lines or (), rows, strict=True)]
 
 
-def _csv_header(path: str | Path, k: int, row: list[str], wanted: Sequence[str]) -> list[str]:
-    if wrong := files.no_commas(row):
-        raise DataError(f"{path}, line {k}: {wrong}")
+def _cells(path: str | Path, k: int, line: str, sep: str) -> list[str]:
+    try:
+        return [c.strip() for c in next(csv.reader([line], delimiter=sep))]
+    except csv.Error as e:
+        raise DataError(f"{path}, line {k}: no row of numbers; {e}") from None
+
+
+def _csv_header(path: str | Path, k: int, row: list[str], wanted: Sequence[str]) -> None:
     missing = [c for c in wanted if c not in row]
     unknown = [c for c in row if c not in wanted]
     if missing:
@@ -228,9 +239,8 @@ def _csv_header(path: str | Path, k: int, row: list[str], wanted: Sequence[str])
     if unknown or len(set(row)) < len(row):
         raise DataError(
             f"{path}, line {k}: the header must hold {','.join(wanted)}, each once, got "
-            f"{','.join(row)!r}"
+            f"{','.join(row)!r}: delete the other columns"
         )
-    return row
 
 
 def _csv_axes(

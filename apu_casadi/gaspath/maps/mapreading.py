@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import ApuWarning, DataError, MapError
+from apu_casadi.core.tables.numbertable import table_text
 from apu_casadi.gaspath.maps.mapcheck import Finding
 from apu_casadi.gaspath.maps.maptable import MapTable, found_text
 
@@ -28,9 +28,12 @@ def file_lines(path: str | Path) -> list[str]:
         DataError: it cannot be read, or is empty.
     """
     try:
-        text = files.table_text(Path(path).read_bytes(), path)
+        raw = Path(path).read_bytes()
     except OSError as e:
         raise DataError(f"{path}: cannot read the map file: {e.strerror}") from None
+    if raw.startswith((b"PAR1", b"CDF", b"\x89HDF")):
+        raise DataError(f"{path}: Parquet and netCDF are no map files: export the map as CSV")
+    text = table_text(raw, path)
     if not text.strip():
         raise DataError(f"{path}: the map file is empty")
     return text.splitlines()

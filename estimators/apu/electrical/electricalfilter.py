@@ -20,6 +20,7 @@ from apu_casadi.machine.terminals import (
     SHUNTS,
     balanced_state,
     before,
+    continued,
     jumps,
     middle_weight,
     midpoints,
@@ -177,22 +178,23 @@ class ElectricalFilter(Parametric):
         out = {}
         full = {n: filled(t, a[n], w, HARMONICS_OF[n], n)[0] for n in GAIN_SENSORS}
         share = middle_weight(w, np.append(np.diff(t), 0.0))
-        for names, harmonics in (((*PHASES_V, *PHASES_I), (1, 3)), (("V_fd", "i_fd"), (0, 2))):
-            # a missing current is predicted as well
-            x = np.array([full[n] for n in names])
-            for n, p in zip(names, before(t, x, w, harmonics=harmonics), strict=True):
-                off = np.abs(a[n] - p) > SMOOTH_LIMIT * self.sensors.sigma(n, 0.0)
-                out[f"{n}_smooth"] = p = np.where(off, a[n], p)
-                if n in VOLTAGES:
-                    rest = a[n] - p
-                    rest = (rest + np.append(rest[1:], 0.0)) * (share if n in PHASES_V else 0.5)
-                    # what the ends are short of their readings, the middle is, too: it cancels
-                    out[f"{n}_mid_smooth"] = given[f"{n}_mid"] - rest
-                    out[f"{n}_next_smooth"] = np.append(p[1:], a[n][-1])
-        v, i = (
-            2 / 3 * (TURN @ before(t, np.array([full[n] for n in names]), w, space=True))
-            for names in (PHASES_V, PHASES_I)
-        )
+        # a missing current is predicted as well
+        phases, field = ([*PHASES_V, *PHASES_I], ["V_fd", "i_fd"])
+        x, slow = (np.array([full[n] for n in names]) for names in (phases, field))
+        turning = continued(t, x, w, 1)
+        predicted = turning.real + continued(t, x, w, 3).real
+        for n, p in zip(
+            (*phases, *field), (*predicted, *before(t, slow, w, harmonics=(0, 2))), strict=True
+        ):
+            off = np.abs(a[n] - p) > SMOOTH_LIMIT * self.sensors.sigma(n, 0.0)
+            out[f"{n}_smooth"] = p = np.where(off, a[n], p)
+            if n in VOLTAGES:
+                rest = a[n] - p
+                rest = (rest + np.append(rest[1:], 0.0)) * (share if n in PHASES_V else 0.5)
+                # what the ends are short of their readings, the middle is, too: it cancels
+                out[f"{n}_mid_smooth"] = given[f"{n}_mid"] - rest
+                out[f"{n}_next_smooth"] = np.append(p[1:], a[n][-1])
+        v, i = (2 / 3 * (TURN @ of) for of in (turning[:3], turning[3:]))
         p = self.machine
         out["theta_smooth"] = np.angle(v + (p.r_s + 1j * w * (p.L_mq + p.L_ls)) * i)
         return out

@@ -24,7 +24,15 @@ from estimators.apu.electrical.tuning import (
 )
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
-from estimators.filters.filtering import FilterResult, FilterStep, StepMaker, run
+from estimators.filters.filtering import (
+    FilterResult,
+    FilterStep,
+    StepMaker,
+    result_of,
+    run,
+    sweep_of,
+)
+from estimators.filters.sweeping import Sweep
 from estimators.models.recording import Recording
 
 __all__ = ["LostError", "track", "window_power"]
@@ -83,12 +91,13 @@ def track(
     own = filt.gains == "consider" if own_level is None else own_level
     made, model = step(filt.model), filt.model
     pieces: list[FilterResult] = []
+    sweep = _sweep(made, prior, data, cov_at, backend)
     resets: list[float] = []
     share = np.zeros(0)  # mean NIS of the windows since the last reset
     at = 0
     while at < data.size:
         stop = min(at + CHUNK, data.size)
-        r, ahead = _filtered(made, prior, data, at, stop, cov_at, backend)
+        r, ahead = _filtered(made, sweep, prior, data, at, stop, cov_at, backend)
         judged, share = share.size, np.append(share, _window_means(r.nis))
         white = np.full(share.size - judged, float(len(MEASURED)))
         usual = _usual(share, judged) if own else white
@@ -109,13 +118,14 @@ def track(
             )
         cut = at + _onset(r.nis, (int(bad[0]) - judged) * RESET_WINDOW)
         if cut > at:
-            r, prior = _filtered(made, prior, data, at, cut, cov_at, backend)
+            r, prior = _filtered(made, sweep, prior, data, at, cut, cov_at, backend)
             pieces.append(r)
         prior = Belief(model.x, prior.mean, prior.cov + _opened(filt))
         resets.append(float(data.t[cut]))
         if filt.gains == "estimate":
             filt = considering(filt)
             made, model = step(filt.model), filt.model
+            sweep = _sweep(made, prior, data, cov_at, backend)
             own = own_level is None or own_level
         share, at = np.zeros(0), cut
     return _loosened(filt, _joined(pieces)), resets
@@ -159,8 +169,22 @@ def _opened(filt: ElectricalFilter) -> np.ndarray:
     return out
 
 
+def _sweep(
+    made: FilterStep,
+    prior: Belief,
+    data: Recording,
+    cov_at: np.ndarray | None,
+    backend: str | None,
+) -> Sweep | None:
+    """Return the filter over parts of the recording, each of which begins where one has ended."""
+    m = made.model
+    free = not (np.isfinite(m.lower).any() or np.isfinite(m.upper).any())
+    return sweep_of(made, prior, data, cov_at, backend) if free else None
+
+
 def _filtered(
     made: FilterStep,
+    sweep: Sweep | None,
     prior: Belief,
     data: Recording,
     start: int,
@@ -169,6 +193,10 @@ def _filtered(
     backend: str | None,
 ) -> tuple[FilterResult, Belief]:
     """Filter samples from start up to stop, and return the belief at stop before its sample."""
+    piece = None if sweep is None else sweep.piece(start, stop, prior)
+    if piece is not None:
+        r = result_of(made.model, data, start, piece, cov_at is not None)
+        return r, piece.ahead or r.final
     more = stop < data.size
     part = data.part(start, stop + more)
     y = part.y.copy()

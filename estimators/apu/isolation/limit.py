@@ -18,7 +18,7 @@ from estimators.apu.isolation.problem import CLASSES, DEFAULT, DT, FAULTS, OUTPU
 from estimators.apu.isolation.scores import scores
 from estimators.apu.isolation.windowmodel import JUMPS, directions_of, model_of, prior_of
 from estimators.detection.signatures import LinearFilter, linear_filter
-from estimators.models.filtermodel import FilterModel
+from estimators.models.filtermodel import FilterModel, inlined
 
 __all__ = ["information_limit", "linear_problem", "white_signatures"]
 
@@ -54,7 +54,7 @@ def linear_problem(
 @kept
 def _jacobians(model: FilterModel) -> ca.Function:
     x, u, p, w, dt = model.symbols()
-    x1, y = model.transition(x, u, p, w, dt)[0], model.output(x, u, p, w)[0]
+    x1, y = inlined(model.transition, x, u, p, w, dt)[0], inlined(model.output, x, u, p, w)[0]
     J = [ca.jacobian(e, v) for e in (x1, y) for v in (x, w)]
     f = ca.Function("J", [x, u, p, w, dt], J)
     xs, us, ts = ca.MX.sym("x", len(model.x)), ca.MX.sym("u", len(model.u)), ca.MX.sym("dt")

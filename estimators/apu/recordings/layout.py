@@ -28,10 +28,10 @@ from pathlib import Path
 from typing import Any
 
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.tables.columns import cut
+from apu_casadi.core.tables.tablelayout import TableLayout
 from apu_casadi.core.units import UNITS, gauge_of, unit_of
 from apu_casadi.gaspath.gasgenerator import GasGenerator
-from estimators.apu.recordings.columns import cut
-from estimators.apu.recordings.numbertext import DECIMALS
 from estimators.apu.recordings.plausible import PLAUSIBLE, Limits, plausible_for
 
 __all__ = ["Reading", "merged", "parse_mapping", "pressure", "read_layout"]
@@ -40,49 +40,47 @@ Columns = dict[str, tuple[str, str | None]]
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How a file is to be read, where it leaves a question.
+class Reading(TableLayout):
+    """How a recording is to be read, where it leaves a question.
 
     Args:
-        encoding: of a text file, such as ``"utf-16"``; default UTF-8.
-        decimal: ``"point"`` or ``"comma"``.
-        missing: numbers, in the unit of the file, and words that stand for a gap.
         exclude: leave impossible readings out instead of refusing them.
         ranges: quantity -> (lowest, highest), SI; go before the table's.
-        time_format, time_zone: see :func:`~estimators.apu.recordings.timestamps.to_seconds`.
-        names, units: of the columns in order; "" leaves a column out.
+        time_format, time_zone: see :func:`~apu_casadi.core.tables.timestamps.to_seconds`.
         rate: of the rows, Hz, where no column is the time.
         time: name of the time column.
-        delimiter: between cells of a text file.
-        names_line, units_line, data_line: of a text file, from 1; data_line is the first of it.
         barometer: pressure of the surrounding air, Pa, for gauge pressures.
         sort: put the rows in the order of time.
         engine: the engine that the readings are of; 100 % speed is its design speed, and the ranges
             of flows, powers and speeds are those of its size.
     """
 
-    encoding: str | None = None
-    decimal: str | None = None
-    missing: tuple[float | str, ...] = ()
     exclude: bool = False
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     time_format: str | None = None
     time_zone: str | None = None
-    names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
     rate: float | None = None
     time: str | None = None
-    delimiter: str | None = None
-    names_line: int | None = None
-    units_line: int | None = None
-    data_line: int | None = None
     barometer: float | None = None
     sort: bool = False
     engine: GasGenerator = field(default_factory=GasGenerator)
 
+    known_head = skips_unnamed = False
+    remedies = {
+        **TableLayout.remedies,
+        "decimal": "give --decimal comma or point",
+        "gap": " (an empty cell is a gap): correct it, or give --missing={} if it stands for a gap",
+        "name": "write one into that line, or give --names",
+        "head": "give --names A,B,... (and --units) if the file has none",
+        "encoding": "give --encoding{}",
+        "above": "delete one of the lines, or give names_line, units_line and data_line by "
+        "--columns FILE",
+        "between": "if it holds units, give them by --units or units_line (--columns FILE), else "
+        "delete it",
+    }
+
     def __post_init__(self) -> None:
-        if self.decimal is not None and self.decimal not in DECIMALS:
-            raise DataError(f"decimal {self.decimal!r}: point or comma is expected")
+        super().__post_init__()
         if self.rate is not None and not (math.isfinite(self.rate) and self.rate > 0):
             raise DataError(f"rate = {self.rate!r} Hz must be > 0")
         if self.delimiter is not None and len(self.delimiter) != 1:
@@ -105,16 +103,6 @@ class Reading:
         return Limits(
             {**plausible_for(self.engine), **self.ranges}, self.exclude, tuple(self.ranges)
         )
-
-    @property
-    def gaps(self) -> tuple[float, ...]:
-        """Numbers that stand for a gap."""
-        return tuple(m for m in self.missing if not isinstance(m, str))
-
-    def means_gap(self, cell: str) -> bool:
-        """Tell whether a cell is one of the words that were given for a gap."""
-        words = [m.strip().lower() for m in self.missing if isinstance(m, str)]
-        return bool(words) and cell.strip().lower() in words
 
 
 def pressure(text: str) -> float:

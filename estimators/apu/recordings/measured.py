@@ -24,11 +24,11 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
 from apu_casadi.core.results import load
-from estimators.apu.recordings.binaryfiles import time_dims
+from apu_casadi.core.tables.binaryfiles import time_dims
+from apu_casadi.core.tables.timestamps import Start, is_time_name
 from estimators.apu.recordings.layout import Reading, merged, parse_mapping, read_layout
 from estimators.apu.recordings.plausible import PLAUSIBLE, WAVES, plain, si_of
 from estimators.apu.recordings.recorded import Table, read_data, read_table
-from estimators.apu.recordings.timestamps import Start, is_time_name
 from estimators.apu.sensors import ELECTRICAL
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
+from apu_casadi.core.tables.sentinels import SENTINELS
 from apu_casadi.core.units import UNITS
 from apu_casadi.gaspath.conditions import RANGES as CONDITIONS
 from apu_casadi.gaspath.gasgenerator import GasGenerator
@@ -79,10 +80,8 @@ _USUAL = {
     "A": ("mA", "kA"),
     "m": ("ft", "km"),
 }
-#: What loggers write for "no reading", where a range would let it pass.
-_SENTINELS = (-999.0, -9999.0, -99999.0, -32768.0, -32767.0)
 #: Full scales and codes that count only where they stand apart from all other readings.
-_CODES = (*_SENTINELS, -40.0, -1.0, 255.0, 850.0, 888.0, 1023.0, 4095.0, 8888.0, 32767.0, 65535.0)
+_CODES = (*SENTINELS, -40.0, -1.0, 255.0, 850.0, 888.0, 1023.0, 4095.0, 8888.0, 32767.0, 65535.0)
 _NINES = (99.0, 99.9, 99.99, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0)
 _RUN = 8  # equal readings in a row, while others change, that look stuck
 
@@ -159,7 +158,7 @@ class Limits:
             return values
         low, high = self.ranges[kind]
         there = np.isfinite(values)
-        out = there & ((values < low) | (values > high) | np.isin(raw, _SENTINELS))
+        out = there & ((values < low) | (values > high) | np.isin(raw, SENTINELS))
         if kind in WAVES:
             out &= (values < low) | (values > high)
         apart = np.zeros_like(out) if name in self.given else _apart(raw, there & ~out)

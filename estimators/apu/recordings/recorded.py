@@ -22,15 +22,11 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
-from apu_casadi.core.units import GAUGE, UNITS, convert, gauge_of, split_unit, unit_of
-from apu_casadi.gaspath.gasgenerator import GasGenerator
-from estimators.apu.recordings.binaryfiles import netcdf_columns, parquet_columns
-from estimators.apu.recordings.columns import Column
-from estimators.apu.recordings.layout import Reading, parse_mapping
-from estimators.apu.recordings.memory import memory_columns
-from estimators.apu.recordings.plausible import PLAUSIBLE, WAVES, clipped, plain, si_of, stuck
-from estimators.apu.recordings.textfiles import text_columns
-from estimators.apu.recordings.timestamps import (
+from apu_casadi.core.tables.binaryfiles import netcdf_columns, parquet_columns
+from apu_casadi.core.tables.columns import Column
+from apu_casadi.core.tables.memory import memory_columns
+from apu_casadi.core.tables.textfiles import text_columns
+from apu_casadi.core.tables.timestamps import (
     TIMES,
     Start,
     date_and_clock,
@@ -40,6 +36,10 @@ from estimators.apu.recordings.timestamps import (
     to_seconds,
     unit_in_name,
 )
+from apu_casadi.core.units import GAUGE, UNITS, convert, gauge_of, split_unit, unit_of
+from apu_casadi.gaspath.gasgenerator import GasGenerator
+from estimators.apu.recordings.layout import Reading, parse_mapping
+from estimators.apu.recordings.plausible import PLAUSIBLE, WAVES, clipped, plain, si_of, stuck
 from estimators.apu.sensors import KNOWN
 
 __all__ = ["TIMES", "UNITS", "Column", "Reading", "Table", "convert", "parse_mapping"]

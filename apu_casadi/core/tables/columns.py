@@ -109,6 +109,7 @@ def parsed(
     place: Callable[[int], str],
     tell: Tell,
     number: Callable[[str], float | None] = point,
+    remedy: str = " (an empty cell is a gap): correct it",
 ) -> Column:
     """Turn cells of text, or of mixed kinds, into a column.
 
@@ -139,10 +140,7 @@ def parsed(
         return Column(name, unit, values, values)
     if wrong and (good > len(wrong) or (good and good == len(wrong))):
         cell = cut(cells[wrong[0]])
-        raise DataError(
-            f"{place(wrong[0])}: {cell} is no number (an empty cell is a gap): correct it, or give "
-            f"--missing={cell} if it stands for a gap"
-        )
+        raise DataError(f"{place(wrong[0])}: {cell} is no number{remedy.format(cell)}")
     if wrong or not good:
         k = (wrong or words)[0]
         problem = f"{place(k)}: {cut(cells[k])} is no number"

@@ -13,10 +13,10 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.units import gauge_of, header, unit_of
-from estimators.apu.recordings.columns import (
+from apu_casadi.core.tables.columns import (
     Column,
     Tell,
     cut,
@@ -25,11 +25,12 @@ from estimators.apu.recordings.columns import (
     like_number,
     parsed,
 )
-from estimators.apu.recordings.layout import Reading
-from estimators.apu.recordings.numbertext import numbers_as, ungrouped, without_unit
-from estimators.apu.recordings.timestamps import is_time_name, looks_like_time
+from apu_casadi.core.tables.numbertext import numbers_as, ungrouped, without_unit
+from apu_casadi.core.tables.tablelayout import TableLayout
+from apu_casadi.core.tables.timestamps import is_time_name, looks_like_time
+from apu_casadi.core.units import gauge_of, header, unit_of
 
-__all__ = ["text_columns"]
+__all__ = ["columns_of", "decoded", "text_columns"]
 
 Row = tuple[int, list[str]]
 #: Anything but numbers with a point or a comma.
@@ -39,18 +40,33 @@ _COMMENT = re.compile(r"^\s*(#|%|//|;|!|')+\s*")
 
 
 def text_columns(
-    path: Path, tell: Tell, reading: Reading, known: Callable[[str], bool]
+    path: Path, tell: Tell, layout: TableLayout, known: Callable[[str], bool]
 ) -> tuple[list[Column], list[int]]:
     """Read a text file; return its columns and the line of each row.
 
     Args:
-        path, tell, reading: the file, who is told, and what is given.
+        path, tell, layout: the file, who is told, and what is given.
         known: tells whether the model knows a name, to find the line of names.
 
     Raises:
         DataError: says line, column and cell.
     """
-    text = _decoded(path, tell, reading.encoding)
+    try:
+        raw = path.read_bytes()
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read: {e.strerror or e}") from None
+    return columns_of(path, decoded(path, raw, tell, layout), tell, layout, known)
+
+
+def columns_of(
+    path: Path,
+    text: str,
+    tell: Tell,
+    layout: TableLayout,
+    known: Callable[[str], bool],
+    words: dict[str, list[str]] | None = None,
+) -> tuple[list[Column], list[int]]:
+    """Read the text of a file; as :func:`text_columns`; ``words`` takes the cells by column."""
     if _MINUS.search(text):
         tell(f"{path}: the typographic minus sign (U+2212) is read as a minus")
         text = _MINUS.sub("-", text)
@@ -64,26 +80,28 @@ def text_columns(
     ]
     if not kept:
         raise DataError(f"{path}: empty")
-    delimiter = reading.delimiter or (first[1] if first else _delimiter([x for _, x in kept]))
+    delimiter = layout.delimiter or (first[1] if first else _delimiter([x for _, x in kept]))
     rows = _rows(path, kept, delimiter)
-    head = _given_head(path, rows, reading) or _found_head(
-        _Head(path, rows, comments, delimiter, tell, reading, known)
+    head = _given_head(path, rows, layout) or _found_head(
+        _Head(path, rows, comments, delimiter, tell, layout, known)
     )
     top, names, units, body = head
+    if layout.pads_rows:
+        body = [(k, [*r, *[""] * (len(names) - len(r))]) for k, r in body]
     body = _whole(path, body, names, tell)
     cells = [[c.strip() for c in column] for column in zip(*(r for _, r in body), strict=True)]
     cells = cells or [[] for _ in names]
     for i, column in enumerate(cells):
         if _ODD.search("\n".join(column)):
             what = f"{path}, column {names[i] or i + 1}"
-            column = ["" if reading.means_gap(c) else c for c in column]
+            column = ["" if layout.means_gap(c) else c for c in column]
             column = ungrouped(column, what, tell) if delimiter != " " else column
             cells[i], units[i] = without_unit(column, units[i], what, tell)
-    number = numbers_as(path, cells, names, reading.decimal, tell)
+    number = numbers_as(path, cells, names, layout, tell)
     out = []
     at = [k for k, _ in body]
     for i, name in enumerate(names):
-        if not name and reading.names:
+        if not name and layout.names:
             continue
         if not name and i == 0 and looks_like_time(cells[0]):
             name = "time"  # as pandas writes an index of dates
@@ -91,14 +109,15 @@ def text_columns(
             tell(f"{path}, line {top}: the first column, without a name, numbers the rows")
             continue
         if not name:
-            if any(cells[i]):
+            if any(cells[i]) and not layout.skips_unnamed:
                 raise DataError(
-                    f"{path}, line {top}: column {i + 1} has no name: write one into that line, or "
-                    "give --names"
+                    f"{path}, line {top}: column {i + 1} has no name: {layout.remedies['name']}"
                 )
             continue
+        if words is not None:
+            words[name] = cells[i]
         place = lambda k, n=name: f"{path}, line {at[k]}, column {n}"  # noqa: E731
-        out.append(parsed(name, units[i], cells[i], place, tell, number))
+        out.append(parsed(name, units[i], cells[i], place, tell, number, layout.remedies["gap"]))
     return out, at
 
 
@@ -110,11 +129,13 @@ def _counts(cells: Sequence[str]) -> bool:
 # ------------------------------------------------------------------------------ text and rows
 
 
-def _decoded(path: Path, tell: Tell, encoding: str | None) -> str:
-    try:
-        raw = path.read_bytes()
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror or e}") from None
+def decoded(path: Any, raw: bytes, tell: Tell, layout: TableLayout) -> str:
+    """Return the text of a file: UTF-8, UTF-16 and UTF-32 with a mark, else Windows-1252.
+
+    Raises:
+        DataError: damaged, or no text.
+    """
+    encoding, remedy = layout.encoding, layout.remedies["encoding"]
     if encoding is not None:
         try:
             return raw.decode(encoding).removeprefix("\ufeff")
@@ -135,12 +156,13 @@ def _decoded(path: Path, tell: Tell, encoding: str | None) -> str:
         except UnicodeDecodeError as e:
             what = f"{path}: not a text file in UTF-8 (byte {e.start})"
             if b"\0" in raw:
-                raise DataError(f"{what}; give --encoding if it is text") from None
+                raise DataError(f"{what}; {remedy.format('')} if it is text") from None
             tell(f"{what}; read as Windows-1252")
             text = raw.decode("cp1252", errors="replace")
     if "\0" in text:
         half = next((n for n, k in (("le", 1), ("be", 0)) if not any(raw[k:200:2])), None)
-        hint = f"; if it is UTF-16 without a mark, give --encoding utf-16-{half}" if half else ""
+        hint = remedy.format(f" utf-16-{half}")
+        hint = f"; if it is UTF-16 without a mark, {hint}" if half else ""
         raise DataError(f"{path}: holds binary data, not CSV{hint}")
     return text
 
@@ -211,6 +233,8 @@ def _whole(path: Path, body: list[Row], names: Sequence[str], tell: Tell) -> lis
                 "are commas decimal commas as well as separators? export with ';' between cells"
                 if twice
                 else "is the file cut off? complete the line, or delete it"
+                if len(row) < width
+                else "a cell too many: correct the line, or delete it"
             )
             raise DataError(
                 f"{path}, line {line}: {len(row)} cells, but {width} columns are named; {why}"
@@ -234,7 +258,7 @@ class _Head:
     comments: list[tuple[int, str]]
     delimiter: str
     tell: Tell
-    reading: Reading
+    layout: TableLayout
     known: Callable[[str], bool]
 
     def start(self) -> int | None:
@@ -247,7 +271,10 @@ class _Head:
         width = Counter(map(len, some)).most_common(1)[0][0]
         last = [r for r in some if len(r) == width]
         last = last[len(last) // 2 :] if len(last) > 1 else last
-        numeric = [i for i in range(width) if _prevails([r[i] for r in last])]
+        for some in (last, last[-1:]):  # the latter where names and units are most of the rows
+            numeric = [i for i in range(width) if _prevails([r[i] for r in some])]
+            if numeric:
+                break
         for k, r in enumerate(rows[: max(len(rows) - 1, 1) if len(rows) > 1 else 1]):
             if len(r) == width and _prevails([r[i] for i in numeric]):
                 return k
@@ -264,54 +291,61 @@ def _prevails(cells: Sequence[str]) -> bool:
 
 
 def _given_head(
-    path: Path, rows: list[Row], reading: Reading
+    path: Path, rows: list[Row], layout: TableLayout
 ) -> tuple[int, list[str], list[str | None], list[Row]] | None:
     """Names and units by the lines that were given; None if none was."""
-    if reading.names_line is None and reading.data_line is None:
+    if layout.names_line is None and layout.data_line is None:
         return None
     by_line = dict(rows)
     for what in ("names_line", "units_line"):
-        line = getattr(reading, what)
+        line = getattr(layout, what)
         if line is not None and line not in by_line:
             raise DataError(f"{path}: {what} = {line}: that line is empty, a comment or not there")
-    head = [n for n in (reading.names_line, reading.units_line) if n is not None]
-    start = reading.data_line or max(head) + 1
+    head = [n for n in (layout.names_line, layout.units_line) if n is not None]
+    start = layout.data_line or max(head) + 1
     body = [(k, r) for k, r in rows if k >= start]
     if head and max(head) >= start:
         raise DataError(f"{path}: the data begin in line {start}, above the line of names or units")
-    if reading.names_line is None:
-        names, units = _by_option(path, body[0] if body else (start, []), reading)
+    if layout.names_line is None:
+        names, units = _by_option(path, body[0] if body else (start, []), layout)
         return start, names, units, body
-    pairs = [header(h) for h in by_line[reading.names_line]]
+    pairs = [header(h) for h in by_line[layout.names_line]]
     units = [u for _, u in pairs]
-    if reading.units_line is not None:
-        below = [_bare(c) for c in by_line[reading.units_line]]
+    if layout.units_line is not None:
+        below = [_bare(c) for c in by_line[layout.units_line]]
         units = [
             u or (b or None) for u, b in zip(units, [*below, *[""] * len(units)], strict=False)
         ]
-    return reading.names_line, [n for n, _ in pairs], units, body
+    return layout.names_line, [n for n, _ in pairs], units, body
 
 
-def _by_option(path: Path, row: Row, reading: Reading) -> tuple[list[str], list[str | None]]:
-    names = list(reading.names)
+def _by_option(path: Path, row: Row, layout: TableLayout) -> tuple[list[str], list[str | None]]:
+    names = list(layout.names)
     if len(names) != len(row[1]) - (len(row[1]) == len(names) + 1 and not row[1][-1].strip()):
         raise DataError(
             f"{path}, line {row[0]}: {len(row[1])} cells, but {len(names)} names are given: give "
             "one for each column in order, '' for one to leave out"
         )
-    units = reading.units or [""] * len(names)
+    units = layout.units or [""] * len(names)
     return names, [u or None for u in units]
 
 
 def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
     """Line of the names, names, units and the rows below them."""
     path, rows, tell = h.path, h.rows, h.tell
+    at = next((k for k, (_, r) in enumerate(rows) if any(_known(c, h.known) for c in r)), None)
+    if h.layout.known_head and at is not None and not h.layout.names:
+        below = rows[at + 1] if at + 1 < len(rows) else None
+        if below and (all(map(_of_data, filter(None, below[1]))) or not _is_units(below[1])):
+            below = None  # 1 is a number first, then a unit
+        _tell_left_out(h, rows[:at], [rows[at]])
+        return *_named(h, rows[at], below), rows[at + 1 + (below is not None) :]
     start = h.start()
-    if h.reading.names:
+    if h.layout.names:
         start = start or 0
         if start:
             tell(f"{path}: {_span(rows[0][0], rows[start - 1][0])} above the data left out")
-        names, units = _by_option(path, rows[start], h.reading)
+        names, units = _by_option(path, rows[start], h.layout)
         return rows[start][0], names, units, rows[start:]
     if start is None:
         start = 1
@@ -325,8 +359,8 @@ def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
             or any(map(_of_data, said_rows[0][1]))
         ):
             raise DataError(
-                f"{path}, line {line}: a line of column names is expected first: give --names "
-                "A,B,... (and --units) if the file has none"
+                f"{path}, line {line}: a line of column names is expected first: "
+                f"{h.layout.remedies['head']}"
             )
         tell(f"{path}, line {said[-1][0]}: the comment above the numbers is taken as column names")
         rows, start = [said_rows[0], *rows], 1
@@ -342,6 +376,11 @@ def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
         named = max(reversed(others), key=lambda r: sum(_known(c, h.known) for c in r[1]))
         tell(f"{path}, line {below[0]}: taken as a row of units")
     _tell_left_out(h, above, [named, below])
+    return *_named(h, named, below), body
+
+
+def _named(h: _Head, named: Row, below: Row | None) -> tuple[int, list[str], list[str | None]]:
+    """Line of the names, names and units."""
     cells = named[1]
     stripped = _COMMENT.sub("", cells[0])
     if stripped and (h.known(header(stripped)[0]) or is_time_name(header(stripped)[0])):
@@ -349,7 +388,7 @@ def _found_head(h: _Head) -> tuple[int, list[str], list[str | None], list[Row]]:
     pairs = [header(c) for c in cells]
     row = ["" if _bare(c) == "-" else _bare(c) for c in below[1]] if below else []
     units = [u or ((row[i] or None) if i < len(row) else None) for i, (_, u) in enumerate(pairs)]
-    return named[0], [n for n, _ in pairs], units, body
+    return named[0], [n for n, _ in pairs], units
 
 
 def _names_without_units(h: _Head, fit: list[Row]) -> tuple[Row, None]:
@@ -360,8 +399,7 @@ def _names_without_units(h: _Head, fit: list[Row]) -> tuple[Row, None]:
             odd = next((c for c in names if unit_of(_bare(c)) is None), names[0])
             raise DataError(
                 f"{h.path}, line {line}: neither numbers nor units below the column names of line "
-                f"{k}: {cut(odd)}: delete one of the lines, or give names_line, units_line and "
-                "data_line by --columns FILE"
+                f"{k}: {cut(odd)}: {h.layout.remedies['above']}"
             )
     return fit[-1], None
 
@@ -374,8 +412,8 @@ def _tell_left_out(h: _Head, above: list[Row], taken: list[Row | None]) -> None:
     elif left and taken[1] is None:
         raise DataError(
             f"{h.path}, line {left[-1]}: what stands between the column names of line "
-            f"{names[0] if names else 0} and the data is not understood; if it holds units, give "
-            "them by --units or units_line (--columns FILE), else delete it"
+            f"{names[0] if names else 0} and the data is not understood; "
+            f"{h.layout.remedies['between']}"
         )
     elif left:
         h.tell(f"{h.path}: left out above the data: line {', '.join(map(str, left[:6]))}")

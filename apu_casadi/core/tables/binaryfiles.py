@@ -11,8 +11,8 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import GENERATOR, load
+from apu_casadi.core.tables.columns import Column, Tell, cut, parsed
 from apu_casadi.core.units import header, unit_of
-from estimators.apu.recordings.columns import Column, Tell, cut, parsed
 
 __all__ = [
     "dataset_columns",

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.units import gauge_of, unit_of
-from estimators.apu.recordings.columns import (
+from apu_casadi.core.tables.columns import (
     COMMA,
     EITHER,
     GROUPS,
@@ -21,10 +20,11 @@ from estimators.apu.recordings.columns import (
     is_word,
     point,
 )
+from apu_casadi.core.tables.tablelayout import TableLayout
+from apu_casadi.core.units import gauge_of, unit_of
 
-__all__ = ["DECIMALS", "numbers_as", "ungrouped", "without_unit"]
+__all__ = ["numbers_as", "ungrouped", "without_unit"]
 
-DECIMALS = ("point", "comma")
 _BLANK = " \u00a0\u2009\u202f'’"
 _SPACED = re.compile(rf"[+-]?\d{{1,3}}(?:[{_BLANK}]\d{{3}})+(?:[.,]\d*)?", re.ASCII)
 _TWO_POINTS = re.compile(r"\.[^\n.]*\.")
@@ -71,10 +71,11 @@ def numbers_as(
     path: Path,
     cells: list[list[str]],
     names: Sequence[str],
-    decimal: str | None,
+    layout: TableLayout,
     tell: Tell,
 ) -> Callable[[str], float | None]:
     """Decide by the whole file what commas and points in numbers are."""
+    decimal, remedy = layout.decimal, layout.remedies["decimal"]
     commas = open_ = groups = groups_comma = points = None
     for i, column in enumerate(cells):
         text = "\n".join(column)
@@ -102,12 +103,12 @@ def numbers_as(
         if by_comma and by_point:
             raise DataError(
                 f"{path}: {said(by_comma)} has a decimal comma, {said(by_point)} a decimal point: "
-                "give --decimal comma or point"
+                f"{remedy}"
             )
         if open_ and not by_comma and not groups:
             raise DataError(
                 f"{path}: {said(open_)} may have a decimal comma or a separator of thousands: "
-                "give --decimal comma or point"
+                f"{remedy}"
             )
         if by_comma:
             tell(f"{path}: decimal commas, such as {said(by_comma)}")

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
+from apu_casadi.core.tables.binaryfiles import dataset_columns, frame_columns, typed
+from apu_casadi.core.tables.columns import Column, Tell
 from apu_casadi.core.units import header
-from estimators.apu.recordings.binaryfiles import dataset_columns, frame_columns, typed
-from estimators.apu.recordings.columns import Column, Tell
 
 __all__ = ["memory_columns"]
 

@@ -1,0 +1,1 @@
+"""Tables that people have: text as instruments and spreadsheets write it, Parquet, netCDF."""
