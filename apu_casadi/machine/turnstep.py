@@ -22,6 +22,7 @@ from apu_casadi.machine.weights import rippling, through
 
 STRIDES = 28  # strides in a turn, where coefficients are periodic: 14 in a period of what ripples
 PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
+_BACK = 8  # samples whose polynomial leads back to the start
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
 #: Samples before and after an end of the step that its share of the means is made of, and degrees
 #: in time of the harmonics of half a turn in them.  The power of a severe fault has ten in a turn:
@@ -284,6 +285,14 @@ def periodic_step(
         sums[at_pair] = sums[at_pair] + its
         samples.append(X)
         voltages.append(V)
+    # The regulator takes the voltage of the first instant for true over a sixth of its first step;
+    # a jump of the load or the fault moves it for microseconds.  What it would be without is told
+    # by the samples after it, but for their ripple, and by those half a turn apart, which ripple
+    # alike, but for what settles within a turn: it is off by no more than either says.
+    near = ca.mtimes(ca.horzcat(*voltages[1 : 1 + _BACK // PACE]), ca.DM(through(1, _BACK)[:, 0]))
+    a, b, c = (voltages[pairs * k][-1] for k in (1, 2, 3))
+    off = (ca.fabs(1 - V / V_now) for V in (near, 3 * a - 3 * b + c))
+    jump = ca.fmin(*off) * PACE / (6 * length)
     mean = pair.means(ca.horzcat(pair.weighted(terms, first), *sums), angles)
     V_all = ca.horzcat(*voltages)
     # the end of the step, with the phases as they are after so many half turns
@@ -309,7 +318,7 @@ def periodic_step(
     return ca.Function(
         f"means_{ss.name}",
         [X0, parameters, U, TH, DT],
-        [x_end, mean, ca.vertcat(V_k[2], doubt)],
+        [x_end, mean, ca.vertcat(V_k[2], doubt, jump)],
         ["x0", "series", "u", "theta", "dt"],
         ["x", "mean", "miss"],
     )
