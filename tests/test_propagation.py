@@ -120,16 +120,16 @@ def test_mean_weights_are_of_order_ten_and_six():
 
 def test_ripples_that_change_slowly_are_integrated_exactly():
     """Seven harmonics of a period of 14 samples times lines and parabolas, against Gauss."""
-    first, partial = rippling(37, 5, 14, {0: 3, 1: 2, 2: 2, 3: 2, 4: 2, 5: 1, 6: 1})
-    at = np.arange(-36.0, 6.0)
+    first, partial = rippling(30, 5, 14, {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0})
+    at = np.arange(-29.0, 6.0)
     node, share = np.polynomial.legendre.leggauss(200)
-    for m, p in ((0, 3), (1, 2), (4, 2), (6, 1)):
+    for m, p in ((0, 3), (1, 2), (4, 1), (6, 0)):
         for shift in (0.0, 0.7):
 
             def f(t, m=m, p=p, shift=shift):
                 return (1 + t / 20) ** p * np.cos(2 * math.pi * m * t / 14 + shift)
 
-            exact = share @ f(18 * node - 18) * 18
+            exact = share @ f(14.5 * node - 14.5) * 14.5
             assert first @ f(at) == pytest.approx(exact, abs=1e-12)
             for x in (0.0, 0.31, 1.0):
                 weights = [np.polyval(row[::-1], x - 0.5) for row in partial]

@@ -20,6 +20,7 @@ from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange
 from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.creeping import creep
 from estimators.apu.electrical.sequences import sequences
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.healthjumps import track_jumps
@@ -101,9 +102,12 @@ def test_gas_path_alone_is_the_filter_of_the_studies(run, files):
     filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)
     noise = np.random.default_rng([SEED, 2])
     data = filt.recording(run, noise, gains=joint_case(SEED).gas_gains)
-    r = track_jumps(filt, data, backend="vm").result
+    tracked = track_jumps(filt, data, backend="vm")
+    drifts = creep(filt, tracked)
+    r = drifts.widened(tracked.result)
     e = estimate(read_recording(files[0]), backend="vm")
     assert not e.joint and not e.machines and e.believable
+    assert np.all(r.variance >= tracked.result.variance)
     for n in ("N", *HEALTH):
         assert_allclose(e.gaspath[n], r[n][0], rtol=1e-7, err_msg=n)
         assert_allclose(e.gaspath[f"{n}_sigma"], r[n][1], rtol=1e-7, err_msg=n)

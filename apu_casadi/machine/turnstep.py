@@ -26,9 +26,9 @@ _BACK = 8  # samples whose polynomial leads back to the start
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
 #: Samples before and after an end of the step that its share of the means is made of, and degrees
 #: in time of the harmonics of half a turn in them.  The power of a severe fault has ten in a turn:
-#: with polynomials through ten samples means err by 4e-4, so by 1e-5 and less.
-_RIPPLE = (37, 5)
-_DEGREES = {0: 3, 1: 2, 2: 2, 3: 2, 4: 2, 5: 1, 6: 1}
+#: with polynomials through ten samples means err by 4e-4, so by 2e-5 and less.
+_RIPPLE = (30, 5)
+_DEGREES = {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}
 
 
 def _powers(polynomials: np.ndarray, s: Any) -> list[Any]:

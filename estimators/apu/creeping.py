@@ -57,7 +57,8 @@ class Creep:
     def probability(self) -> np.ndarray:
         """That each is the one that drifts, (n,)."""
         v, t2 = self.sigma**2, SIZE**2
-        odds = 0.5 * np.log(v / (v + t2)) + self.size**2 / v * t2 / (v + t2) / 2
+        # v is infinite of a sensor that is not there
+        odds = -0.5 * np.log1p(t2 / v) + self.size**2 / v * t2 / (v + t2) / 2
         p: np.ndarray = posterior(np.append(0.0, math.log(DRIFTS) + odds)[:, None])[1:, 0]
         return p
 
@@ -65,7 +66,7 @@ class Creep:
         """Return the result with what drifts may have moved in its variances."""
         v, t2 = self.sigma**2, SIZE**2
         share = t2 / (v + t2)
-        weight = self.probability * ((share * self.size) ** 2 + share * v)
+        weight = self.probability * ((share * self.size) ** 2 + 1 / (1 / v + 1 / t2))
         return dataclasses.replace(r, variance=r.variance + (self.error**2 @ weight).T)
 
 
