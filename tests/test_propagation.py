@@ -16,7 +16,7 @@ from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.propagation import Propagator, hoisted, strides
-from apu_casadi.machine.weights import gregory
+from apu_casadi.machine.weights import gregory, rippling
 
 GEN = Generator()
 ISOLATED = Generator(neutral="isolated")
@@ -116,6 +116,25 @@ def test_mean_weights_are_of_order_ten_and_six():
     wave = 0.5 + 0.5 * np.cos(phase * t + 0.8)
     exact = 0.5 + (math.sin(phase + 0.8) - math.sin(0.8)) / (2 * phase)
     assert gregory(160) @ wave == pytest.approx(exact, rel=2e-6)
+
+
+def test_ripples_that_change_slowly_are_integrated_exactly():
+    """Seven harmonics of a period of 14 samples times lines and parabolas, against Gauss."""
+    first, partial = rippling(37, 5, 14, {0: 3, 1: 2, 2: 2, 3: 2, 4: 2, 5: 1, 6: 1})
+    at = np.arange(-36.0, 6.0)
+    node, share = np.polynomial.legendre.leggauss(200)
+    for m, p in ((0, 3), (1, 2), (4, 2), (6, 1)):
+        for shift in (0.0, 0.7):
+
+            def f(t, m=m, p=p, shift=shift):
+                return (1 + t / 20) ** p * np.cos(2 * math.pi * m * t / 14 + shift)
+
+            exact = share @ f(18 * node - 18) * 18
+            assert first @ f(at) == pytest.approx(exact, abs=1e-12)
+            for x in (0.0, 0.31, 1.0):
+                weights = [np.polyval(row[::-1], x - 0.5) for row in partial]
+                exact = share @ f(x / 2 * (1 + node)) * x / 2
+                assert weights @ f(at) == pytest.approx(exact, abs=1e-12)
 
 
 def test_strides_cover_every_sample_once():

@@ -19,7 +19,7 @@ import bisect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -37,11 +37,13 @@ TOL = 1e-8  # largest error of transition matrices between nodes, nominal units;
 DEEPEST = 16  # times that an interval may be halved
 #: Products of numbers up to which BLAS does not start threads; with them, waiting takes longer.
 _ONE_THREAD = 250_000
-_NEAR = 4  # degree of polynomials over a small part of an interval ...
+_NEAR = (2, 4)  # degrees of polynomials over a small part of an interval, the first enough ...
 _EQUAL = 1e-12  # ... and their largest error, as of ``TOL``
 _INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 
 F = TypeVar("F", MeanStep, Propagator)
+#: Where the next block's vectors are to be written, (numbers, steps) column by column; None: apart.
+Into: TypeAlias = Callable[[], np.ndarray | None]
 
 
 class Numbers(NamedTuple):
@@ -80,28 +82,37 @@ class Piece(Generic[F]):
     weights: np.ndarray
     nodes: np.ndarray
     rates: np.ndarray
-    buffers: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
+    buffers: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, repr=False)
 
     def at(self, s: np.ndarray) -> np.ndarray:
         """Return all numbers at values of the coordinate, (numbers, steps).
 
         The next call for as many steps overwrites them: new memory costs as much as the sums.
         """
-        basis = self._basis(s)
-        if s.size not in self.buffers:
-            self.buffers[s.size] = np.empty((s.size, self.powers.shape[1]))
-        made = self.buffers[s.size]
+        basis = self.basis(s)
+        return self.summed(basis, self.room(s.size, self.powers.shape[1]).T).T
+
+    def room(self, steps: int, numbers: int) -> np.ndarray:
+        """Return memory that is used again, (numbers, steps), column by column."""
+        key = steps, numbers
+        if key not in self.buffers:
+            self.buffers[key] = np.empty(key)
+        return self.buffers[key].T
+
+    def summed(self, basis: np.ndarray, made: np.ndarray) -> np.ndarray:
+        """Sum the first numbers by polynomials at some values into ``made``, (steps, numbers)."""
         size = max(1, _ONE_THREAD // basis.size)
         for k in range(0, made.shape[1], size):
-            np.matmul(basis, self.powers[:, k : k + size], out=made[:, k : k + size])
-        return made.T
+            part = made[:, k : k + size]
+            np.matmul(basis, self.powers[:, k : k + part.shape[1]], out=part)
+        return made
 
     def some(self, s: np.ndarray, columns: list[int]) -> np.ndarray:
         """Return some of the numbers at values of the coordinate, (steps, columns)."""
-        made: np.ndarray = self._basis(s) @ self.powers[:, columns]
+        made: np.ndarray = self.basis(s) @ self.powers[:, columns]
         return made
 
-    def _basis(self, s: np.ndarray) -> np.ndarray:
+    def basis(self, s: np.ndarray) -> np.ndarray:
         """Chebyshev polynomials at values of the coordinate, (steps, degree + 1)."""
         x = np.clip((s - self.middle) / self.half, -1.0, 1.0)
         made: np.ndarray = np.cos(np.arccos(x)[:, None] * np.arange(self.powers.shape[0]))
@@ -113,20 +124,22 @@ class Piece(Generic[F]):
         They take less sums, for many values that lie near each other, and must be equal to
         ``_EQUAL``.
         """
-        middle, half, degree = (low + high) / 2, (high - low) / 2, _NEAR
+        middle, half = (low + high) / 2, (high - low) / 2
         if not half > 0:
             powers = self.at(np.array([middle])).T.copy()
             return replace(self, middle=middle, half=1.0, powers=powers, buffers={})
-        if self.powers.shape[0] <= degree + 1:
-            return self
-        nodes, between = _lobatto(degree), np.array([-0.8, 0.3])
-        values = self.at(middle + half * np.append(nodes, between)).T
-        fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
-        powers = fit @ values[: degree + 1]
-        off = np.polynomial.chebyshev.chebvander(between, degree) @ powers - values[degree + 1 :]
-        if not (np.abs(off) * self.weights).max() <= _EQUAL:
-            return self
-        return replace(self, middle=middle, half=half, powers=powers, buffers={})
+        between = np.array([-0.8, 0.3])
+        for degree in _NEAR:
+            if self.powers.shape[0] <= degree + 1:
+                return self
+            nodes = _lobatto(degree)
+            values = self.at(middle + half * np.append(nodes, between)).T
+            fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
+            powers = fit @ values[: degree + 1]
+            here = np.polynomial.chebyshev.chebvander(between, degree) @ powers
+            if (np.abs(here - values[degree + 1 :]) * self.weights).max() <= _EQUAL:
+                return replace(self, middle=middle, half=half, powers=powers, buffers={})
+        return self
 
 
 class Course(Generic[F]):
@@ -189,11 +202,11 @@ class Course(Generic[F]):
 
         The next call overwrites the numbers.  Arguments and errors as of :meth:`blocks`.
         """
-        fast, blocks = self.blocks(t, before, t.size)
+        fast, blocks = self.blocks(t, before, t.size, apart)
         return fast, next(blocks)
 
     def blocks(
-        self, t: np.ndarray, before: float | None, width: int
+        self, t: np.ndarray, before: float | None, width: int, into: Into
     ) -> tuple[F, Iterator[Numbers]]:
         """Return what propagates over steps, and its numbers in blocks.
 
@@ -201,6 +214,7 @@ class Course(Generic[F]):
             t: middles of the steps, s.
             before: the middle of the step before them, if the first goes on from it.
             width: steps in a block, whose numbers the next one overwrites.
+            into: see ``Into``.
 
         Raises:
             NotApplicable: the numbers change too fast from step to step, have no polynomial, or
@@ -221,6 +235,7 @@ class Course(Generic[F]):
                 f"{self.ss.name}: load or fault change by {jump:.1e} of the transition matrices "
                 f"in a step, {fast.smooth:g} at most"
             )
+        fast.expect(jump)
         spike = self._spike(pieces, s, float(first))
         if spike > fast.spike:
             raise NotApplicable(
@@ -230,22 +245,31 @@ class Course(Generic[F]):
         if alone:
             one = pieces[0].near(float(s.min()), float(s.max())) if s.size > width else pieces[0]
             pieces = [one] * s.size
-        return fast, self._blocks(pieces, s, width)
+        return fast, self._blocks(pieces, s, width, into)
 
-    def _blocks(self, pieces: list[Piece[F]], s: np.ndarray, width: int) -> Iterator[Numbers]:
+    def _blocks(
+        self, pieces: list[Piece[F]], s: np.ndarray, width: int, into: Into
+    ) -> Iterator[Numbers]:
         """Yield the numbers of steps, each of its piece."""
-        fast = pieces[0].fast
+        fast, first = pieces[0].fast, pieces[0]
         a = fast.vector.size
-        b = a + len(self.ss.u)
-        c = b + fast.theta.size
+        b, c = (n - a for n in (a + len(self.ss.u), a + len(self.ss.u) + fast.theta.size))
+        alone = all(p is first for p in pieces)
+        if alone:  # all but the long vectors at once
+            basis = first.basis(s)
+            rest = (basis @ first.powers[:, a:]).T
         for k in range(0, s.size, width):
             at = slice(k, k + width)
-            if all(p is pieces[k] for p in pieces[at]):
-                values = pieces[k].at(s[at])
+            if alone:
+                room = into()
+                vector = first.room(s[at].size, a) if room is None else room
+                first.summed(basis[at], vector.T)
+                more = rest[:, at]
             else:
                 each = zip(pieces[at], s[at, None], strict=True)
                 values = np.concatenate([p.at(v).copy() for p, v in each], axis=1)
-            yield Numbers(values[:a], values[a:b], values[b:c], values[c:])
+                vector, more = values[:a], values[a:]
+            yield Numbers(vector, more[:b], more[b:c], more[c:])
 
     def _jump(self, pieces: list[Piece[F]], s: np.ndarray, first: float) -> float:
         """Return a bound of the largest change of a transition matrix from step to step."""
@@ -344,6 +368,10 @@ class Course(Generic[F]):
         severity = [0.0 if math.isnan(v) else v for v in severity]
         made[x] = fast, np.concatenate([fast.vector, u, fast.theta, severity])
         return made[x]
+
+
+def apart() -> None:
+    """Write the vectors of blocks to memory of their own; an ``Into``."""
 
 
 def _lobatto(degree: int) -> np.ndarray:

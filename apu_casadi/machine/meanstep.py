@@ -46,6 +46,10 @@ DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
 #: Largest change of transition matrices from step to step, nominal units, of loads and faults that
 #: change in time: what follows such a jump falls between the samples, and means err by 1e-6 of it.
 SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
+#: Largest error of the mean voltage, relative, that a jump of the load or the fault at the start of
+#: a step makes the regulator see; loads and faults that change in time have one in every step.
+JUMP_TOL = 3e-7
+NO_JUMP = 1e-6  # change of transition matrices that is none: tables err by 1e-8
 END_TOL = 1e-5  # nominal units: doubt about the state at the end, whose error is much smaller
 _PHASE = ("_a", "_b", "_c")
 _PHASES = 5  # rotor angles that tell the harmonics 0, 1, 2 apart
@@ -340,7 +344,7 @@ class MeanStep(Rebuilt):
         self.layout = (ss.shared, self.quad, turn, self.harmonics)
         self.advance = _function(*self.layout)
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]
-        self.limits = np.array([drive] if self.constant else [drive, END_TOL])
+        self.limits = np.array([drive] if self.constant else [drive, END_TOL, math.inf])
         self._iw = ss.u.index("w_r")
         self._compiled: Gradual | None = None
 
@@ -370,6 +374,11 @@ class MeanStep(Rebuilt):
             parts = [np.repeat(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
         return np.concatenate([*parts, np.zeros(4)])
 
+    def expect(self, jump: float) -> None:
+        """Expect transition matrices that change by so much from step to step, nominal units."""
+        if not self.constant:
+            self.limits[2] = JUMP_TOL if jump > NO_JUMP else math.inf
+
     def put(self, vector: np.ndarray, theta: np.ndarray) -> None:
         """Go on with other numbers: those of :attr:`vector`, and theta in full."""
         self.parameters, self.theta = vector, theta
@@ -396,7 +405,8 @@ class MeanStep(Rebuilt):
         x, mean, miss = call(x0, self.parameters, u, self.theta, self.dt)
         if not (np.all(miss <= self.limits) and math.isfinite(float(x.sum() + mean.sum()))):
             raise NotApplicable(
-                f"{self.ss.name}: step from {t0:.6g} s: errors of E_fd and of the state at the end "
-                f"{miss.tolist()} > {self.limits.tolist()}, or values that are not finite"
+                f"{self.ss.name}: step from {t0:.6g} s: errors of E_fd, of the state at the end "
+                f"and of the voltage seen, {miss.tolist()} > {self.limits.tolist()}, or values "
+                "that are not finite"
             )
         return x, mean

@@ -503,6 +503,9 @@ class Propagator(Rebuilt):
         rows = [np.broadcast_to(scale, part.shape).ravel() for part, scale in parts]
         return np.append(rows[0], [0.0, 0.0]) if self.constant else np.concatenate(rows)
 
+    def expect(self, jump: float) -> None:
+        """Expect transition matrices that change so from step to step: ``spike`` bounds it."""
+
     def put(self, vector: np.ndarray, theta: np.ndarray) -> None:
         """Go on with other numbers: those of :attr:`vector`, and theta in full."""
         shapes, n = (self.table.even.shape, self.table.odd.shape), self.table.even.size

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial, legendre
+
+_TERMS = (
+    17  # of polynomials over an interval, in which the fastest harmonic turns by 2.7 rad: 1e-15
+)
 
 
 def through(first: int, count: int) -> np.ndarray:
@@ -27,6 +35,54 @@ def end_weights(count: int) -> np.ndarray:
     for i in range(count):
         weights[i:] += middle[: count - i]
     return np.asarray(weights)
+
+
+def rippling(
+    before: int, after: int, period: int, degrees: Mapping[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrals of what ripples, its harmonics changing slowly, by samples around an interval.
+
+    Exact for polynomials times the harmonics of a period; of all weights that are so, the smallest.
+
+    Args:
+        before: samples to the left of the interval [0, 1], that at 0 included.
+        after: samples to its right, that at 1 included.
+        period: samples in a period.
+        degrees: degree of the polynomial by harmonic.
+
+    Returns:
+        The integral from the first sample to 0, weight by weight; and from 0 to x in [0, 1], a row
+        of coefficients of 1, (x - 1/2), (x - 1/2)^2, ... by weight.
+    """
+    at = np.arange(1.0 - before, after + 1.0)
+    centre, half = at.mean(), at.size / 2
+
+    def basis(t: np.ndarray) -> np.ndarray:
+        turned = 2 * math.pi * (t - centre) / period
+        rows = [
+            ((t - centre) / half) ** p * trig(m * turned)
+            for m, degree in degrees.items()
+            for trig in ((np.cos, np.sin) if m else (np.cos,))
+            for p in range(degree + 1)
+        ]
+        return np.array(rows)
+
+    exact = np.linalg.pinv(basis(at))  # values of an integral of all the basis -> weights
+    node, share = legendre.leggauss(40)
+
+    def integral(start: float, end: float) -> np.ndarray:
+        h = (end - start) / 2
+        return np.asarray(exact @ (basis(start + h * (1 + node)) @ (share * h)))
+
+    first = sum(integral(k, k + 1.0) for k in range(1 - before, 0))
+    x = (1 + np.cos(math.pi * (np.arange(_TERMS) + 0.5) / _TERMS)) / 2
+    values = np.array([integral(0.0, float(v)) for v in x])
+    rows = []
+    for column in values.T:
+        fit = Chebyshev.fit(x, column, _TERMS - 1, domain=[0, 1])
+        u = Polynomial(fit.convert(kind=Polynomial, domain=[0, 1], window=[-0.5, 0.5]).coef)
+        rows.append(np.pad(u.coef, (0, _TERMS - u.coef.size)))
+    return np.asarray(first), np.array(rows)
 
 
 def gregory(n: int) -> np.ndarray:

@@ -166,6 +166,7 @@ class JointBlock(Rebuilt):
 
     apu: Apu
     machines: Sequence[Fast]
+    _likely = LONG // BLOCK  # blocks in a row that may well be right
 
     def __init__(
         self, apu: Apu, machines: Sequence[Fast], links: Sequence[Link], *, wide: bool = False
@@ -180,7 +181,6 @@ class JointBlock(Rebuilt):
         self._n_gov, self._n_x = len(apu.governor.X), n_x
         self._n_z = apu.gas_generator.family.step.numel_in(4)
         self._sampled = [m.advance.n_out() == 4 for m in machines]
-        self._likely = LONG // BLOCK  # blocks in a row that an ensemble is asked for
         self._call = _caller(apu.gas_generator.family, links[0], self.machines, wide)
 
     def __call__(
@@ -209,6 +209,19 @@ class JointBlock(Rebuilt):
     def _row(self, blocks: int, carry: np.ndarray, held: Sequence[Any]) -> BlockResult:
         """Advance by a row of blocks, one question to the ensemble, up to the first not right."""
         last, *out = self._call.in_a_row(blocks, carry, *held)
+        return self._right(last, out)
+
+    def _right(self, last: np.ndarray, out: Sequence[np.ndarray]) -> BlockResult:
+        """Return what blocks gave up to the first that is not right.
+
+        Args:
+            last: states at their ends, a column for each.
+            out: outputs of all, side by side.
+
+        Raises:
+            NotApplicable: the first is not; step by step it is decided why, and what to do.
+        """
+        blocks = last.shape[1]
 
         def part(first: int, end: int) -> list[np.ndarray]:
             """Outputs of some blocks, which have one column a step, or one a sample."""
@@ -233,7 +246,7 @@ class JointBlock(Rebuilt):
         x_sg: Sequence[np.ndarray],
         held: Iterable[Sequence[Any]],
     ) -> BlockResult:
-        """Advance a block for each of ``held``, up to the first that is not right.
+        """Advance a block for each of ``held``, as far as they may go, and are right.
 
         Args:
             N, z, governor: states of the unit.
@@ -243,20 +256,22 @@ class JointBlock(Rebuilt):
         Raises:
             NotApplicable: the first is not; step by step it is decided why, and what to do.
         """
-        carry, made = np.concatenate([N, z, governor, *x_sg]), list[tuple[np.ndarray, ...]]()
+        carry, most = np.concatenate([N, z, governor, *x_sg]), self._likely
+        lasts, made = list[np.ndarray](), list[tuple[np.ndarray, ...]]()
         for given in held:
-            if len(made) == 1:
-                made[0] = tuple([a.copy() for a in made[0]])  # views, which the next call changes
             last, *out = self._call(carry, *given)
-            wrong = self._wrong(last, *out)
-            if wrong and not made:
-                raise NotApplicable(wrong)
-            if wrong:
-                break
             carry = last.copy()
-            made.append(tuple([a.copy() for a in out]) if made else tuple(out))
+            lasts.append(carry)
+            made.append(tuple([a.copy() for a in out]))
+            if len(made) >= most or not self._seems_right(out):
+                break
         out = [c[0] if len(c) == 1 else np.concatenate(c, axis=1) for c in zip(*made, strict=True)]
-        return self._parted(carry, out)
+        return self._right(np.stack(lasts, axis=1), out)
+
+    def tables(self, group: int) -> np.ndarray:
+        """Return the memory that the next call takes the tables of a group from."""
+        made: np.ndarray = self._call.inputs[3 + len(_Machine._fields) * group + 3]
+        return made
 
     def _parted(self, carry: np.ndarray, out: Sequence[np.ndarray]) -> BlockResult:
         """Return the parts of the state at the end of blocks, and of their outputs."""
@@ -271,6 +286,15 @@ class JointBlock(Rebuilt):
                 waves, *rest = rest
             groups.append(MachineBlock(x, means, w_r, waves))
         return BlockResult(N, z, tuple(x_gov.tolist()), y, groups)
+
+    def _seems_right(self, out: Sequence[np.ndarray]) -> bool:
+        """Look at the largest error of a block only: all is checked for a row of them at once."""
+        at = 3
+        for m, sampled in zip(self.machines, self._sampled, strict=True):
+            if not out[at][:-1].max() <= m.limits.max():
+                return False
+            at += 2 + sampled
+        return True
 
     def _wrong(
         self, last: np.ndarray, _y: np.ndarray, residual: np.ndarray, *rest: np.ndarray

@@ -8,11 +8,13 @@ exchange steps where all can, else by single steps, each with the integrator tha
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.lanes.together import asking
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.unit.apu import Apu, JointPoint, groups
 from apu_casadi.unit.departures import Departure
@@ -247,11 +249,14 @@ class Machines:
         """
         self._check_block(grid)
         middles = (grid[1:] + grid[:-1]) / 2
-        fast, numbers = zip(*(g.columns(middles, before) for g in self.groups), strict=True)
+        into = [partial(self._room, k) for k in range(len(self.groups))]
+        each = zip(self.groups, into, strict=True)
+        fast, numbers = zip(*(g.columns(middles, before, to) for g, to in each), strict=True)
         layouts = [one.layout for one in fast]
         if self._wide is None or self._wide[0] != layouts:
             links = [g.link for g in self.groups]
             self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
+        self._wide[1].machines = fast  # of the same layouts, with what is expected of them now
         severity: list[list[np.ndarray]] = [[] for _ in self.groups]
 
         def held() -> Iterator[list[Any]]:
@@ -263,7 +268,7 @@ class Machines:
                 for g, one, now, kept in zip(self.groups, fast, own, severity, strict=True):
                     link = g.numbers_of_link
                     link[0] = unit.N_ref[at]
-                    kept.append(now.severity.copy())
+                    kept.append(now.severity)
                     given += [now.u, now.theta, link, now.vector, one.dt]
                 yield given
 
@@ -272,6 +277,10 @@ class Machines:
         severe = [np.concatenate(kept, axis=1)[:, :n] for kept in severity]
         pairs = zip(self.groups, done.machines, severe, strict=True)
         return done, [g.went_on(one, grid[: n + 1], own) for g, one, own in pairs]
+
+    def _room(self, group: int) -> np.ndarray | None:
+        """Return where the next block takes the tables of a group from; None where it is asked."""
+        return None if asking() or self._wide is None else self._wide[1].tables(group)
 
     def rows(self, made: Sequence[MachineMade]) -> list[Of]:
         """What is to be recorded of what the groups made."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
-from apu_casadi.machine.course import Numbers
+from apu_casadi.machine.course import Into, Numbers
 from apu_casadi.machine.generator import Generator, GeneratorPoint, Spike
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import who
@@ -198,27 +198,27 @@ class MachineStep:
         return self._integrators[0].for_blocks()
 
     def columns(
-        self, t: np.ndarray, before: float
+        self, t: np.ndarray, before: float, into: Into
     ) -> tuple[MeanStep | Propagator, Iterator[Numbers]]:
         """Return what propagates over the steps of blocks, and what it takes in each.
 
         Args:
             t, before: middles of the steps and of the one before, s.
+            into: where numbers that change go.
 
         Raises:
             NotApplicable: exact propagation does not hold, or numbers change too fast.
         """
         if self._same is None:
-            fast, blocks = self._integrators[0].columns(t, before, BLOCK)
+            fast, blocks = self._integrators[0].columns(t, before, BLOCK, into)
             if self._way is not None:
                 return fast, map(self._regulated, blocks)
             self._same = fast, self._regulated(next(blocks))
         return self._same[0], itertools.repeat(self._same[1])
 
     def _regulated(self, now: Numbers) -> Numbers:
-        inputs = now.u.copy()
-        inputs[self._V_ref_at] = self.V_ref
-        return now._replace(u=inputs)
+        now.u[self._V_ref_at] = self.V_ref
+        return now
 
     @property
     def numbers_of_link(self) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Protocol
 
 import casadi as ca
@@ -11,7 +10,7 @@ import numpy as np
 
 from apu_casadi.core.backend import compiled
 from apu_casadi.core.reciprocals import by_reciprocals
-from apu_casadi.core.sharing import kept
+from apu_casadi.core.sharing import kept, once
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
@@ -73,7 +72,7 @@ def packed_diagonal(n: int) -> np.ndarray:
     return np.cumsum([0, *range(n, 1, -1)])
 
 
-@lru_cache(maxsize=64)
+@once
 def _upper(n: int) -> tuple[np.ndarray, np.ndarray]:
     i, j = np.triu_indices(n)
     return i, j

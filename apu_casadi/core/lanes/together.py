@@ -9,11 +9,11 @@ between call and mover need know of ensembles, if it changes nothing before the 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -111,6 +111,17 @@ def by_itself() -> Iterator[None]:
         _here.reset(token)
 
 
+class Single(Protocol):
+    """What evaluates one call, compiled or not."""
+
+    @property
+    def inputs(self) -> list[np.ndarray]:
+        """This thread's input buffers."""
+
+    def __call__(self, *arrays: Any) -> tuple[np.ndarray, ...]:
+        """Evaluate."""
+
+
 class Together:
     """A function called as by :class:`~apu_casadi.core.calling.Caller`, in an ensemble together.
 
@@ -125,7 +136,7 @@ class Together:
         self,
         fun: ca.Function,
         of: ca.Function,
-        one: Callable[..., tuple[np.ndarray, ...]] | None = None,
+        one: Single | None = None,
     ) -> None:
         self.fun, self.of = fun, of
         self._one = one  # a member's own is never made where all ask
@@ -142,6 +153,11 @@ class Together:
         """
         made = self._asked(given, 0)
         return self._alone(*given) if made is None else made
+
+    @property
+    def inputs(self) -> list[np.ndarray]:
+        """This thread's input buffers of a call, which are not copied if they are given."""
+        return self._made().inputs
 
     def in_a_row(self, calls: int, *given: Any) -> tuple[np.ndarray, ...]:
         """Evaluate so many times, or ask; each call takes the last one's first output first.
@@ -169,9 +185,12 @@ class Together:
         return results
 
     def _alone(self, *given: Any) -> tuple[np.ndarray, ...]:
+        return self._made()(*given)
+
+    def _made(self) -> Single:
         if self._one is None:
             self._one = Caller(self.fun, copy=False)
-        return self._one(*given)
+        return self._one
 
     def evaluate(self, asked: Sequence[Question]) -> list[tuple[np.ndarray, ...]]:
         """Return the results for some members, as many as there are lanes at most."""
