@@ -17,8 +17,8 @@ from apu_casadi.unit.linearisation import linearise_generator
 from estimators.apu.measuring import measure_run, write_recording
 from scenarios.export import linear
 
-TOLD = "title summary keywords project processing_level date_created".split()
-ASKED = {*cf.origin("made"), *TOLD}
+TOLD = {"title", "summary", "keywords", "project", "processing_level", "date_created"}
+ASKED = TOLD | set(cf.origin("made"))
 DATE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 
 
