@@ -17,7 +17,8 @@ from apu_casadi.unit.linearisation import linearise_generator
 from estimators.apu.measuring import measure_run, write_recording
 from scenarios.export import linear
 
-ASKED = {*cf.origin("made"), "title", "summary", "keywords", "date_created"}
+TOLD = {"title", "summary", "keywords", "project", "processing_level", "date_created"}
+ASKED = TOLD | set(cf.origin("made"))
 DATE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 
 
@@ -29,6 +30,8 @@ def complete(ds):
     )
     for name, v in ds.variables.items():
         assert v.attrs["long_name"], name
+        kind = "coordinate" if name in ds.coords else "modelResult"
+        assert v.attrs["coverage_content_type"] == kind, name
         assert v.attrs.get("standard_name") == cf.STANDARD_NAMES.get(name), name
         assert name not in ds.coords or "_FillValue" not in v.attrs | v.encoding, name
         assert np.asarray(v.attrs.get("flag_values", np.array(0, v.dtype))).dtype == v.dtype, name
@@ -46,6 +49,9 @@ def test_results(run, tmp_path, form):
     (path,) = resultformats.save_as(run, tmp_path / "r", form)
     ds = complete(results.load(path))
     assert {n: ds.attrs[n] for n in run.attrs} == run.attrs
+    assert ds.attrs["time_coverage_duration"] == "PT0.5S"
+    assert ds.attrs["time_coverage_resolution"] == "PT0.02S"
+    assert "time_coverage_start" not in ds.attrs  # no date is made up
 
 
 def test_mat(run, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from scenarios import cli
 from scenarios.commands import validate
-from scenarios.shell import completing, terminal
+from scenarios.shell import completing, terminal, usage
 from scenarios.validation.comparison import Row
 
 KNOWN = {"SCENARIO": ["joint", "quiet"], "--engine": ["aps5000"]}
@@ -100,3 +100,19 @@ def test_validation_fits_the_terminal():
     rows.append(Row("mean of 15 rows that are", "kg/(kW.h)", *numbers, "w", "check"))
     lines = validate.table(rows, 80).splitlines()
     assert max(map(len, lines)) <= 80 and "check, tolerance 1e-04: w" in lines[-1]
+    rows.append(Row("a quantity of very many words " * 4, "1", *numbers, "w", "check"))
+    lines = validate.table(rows, 80).splitlines()
+    assert max(map(len, lines)) <= 80 and lines[-2].endswith("ok")
+    assert " ".join(lines).count("very") == 4
+    assert "a quantity of very many words " * 4 in validate.table(rows)
+
+
+def test_help_fits_the_terminal_and_examples_stay(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    words = " ".join(["paragraph"] * 12)
+    help_of = usage.Help("apu")
+    text = help_of._fill_text(f"Title.\n\n{words}\n\n    apu {words}", 78, "")
+    broken, example = text.split("\n\n")[1:]
+    assert max(map(len, broken.splitlines())) <= 80 and " ".join(broken.split()) == words
+    assert example == f"    apu {words}"
+    assert help_of._fill_text(words, 118, "") == words

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from datetime import datetime
 from types import SimpleNamespace
 
 import numpy as np
@@ -301,9 +302,19 @@ def test_what_a_kill_left_half_written_goes(small, made, tmp_path, monkeypatch):
     assert sorted(p.name for p in folder.iterdir()) == ["recipe.json"]
 
 
+def test_the_day_of_a_set_is_that_of_its_beginning(tmp_path, monkeypatch):
+    told = {"recipe": {}, "program": "p"}
+    for epoch, day in ((0, "1970-01-01"), (86400 * 365, "1970-01-01")):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", str(epoch))
+        assert making._claim(tmp_path, told) == day
+    assert json.loads((tmp_path / "recipe.json").read_text())["begun"] == "1970-01-01"
+
+
 @pytest.mark.ci  # processes that are killed and begun again
 def test_killed_at_any_moment_it_goes_on_with_the_same_bits(small, made, tmp_path):
-    told = json.loads((made / "recipe.json").read_text())["recipe"]
+    kept = json.loads((made / "recipe.json").read_text())
+    told, begun = kept["recipe"], datetime.fromisoformat(kept["begun"] + "T00:00+00:00")
+    same_day = os.environ | {"SOURCE_DATE_EPOCH": f"{begun.timestamp():.0f}"}
     text = "\n".join(f"{k} = {json.dumps(v)}" for k, v in told.items() if not isinstance(v, dict))
     for name, rows in ((k, v) for k, v in told.items() if isinstance(v, dict)):
         text += f"\n[{name}]\n" + "\n".join(f'"{k}" = {json.dumps(v)}' for k, v in rows.items())
@@ -312,13 +323,13 @@ def test_killed_at_any_moment_it_goes_on_with_the_same_bits(small, made, tmp_pat
     command += ["--out", str(tmp_path / "data"), "--quiet"]
     rng = np.random.default_rng(7)
     for _ in range(4):
-        p = subprocess.Popen(command, start_new_session=True)
+        p = subprocess.Popen(command, start_new_session=True, env=same_day)
         with contextlib.suppress(subprocess.TimeoutExpired):
             p.wait(rng.uniform(1, 12))
         with contextlib.suppress(ProcessLookupError):
             os.killpg(p.pid, signal.SIGKILL)
         p.wait()
-    subprocess.run(command, check=True)
+    subprocess.run(command, check=True, env=same_day)
     names = {str(p.relative_to(made)) for p in made.rglob("*") if p.is_file()}
     assert names == {
         str(p.relative_to(tmp_path / "data")) for p in (tmp_path / "data").rglob("*") if p.is_file()
@@ -368,6 +379,7 @@ def test_metadata_names_every_file_and_column(small, made):
         meta["distribution"][0]["sha256"]
         == hashlib.sha256((made / "runs.parquet").read_bytes()).hexdigest()
     )
+    assert meta["datePublished"] == json.loads((made / "recipe.json").read_text())["begun"]
     fields = {r["@id"]: [f["name"] for f in r["field"]] for r in meta["recordSet"]}
     assert fields["gaspath_samples"] == list(making.gas_path_columns())
     assert fields["runs"] == list(pd.read_parquet(made / "runs.parquet"))

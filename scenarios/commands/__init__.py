@@ -43,10 +43,8 @@ def register(
     """Add the subcommands of ``modules`` to a parser."""
     for name in modules:
         command = import_module(name)
-        form = argparse.RawDescriptionHelpFormatter
-        parser = subparsers.add_parser(
-            command.NAME, help=command.HELP, description=command.__doc__, formatter_class=form
-        )
+        told = {"help": command.HELP, "description": command.__doc__}
+        parser = subparsers.add_parser(command.NAME, formatter_class=usage.Help, **told)
         if hasattr(command, "OPTIONS"):
             usage.declare(parser, command.OPTIONS)
         else:

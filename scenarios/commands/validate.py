@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     known = comparison.sections()
     if args.list:
         for name, (title, _) in known.items():
-            print(f"{name:<14} {title}")
+            _say(f"{name:<14} ", title)
         return 0
     if args.figures:
         from scenarios.validation import paper_figures
@@ -59,12 +59,13 @@ def run(args: argparse.Namespace) -> int:
         except comparison.SkippedError as reason:
             skipped[name] = str(reason)
             if not args.json:
-                print(f"\n{name}: {known[name][0]}\n  skipped: {reason}")
+                _say(f"\n{name}: ", known[name][0])
+                _say("  skipped: ", str(reason))
             continue
         failed += sum(not r.passed for r in rows)
         report[name] = rows
         if not args.json:
-            print(f"\n{name}: {known[name][0]}")
+            _say(f"\n{name}: ", known[name][0])
             print(table(rows, terminal.columns() if terminal.folds() else None), flush=True)
     total = sum(len(r) for r in report.values())
     if args.json:
@@ -84,6 +85,13 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failed or (args.only and skipped) else 0
 
 
+def _say(label: str, text: str) -> None:
+    """Print a text behind its label, on a terminal broken to its width below itself."""
+    left = len(label.lstrip("\n"))
+    width = terminal.columns() - left if terminal.folds() else len(text) + 1
+    print(label, terminal.filled(text, width).replace("\n", "\n" + " " * left), sep="")
+
+
 _HEAD = "quantity|unit|reference|ours|error|tolerance|kind||why this tolerance"
 HEAD = _HEAD.split("|")
 
@@ -93,7 +101,8 @@ def table(rows: list[Row], width: int | None = None) -> str:
 
     Args:
         rows: what was compared.
-        width: letters a line; the last column is broken to it. None breaks nothing.
+        width: letters a line; the last column is broken to it, and the first where the others leave
+            too little. None breaks nothing.
     """
     body = [HEAD, *(_cells(r) for r in rows)]
     n = len(HEAD) - 1
@@ -102,9 +111,12 @@ def table(rows: list[Row], width: int | None = None) -> str:
         body = [[*r[:5], r[7], f"{r[6]}, tolerance {r[5]}: {r[8]}"] for r in body]
         body[0][-1] = "kind, tolerance: why this tolerance"
         n, widths = 6, [*widths[:5], widths[7]]
+        widths[0] = max(16, min(widths[0], width - sum(widths[1:]) - 2 * n))
     right = [">" if 2 <= k <= min(n - 2, 5) else "<" for k in range(n)]
     made = []
     for *cells, why in body:
+        *above, cells[0] = terminal.filled(cells[0], widths[0]).split("\n")
+        made += [f"  {part}" for part in above]
         line = "  " + "  ".join(map("{:{}{}}".format, cells, right, widths)) + "  "
         room = None if width is None else width - len(line)
         if room is not None and room < len(why) and room < _ROOM:  # below, where there is room

@@ -122,8 +122,9 @@ def croissant(
     labels: Mapping[str, Any],
     columns: Mapping[str, tuple[str, str]],
     waves: Mapping[str, str],
+    day: str,
 ) -> dict[str, Any]:
-    """Return Croissant 1.0 metadata: files, and the columns of each table."""
+    """Return Croissant 1.0 metadata, dated: files, and the columns of each table."""
     parquet = "application/x-parquet"
     files: list[dict[str, Any]] = [
         {
@@ -165,6 +166,7 @@ def croissant(
         "keywords": list(KEYWORDS),
         "license": LICENCE,
         "version": installed(),
+        "datePublished": day,
         "citeAs": f"apu-casadi {installed()}, data set {r.name}, seed {r.seed}",
         "creator": {"@type": "sc:Organization", "name": "apu-casadi developers"},
         "distribution": files,

@@ -29,6 +29,7 @@ import numpy as np
 
 from apu_casadi.core import files
 from apu_casadi.core.backend import package_digest
+from apu_casadi.core.cf import now
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, SimulationError
 from apu_casadi.core.results import CHANNELS, severity_h
 from apu_casadi.gaspath.conditions import CONDITIONS
@@ -214,7 +215,7 @@ def make_dataset(
     table = json.loads(json.dumps(asdict(r)))
     told = {"recipe": table, "program": package_digest()}
     with locked(folder, LOCK), stoppable() as stop:
-        _claim(folder, told)
+        begun = _claim(folder, told)
         left = [u for u in range(r.units) if not _whole(folder, u)]
         done = r.units - len(left)
         for unit, made in _all(table, left, workers, cluster):
@@ -223,7 +224,7 @@ def make_dataset(
             if progress is not None:
                 progress(done, r.units)
             stop()
-        return _finish(folder, r, told)
+        return _finish(folder, r, {**told, "begun": begun})
 
 
 def _all(
@@ -260,8 +261,11 @@ def _on_cluster(
 # ------------------------------------------------------------------------------ on disk
 
 
-def _claim(folder: Path, told: Mapping[str, Any]) -> None:
-    """Make sure that the folder is this recipe's, by this program."""
+def _claim(folder: Path, told: Mapping[str, Any]) -> str:
+    """Make sure that the folder is this recipe's, by this program; return the day it was begun.
+
+    The day stays where a set is gone on with; ``SOURCE_DATE_EPOCH`` fixes it.
+    """
     path = folder / "recipe.json"
     for part in (
         p for p in folder.rglob(".[0-9]*-[0-9]*.part") if path.exists() or p.parent == folder
@@ -270,8 +274,9 @@ def _claim(folder: Path, told: Mapping[str, Any]) -> None:
     if not path.exists():
         if any(p.name != LOCK for p in folder.iterdir()):
             raise DataError(f"{folder} holds other files: give a folder of its own")
-        files.write_text(path, jsontext.dumps(told) + "\n")
-        return
+        begun = now()[:10]
+        files.write_text(path, jsontext.dumps({**told, "begun": begun}) + "\n")
+        return begun
     try:
         before = json.loads(files.read_text(path))
     except ValueError as e:
@@ -279,6 +284,7 @@ def _claim(folder: Path, told: Mapping[str, Any]) -> None:
     for key, what in (("recipe", "another recipe"), ("program", "another version of the program")):
         if before.get(key) != told[key]:
             raise DataError(f"{folder} was begun with {what}: give another folder, or remove it")
+    return str(before.get("begun", now()[:10]))
 
 
 def _record(folder: Path, unit: int) -> Path:
@@ -323,7 +329,7 @@ def _finish(folder: Path, r: Recipe, told: Mapping[str, Any]) -> dict[str, int]:
     sums[RUNS] = _sum(table)
     columns = gas_path_columns()
     files.write_text(folder / "CARD.md", data_card(r, rows, columns, WAVES, told))
-    meta = croissant(r, sums, rows[0], columns, WAVES)
+    meta = croissant(r, sums, rows[0], columns, WAVES, told["begun"])
     files.write_text(folder / "croissant.json", jsontext.dumps(meta) + "\n")
     lines = [f"{s}  {n}\n" for n, s in sorted(sums.items())]
     files.write_text(folder / SUMS, "".join(lines))

@@ -4,14 +4,29 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import inspect
 import math
 import re
 import sys
+import textwrap
 import tomllib
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from apu_casadi.core.errors import ScenarioError, nearest
+
+
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Help whose paragraphs are broken anew where the terminal is narrower than they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        """Leave examples, which are indented or have columns, as they are."""
+        room, blocks = width + 2, inspect.cleandoc(text).split("\n\n")
+        for k, block in enumerate(blocks):
+            lines = block.split("\n")
+            if max(map(len, lines)) > room and not re.search(r"^ |\S   +\S", block, re.MULTILINE):
+                blocks[k] = textwrap.fill(block, room, break_on_hyphens=False)
+        return super()._fill_text("\n\n".join(blocks), width, indent)
 
 
 class Parser(argparse.ArgumentParser):

@@ -98,11 +98,7 @@ def track(
         stop = min(at + CHUNK, data.size)
         r, ahead = _filtered(made, sweep, prior, data, at, stop, cov_at, backend)
         judged, share = share.size, np.append(share, _window_means(r.nis))
-        white = np.full(share.size - judged, float(len(MEASURED)))
-        usual = _usual(share, judged) if own else white
-        over = share[judged:] > usual + RESET_LEVEL - len(MEASURED)
-        over[: max(2 - judged, 0)] = False  # a start needs them to settle
-        bad = judged + np.flatnonzero(over)
+        bad = _unusual(share, judged, own=own)
         if not bad.size:
             pieces.append(r)
             prior, at = ahead, stop
@@ -211,6 +207,15 @@ def _window_means(nis: np.ndarray) -> np.ndarray:
     full = nis.size // RESET_WINDOW
     of_windows: np.ndarray = nis[: full * RESET_WINDOW].reshape(full, RESET_WINDOW).mean(1)
     return of_windows
+
+
+def _unusual(share: np.ndarray, first: int, *, own: bool) -> np.ndarray:
+    """Return windows from ``first`` on whose NIS no noise makes; a start needs two to settle."""
+    white = np.full(share.size - first, float(len(MEASURED)))
+    usual = _usual(share, first) if own else white
+    over = share[first:] > usual + RESET_LEVEL - len(MEASURED)
+    over[: max(2 - first, 0)] = False
+    return first + np.flatnonzero(over)
 
 
 def _usual(share: np.ndarray, first: int) -> np.ndarray:
