@@ -239,6 +239,26 @@ class _Pair:
         return ca.Function("means", given, [ca.vertcat(*found)], {"cse": True})(sums, angles)
 
 
+def _seen_of_a_jump(V_now: Any, voltages: list[Any], pairs: int, length: Any) -> Any:
+    """Relative error of the mean voltage that a jump at the start makes the regulator see.
+
+    It takes the voltage of the first instant for true over a sixth of its first step; a jump of the
+    load or the fault moves it for microseconds.  What it would be without is told by the samples
+    after it, but for their ripple, and by those half a turn apart, which ripple alike, but for what
+    settles within a turn: it is off by no more than either says.
+
+    Args:
+        V_now: at the first instant.
+        voltages: those at its start, and of the pairs that follow.
+        pairs: in half a turn.
+        length: of the step, in strides.
+    """
+    near = ca.mtimes(ca.horzcat(*voltages[1 : 1 + _BACK // PACE]), ca.DM(through(1, _BACK)[:, 0]))
+    a, b, c = (voltages[pairs * k][-1] for k in (1, 2, 3))
+    off = (ca.fabs(1 - V / V_now) for V in (near, 3 * a - 3 * b + c))
+    return ca.fmin(*off) * PACE / (6 * length)
+
+
 def periodic_step(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn, harmonics: int
 ) -> ca.Function:
@@ -285,14 +305,7 @@ def periodic_step(
         sums[at_pair] = sums[at_pair] + its
         samples.append(X)
         voltages.append(V)
-    # The regulator takes the voltage of the first instant for true over a sixth of its first step;
-    # a jump of the load or the fault moves it for microseconds.  What it would be without is told
-    # by the samples after it, but for their ripple, and by those half a turn apart, which ripple
-    # alike, but for what settles within a turn: it is off by no more than either says.
-    near = ca.mtimes(ca.horzcat(*voltages[1 : 1 + _BACK // PACE]), ca.DM(through(1, _BACK)[:, 0]))
-    a, b, c = (voltages[pairs * k][-1] for k in (1, 2, 3))
-    off = (ca.fabs(1 - V / V_now) for V in (near, 3 * a - 3 * b + c))
-    jump = ca.fmin(*off) * PACE / (6 * length)
+    jump = _seen_of_a_jump(V_now, voltages, pairs, length)
     mean = pair.means(ca.horzcat(pair.weighted(terms, first), *sums), angles)
     V_all = ca.horzcat(*voltages)
     # the end of the step, with the phases as they are after so many half turns

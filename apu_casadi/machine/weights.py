@@ -80,8 +80,8 @@ def rippling(
     rows = []
     for column in values.T:
         fit = Chebyshev.fit(x, column, _TERMS - 1, domain=[0, 1])
-        u = Polynomial(fit.convert(kind=Polynomial, domain=[0, 1], window=[-0.5, 0.5]).coef)
-        rows.append(np.pad(u.coef, (0, _TERMS - u.coef.size)))
+        own = fit.convert(kind=Polynomial, domain=[0, 1], window=[-0.5, 0.5]).coef
+        rows.append(np.pad(own, (0, _TERMS - own.size)))
     return np.asarray(first), np.array(rows)
 
 
