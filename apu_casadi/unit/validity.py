@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from apu_casadi.machine.loads.load import Load
+    from apu_casadi.unit.exchange import Link
 
 __all__ = [
     "EXCHANGE_LIMIT",
@@ -304,6 +305,16 @@ class FollowedRotor:
         apu, point: the unit, and the steady point that the run starts from.
         t, N, Wf: of the run, of which the first values count here.
     """
+
+    link: Link
+    N_0: float
+    Wf_0: float
+    a: float
+    b: float
+    state: np.ndarray
+    error: float
+    excursion: float
+    grew: float
 
     def __init__(
         self, apu: Apu, point: OperatingPoint, t: np.ndarray, N: np.ndarray, Wf: np.ndarray

@@ -13,6 +13,7 @@ exchange it is one continuous model.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     usage.actions(parser, (("c", _c, _C), ("fmu", _fmu, _FMU)))
 
 
-run = usage.act
+run: Callable[[argparse.Namespace], int] = usage.act
 
 
 def _asked(args: argparse.Namespace) -> Asked:
