@@ -32,10 +32,11 @@ from apu_casadi.core import files
 from apu_casadi.core.backend import package_digest
 from apu_casadi.core.cf import now
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, SimulationError
-from apu_casadi.core.results import CHANNELS, severity_h
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.runsignals import RUN
+from apu_casadi.unit.runsummary import severity_h
 from estimators.apu.measuring import measure_run
 from estimators.apu.sensors import GAS_PATH
 from scenarios import registry
@@ -60,8 +61,8 @@ def gas_path_columns() -> dict[str, tuple[str, str]]:
     found |= {f"W.{n}": (CONDITIONS[n].unit, CONDITIONS[n].doc) for n in VARIED}
     found["W.P_e"] = ("W", "electrical output, both generators")
     found |= {f"X_s.{s.name}": (s.unit, "as measured") for s in GAS_PATH.sensors}
-    found |= {f"X_v.{n}": CHANNELS[n] for n in VIRTUAL}
-    found |= {f"T.{n}": CHANNELS[n] for n in HEALTH}
+    found |= {f"X_v.{n}": (RUN[n].unit, RUN[n].doc) for n in VIRTUAL}
+    found |= {f"T.{n}": (RUN[n].unit, RUN[n].doc) for n in HEALTH}
     return found | {"T.h": ("1", "mu/(k_rf + 1 - mu) of the short circuit")}
 
 

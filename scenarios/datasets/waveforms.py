@@ -17,7 +17,8 @@ import numpy as np
 
 from apu_casadi.core import cf, files
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import CHANNELS, GENERATOR
+from apu_casadi.core.results import GENERATOR
+from apu_casadi.unit.runsignals import RUN
 from estimators.apu.sensors import ELECTRICAL
 
 MACHINES = (1, 2)
@@ -40,7 +41,7 @@ _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 def meaning(name: str) -> str:
     """Return what a reading is of."""
-    return CHANNELS[name][1] if name in CHANNELS else "electrical speed of the rotor"
+    return RUN[name].doc if name in RUN else "electrical speed of the rotor"
 
 
 def _described(parts: Sequence[dict[str, np.ndarray]], title: str) -> Any:
