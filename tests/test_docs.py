@@ -62,3 +62,21 @@ def test_files_of_the_tutorials_are_accepted(tmp_path):
     (tmp_path / "my_unit.toml").write_text(blocks(DOCS / "tutorials/own-engine.md", "toml")[0])
     engine = read_unit(tmp_path / "my_unit.toml")
     assert engine.unit.gas_generator.design.values["PW"] > 50e3
+
+
+def test_every_module_has_a_page_of_the_api(monkeypatch):
+    """Packages name what is in them, with the first line of each; nothing private is there."""
+    import apu_casadi
+
+    monkeypatch.syspath_prepend(str(DOCS))
+    import site_api
+
+    root = Path(apu_casadi.__file__).parents[1]
+    known = site_api.modules(root)
+    assert len(known) > 400 and {*site_api.PACKAGES, "apu_casadi.core.cf"} < {*known}
+    assert not [n for n in known if "._" in n or "__init__" in n]
+    assert {n.rpartition(".")[0] for n in known} - {*known} == {""}
+    faults = site_api.page("apu_casadi.machine.faults", known)
+    assert ":doc:`apu_casadi.machine.faults.ttsc`\n     - Turn-to-turn short circuit" in faults
+    inner = {n for n in known if n.startswith("apu_casadi.machine.faults.")}
+    assert {*re.findall(r"^   ([\w.]+)$", faults, re.M)} == inner
