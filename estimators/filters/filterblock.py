@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import compiled
+from apu_casadi.core.backend import READY, compiled, library
+from apu_casadi.core.lanes.lanelibrary import lanes_in_use
 from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.sharing import kept, once
+from estimators.filters.rowblock import Rows, row_block
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
@@ -51,6 +54,10 @@ class Step(Protocol):
     @property
     def gives_roots(self) -> bool:
         """Whether the step hands roots of covariances on."""
+
+    @property
+    def rows(self) -> Callable[[], Rows | None] | None:
+        """What takes the step apart for blocks whose lanes are rows."""
 
 
 def block_length(model: FilterModel) -> int:
@@ -214,7 +221,24 @@ def block_function(
     one = by_reciprocals(one)
     of_halves = block_of(one, f"{name}_half", len(carried), short=block_length(step.model) < BLOCK)
     block = _whole(of_halves, of_p, name, len(carried), pattern)
-    return compiled(block, backend=backend), block
+    rows = None if full else _by_rows(step, block, short, backend)
+    return (compiled(block, backend=backend) if rows is None else rows), block
+
+
+def _by_rows(
+    step: Step, block: ca.Function, short: bool, backend: str | None
+) -> ca.Function | None:
+    """Return the block compiled with rows as lanes; None where it has no such form."""
+    lanes = lanes_in_use()
+    if lanes == 1 or step.rows is None:
+        return None
+    parts = step.rows()
+    if parts is None:
+        return None
+    how: dict[str, Any] = {"short": short, "padded": PADDED}
+    code = row_block(parts, block, block_length(step.model), lanes, **how)
+    wanted = None if backend == READY else backend
+    return library(code, backend=wanted, build=backend != READY)
 
 
 def _whole(

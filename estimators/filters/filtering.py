@@ -39,6 +39,7 @@ from estimators.filters.filterblock import (
     padded,
     unpacked,
 )
+from estimators.filters.rowblock import Rows
 from estimators.filters.sweeping import Piece, Sweep
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
@@ -78,12 +79,15 @@ class FilterStep(Parametric):
             triangular factors L of the covariance L L'.
         wide: makes the same filter in square-root form, for beliefs whose covariance double
             precision does not hold; None where there is none.
+        rows: takes the step apart, for blocks whose lanes are rows; None where there is no such
+            form, or returns None.
     """
 
     model: FilterModel
     function: ca.Function
     root: bool = False
     wide: Callable[[], FilterStep] | None = None
+    rows: Callable[[], Rows | None] | None = None
 
     def __post_init__(self) -> None:
         f, (nx, nu, np_, _, ny) = self.function, self.model.sizes
