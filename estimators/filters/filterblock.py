@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -17,12 +17,13 @@ from estimators.filters.rowblock import Rows, row_block
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "WIDE"]
+__all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "ROWS", "WIDE"]
 __all__ += ["block_function", "block_length", "block_of", "in_halves", "narrow", "packed_diagonal"]
-__all__ += ["padded", "unpacked"]
+__all__ += ["padded", "row_function", "unpacked"]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
+ROWS = 4 * BLOCK  # the same where a block's length costs nothing
 STEP_IN = ["m", "P", "u", "p", "y", "R", "dt"]
 STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
 """Of a step: belief before the sample, inputs, parameters, sample, variances (< 0: not measured),
@@ -221,22 +222,19 @@ def block_function(
     one = by_reciprocals(one)
     of_halves = block_of(one, f"{name}_half", len(carried), short=block_length(step.model) < BLOCK)
     block = _whole(of_halves, of_p, name, len(carried), pattern)
-    rows = None if full else _by_rows(step, block, short, backend)
-    return (compiled(block, backend=backend) if rows is None else rows), block
+    return compiled(block, backend=backend), block
 
 
-def _by_rows(
-    step: Step, block: ca.Function, short: bool, backend: str | None
-) -> ca.Function | None:
-    """Return the block compiled with rows as lanes; None where it has no such form."""
-    lanes = lanes_in_use()
-    if lanes == 1 or step.rows is None:
+@kept
+def row_function(step: Step, backend: str | None, _in_use: str) -> ca.Function | None:
+    """Return ``ROWS`` steps compiled with rows as lanes; None where there is no such form.
+
+    See :func:`estimators.filters.rowblock.row_block`.
+    """
+    lanes, parts = lanes_in_use(), None if step.rows is None else step.rows()
+    if lanes == 1 or parts is None:
         return None
-    parts = step.rows()
-    if parts is None:
-        return None
-    how: dict[str, Any] = {"short": short, "padded": PADDED}
-    code = row_block(parts, block, block_length(step.model), lanes, **how)
+    code = row_block(f"{step.function.name()}_rows", parts, ROWS, lanes, padded=PADDED)
     wanted = None if backend == READY else backend
     return library(code, backend=wanted, build=backend != READY)
 

@@ -37,6 +37,7 @@ from estimators.filters.filterblock import (
     narrow,
     packed_diagonal,
     padded,
+    row_function,
     unpacked,
 )
 from estimators.filters.rowblock import Rows
@@ -391,9 +392,12 @@ def sweep_of(
     wide = step.wide is not None
     if wide and narrow(prior.cov):
         return None
-    block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
+    by_rows = row_function(step.shared, backend, backend_in_use())
+    block = by_rows
+    if block is None:
+        block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
     how: dict[str, Any] = {"wide": wide, "cov_at": cov_at, "remember": remember}
-    return Sweep(step.model, block, data, step.full(data.p), **how)
+    return Sweep(step.model, block, data, step.full(data.p), rows=by_rows is not None, **how)
 
 
 def result_of(

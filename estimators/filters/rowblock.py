@@ -29,7 +29,7 @@ from apu_casadi.core.lanes.lanelibrary import flags_of, framed
 from apu_casadi.core.reciprocals import as_written, by_reciprocals
 from apu_casadi.core.sharing import once
 
-__all__ = ["Rows", "row_block"]
+__all__ = ["SOME", "Rows", "row_block"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +69,6 @@ class Rows:
 
 
 _TYPES = """
-typedef double U __attribute__((vector_size(8*L),aligned(8)));
-#define AT(p) (*(U*)(p))
 #define ALL(x) v_all(x)
 #define ROW(A,i) ((double*)(A)+(i)*NV*L)
 IN void turned(const V*from,V*to){
@@ -91,57 +89,55 @@ for(int c=b+1;c<NV;c++){turned(A+c*L*NV+b,t);for(int k=0;k<L;k++)A[(b*L+k)*NV+c]
 
 _BEFORE = """
 double hp[NX*NY],m[NX],m1[NX],at[NX+NW],Hz[NH],Fz[NF+1],Rd[NY],nu[NY],a[NY],inv[NY],Lz[NY*NY];
-double pc[NP+NC],check,measured,work[WORK],half[HALF+L];
-V P[NV*L*NV+1],X[NX*NV],F[(NX+NW)*NV],HP[NY*MV],B[NY*MV+1],d[MV],G[NY*NV],D[NY*NV],E[NY*NV];
+double pc[NP+NC],check,measured,work[WORK];
+V P[NV*L*NV],X[NX*NV],F[(NX+NW)*NV],HP[NY*MV],B[NY*MV],d[MV],G[NY*NV],D[NY*NV],E[NY*NV];
 memset(P,0,sizeof P);memset(F,0,sizeof F);memset(HP,0,sizeof HP);memset(B,0,sizeof B);
-for(int k=0;k<NP;k++)pc[k]=arg[GIVEN+4][k];
-{const double*a1[]={arg[GIVEN+4]};double*r1[]={pc+NP};CONSTANTS(a1,r1,0,work,0);}
+for(int k=0;k<NP;k++)pc[k]=arg[8][k];
+{const double*a1[]={arg[8]};double*r1[]={pc+NP};CONSTANTS(a1,r1,0,work,0);}
 for(int i=0;i<NX;i++){m[i]=arg[0][i];for(int j=0;j<=i;j++)ROW(P,i)[j]=arg[1][j*NX+i];}
 mirrored(P);
 for(int k=0;k<NCONST;k++)((double*)F)[const_to[k]]=const_of[k];
 """
-_LAST = "memcpy(res[2],arg[2],sizeof(double)*NX*NX);"
 _READ = """
+memcpy(res[2],arg[2],sizeof(double)*NX*NX);
+double*to=res[8];
 for(int s=0;s<K;s++){
-const double*us=arg[GIVEN]+s*NU,*ys=arg[GIVEN+1]+s*NY,*Rs=arg[GIVEN+2]+s*NY,*dts=arg[GIVEN+3]+s;
-double*stats=res[KEPT+4]+4*s;
+const double*us=arg[3]+s*NU,*ys=arg[4]+s*NY,*Rs=arg[5]+s*NY,*dts=arg[6]+s;
+if(Rs[0]==PADDED)break;
+double*stats=res[7]+4*s;
 {const double*a1[]={m,at,us,pc,ys,Rs,dts};
-double*r1[]={nu,Hz,Rd,res[KEPT+2]+s*NY,&check,&measured};READ(a1,r1,0,work,0);}
+double*r1[]={nu,Hz,Rd,res[5]+s*NY,&check,&measured};READ(a1,r1,0,work,0);}
 /* H P as columns; below the states the noise */
 """
 _GAIN = """
 for(int l=0;l<NY;l++)for(int i=0;i<NX;i++)hp[l*NX+i]=((double*)(HP+l*MV))[i];
 {const double*a1[]={Hz,hp,Rd,nu,&measured};
-double*r1[]={Lz,inv,a,res[KEPT+3]+s*NY,stats+1};GAIN(a1,r1,0,work,0);}
+double*r1[]={Lz,inv,a,res[6]+s*NY,stats+1};GAIN(a1,r1,0,work,0);}
 for(int v=0;v<MV;v++){
 """
 _FORECAST = """
 }
-for(int i=0;i<NX;i++)res[KEPT][s*NX+i]=at[i]=gains[i]?m[i]+((double*)d)[i]:m[i];
+for(int i=0;i<NX;i++)res[3][s*NX+i]=at[i]=gains[i]?m[i]+((double*)d)[i]:m[i];
 for(int i=0;i<NW;i++)at[NX+i]=((double*)(d+NV))[i];
 {const double*a1[]={m,at,us,pc,ys,Rs,dts};
 double*r1[]={m1,Fz,stats};FORECAST(a1,r1,0,work,0);}
 stats[0]=check+stats[0];
 for(int k=0;k<NF;k++)((double*)F)[f_to[k]]=Fz[k];
 """
-_VARIANCES = """
+_FILTERED = """
 for(int i=0;i<NX;i++){double t=0.0;
-for(int l=0;l<NY;l++){const double b=((double*)(B+l*MV))[i];t=t+b*b;}
-res[KEPT+1][s*NX+i]=ROW(P,i)[i]-t*gains[i];}
-if(Rs[0]!=PADDED&&(s==K-1||Rs[NY]==PADDED))
-for(int i=0;i<NX;i++)for(int j=0;j<=i;j++){double t=0.0;
-for(int l=0;l<NY;l++)t=t+((double*)(B+l*MV))[i]*((double*)(B+l*MV))[j];
-res[2][i*NX+j]=res[2][j*NX+i]=ROW(P,i)[j]-(gains[i]+gains[j]>0.0?t:0.0);}
-"""
-_HALVES = """
-{double*to=HALF>=L&&s<K-1?res[KEPT+1]+s*HALF:half;
+for(int k=0;k<NY;k++){const double b=((double*)(B+k*MV))[i];t=t+b*b;}
+res[4][s*NX+i]=ROW(P,i)[i]-t*gains[i];}
+if(arg[7][s]!=0.0&&to+HALF<=res[8]+SOME*HALF){
 for(int j=0;j<NX;j++){const double*b=(double*)B+j;
-for(int i=0;i<NX-j;i+=L){V t=AT(b+i)*ALL(b[0]);
-for(int l=1;l<NY;l++)t=t+AT(b+l*MV*L+i)*ALL(b[l*MV*L]);
-if(!gains[j])t=t*AT(gains+j+i);
-AT(to+i)=AT(ROW(P,j)+j+i)-t;}
-to+=NX-j;}
-if(HALF<L||s==K-1)for(int i=0;i<HALF;i++)res[KEPT+1][s*HALF+i]=half[i];}
+for(int i=0;i<NX-j;i++){double t=b[i]*b[0];
+for(int k=1;k<NY;k++)t=t+b[k*MV*L+i]*b[k*MV*L];
+to[i]=ROW(P,j)[j+i]-(gains[j]+gains[j+i]>0.0?t:0.0);}
+to+=NX-j;}}
+if(s==K-1||Rs[NY]==PADDED)
+for(int i=0;i<NX;i++)for(int j=0;j<=i;j++){double t=0.0;
+for(int k=0;k<NY;k++)t=t+((double*)(B+k*MV))[i]*((double*)(B+k*MV))[j];
+res[2][i*NX+j]=res[2][j*NX+i]=ROW(P,i)[j]-(gains[i]+gains[j]>0.0?t:0.0);}
 """
 _AFTER = """
 mirrored(P);
@@ -150,6 +146,9 @@ for(int i=0;i<NX;i++)m[i]=m1[i];
 for(int i=0;i<NX;i++){res[0][i]=m[i];for(int j=0;j<NX;j++)res[1][i*NX+j]=ROW(P,i)[j];}
 DONE return 0;}
 """
+SOME = 8  # samples of a block whose covariances are kept
+INPUTS = ["m", "P", "P_last", "u", "y", "R", "dt", "keep", "p"]
+OUTPUTS = ["m1", "P1", "P_f", "m_f", "var", "nu", "S", "stats", "some"]
 WOVEN = 8  # sums that are under way at once: an addition takes four cycles, and two begin in each
 
 Terms = Sequence[tuple[str, str]]  # a number and a vector
@@ -319,35 +318,37 @@ def _digest() -> str:
     return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
 
 
-def row_block(
-    rows: Rows, block: ca.Function, length: int, lanes: int, *, short: bool, padded: float
-) -> Code:
-    """Return the code of a block of steps.
+def row_block(name: str, rows: Rows, length: int, lanes: int, *, padded: float) -> Code:
+    """Return the code of a block of steps; matrices in columns are lower halves.
+
+    (m, P, P_f, u, y, R, dt, keep, p) -> (m1, P1, P_f, m_f, var, nu, diag S, stats, some), where the
+    first P_f is the last sample's, and some are of the first ``SOME`` samples that ``keep`` marks.
 
     Args:
+        name: of the function.
         rows: the step.
-        block: the same in scalar operations, whose name, inputs and outputs this one takes.
-        length: steps.
+        length: steps at most.
         lanes: rows at once.
-        short: of :func:`estimators.filters.filterblock.block_function`, whose blocks these are.
-        padded: variance of what fills a block up.
+        padded: variance that ends a recording: there the block ends.
     """
-    name = f"{block.name()}_rows"
-    nx, nm, ny, np_ = (rows.symbols[k].shape[0] for k in (0, 1, 4, 3))
+    nx, nm, ny, np_, nu = (rows.symbols[k].shape[0] for k in (0, 1, 4, 3, 2))
     how = rows.fixed, rows.walk, rows.gain.sparsity_in(0), rows.forecast[1]
     layout = _Layout(nx, ny, lanes, *how)
     varying = ca.vertcat(*(e for _, _, e in layout.varying))
     forecast = rows.forecast[0], varying, rows.forecast[2]
     of_p, read, ahead = dataclasses.replace(rows, forecast=forecast).functions(name)
     functions = {"CONSTANTS": of_p, "READ": read, "GAIN": rows.gain, "FORECAST": ahead}
-    numbers = {"NX": nx, "NW": nm - nx, "NY": ny, "NU": rows.symbols[2].shape[0], "NP": np_}
-    numbers |= {"NC": of_p.nnz_out(0), "NV": layout.room, "K": length, "NH": rows.gain.nnz_in(0)}
-    numbers |= {"MV": layout.room - (nx - nm) // lanes, "NF": varying.shape[0]}
-    numbers |= {"NCONST": len(layout.entries) - len(layout.varying), "HALF": nx * (nx + 1) // 2}
-    numbers |= {"GIVEN": 3 if short else 2, "KEPT": 3 if short else 2}
+    half = nx * (nx + 1) // 2
+    numbers = {"NX": nx, "NW": nm - nx, "NY": ny, "NU": nu, "NP": np_, "NC": of_p.nnz_out(0)}
+    numbers |= {"NV": layout.room, "MV": layout.room - (nx - nm) // lanes, "K": length}
+    numbers |= {"NH": rows.gain.nnz_in(0), "NF": varying.shape[0], "HALF": half, "SOME": SOME}
+    numbers |= {"NCONST": len(layout.entries) - len(layout.varying)}
     numbers |= {"WORK": 1 + max(f.sz_w() for f in functions.values())}
     content = "\n".join([name, _digest(), *(f.serialize() for f in functions.values())])
-    content += f"{lanes} {short} {numbers} {rows.walk} {rows.fixed}"
+    content += f"{lanes} {padded} {numbers} {rows.walk} {rows.fixed}"
+    each = [(n, length) for n in (nu, ny, ny, 1, 1)]
+    ins = [(nx, 1), (nx, nx), (nx, nx), *each, (np_, 1)]
+    outs = [(nx, 1), (nx, nx), (nx, nx), *((n, length) for n in (nx, nx, ny, ny, 4)), (half, SOME)]
 
     def write() -> str:
         generator = ca.CodeGenerator("code.c", {"with_header": False})
@@ -356,22 +357,18 @@ def row_block(
         words = [f"#define {n} {v}" for n, v in numbers.items()]
         words += [f"#define {n} {f.name()}" for n, f in functions.items()]
         words.append(f"#define PADDED ({number(padded)})")
-        gains = [float(i not in rows.fixed) for i in range(nx)] + [0.0] * 2 * lanes
+        gains = [float(i not in rows.fixed) for i in range(nx)]
         line = [str(-int(b <= k)) for k in range(lanes) for b in range(lanes)]
         walks = [w * (i % lanes == k) for i, w in enumerate(rows.walk) for k in range(lanes)]
         mine = [_doubles("gains", gains), _doubles("walks", walks)]
         mine += [_table("int64_t", "below", line), *layout.tables()]
-        ins, outs = (
-            [of(i) for i in range(n)]
-            for of, n in ((block.sparsity_in, block.n_in()), (block.sparsity_out, block.n_out()))
-        )
+        given, made = ([ca.Sparsity.dense(*size) for size in sizes] for sizes in (ins, outs))
+        frame = framed(name, INPUTS, OUTPUTS, given, made, 0)
         text = [generator.dump(), "#include <string.h>", Writer(lanes).source(), *mine, *words]
-        text += [_TYPES, framed(name, block.name_in(), block.name_out(), ins, outs, 0)]
-        for what, there in (("arg", ins), ("res", outs)):
-            text += [f"if(!{what}[{k}])return 1;" for k, s in enumerate(there) if s.numel()]
-        text.append(_BEFORE)
-        text += [*([_LAST] if short else []), _READ, *layout.output(), _GAIN, *layout.gained()]
-        text += [_FORECAST, _VARIANCES if short else _HALVES, *layout.ahead(), *layout.next()]
-        return "\n".join([*text, _AFTER])
+        text += [_TYPES, frame]
+        for what, sizes in (("arg", ins), ("res", outs)):
+            text += [f"if(!{what}[{k}])return 1;" for k, (n, _) in enumerate(sizes) if n]
+        text += [_BEFORE, _READ, *layout.output(), _GAIN, *layout.gained()]
+        return "\n".join([*text, _FORECAST, _FILTERED, *layout.ahead(), *layout.next(), _AFTER])
 
     return Code(name, content, write, flags_of(lanes))
