@@ -90,7 +90,7 @@ def coefficients(ss: GeneratorModel) -> ca.Function:
 
 
 @once
-def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
+def radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes in (0, 1], the last one 1, and Butcher matrix of a Radau IIA method."""
     c = np.array(ca.collocation_points(stages, "radau"))
     k = np.arange(stages)
@@ -138,7 +138,7 @@ def _radau_function(ss: GeneratorModel, stages: int) -> ca.Function:
     stages X_i = X + h sum_j a_ij (M_j X_j + F_j) are eliminated one after the other, by blocks of
     the windings' size; the last one is the result.
     """
-    n, (c, a), iw = len(ss.linear), _radau(stages), ss.u.index("w_r")
+    n, (c, a), iw = len(ss.linear), radau(stages), ss.u.index("w_r")
     sizes = {"theta_0": 1, "w": 1, "t": 1, "u": len(ss.u), "theta": len(ss.theta)}
     angle, w, t, u, th = given = [ca.SX.sym(k, size) for k, size in sizes.items()]
     u_now = ca.SX(u)
@@ -149,7 +149,7 @@ def _radau_function(ss: GeneratorModel, stages: int) -> ca.Function:
     drive[-1, -1] = 1
     parts = [ca.densify(M[:n, :n]), ca.densify(M[:n, n:] @ drive)]
     node = ca.Function("node", given, parts, {"cse": True})
-    inverse = _inverse(n)
+    inverted = inverse(n)
 
     sizes = {"theta_0": 1, "w": 1, "h": 1, "t": 1, "X": n * (n + EXTRA)}
     sizes |= {"u": len(ss.u), "theta": len(ss.theta)}
@@ -165,7 +165,7 @@ def _radau_function(ss: GeneratorModel, stages: int) -> ca.Function:
         rows.append(ca.horzcat(ca.DM(one) - ca.DM(weights) * M, before[:, :n], driven))
     row = rows[0]
     for k in range(stages):
-        row = ca.mtimes(inverse(rows[k][:, :n]), rows[k][:, n:])
+        row = ca.mtimes(inverted(rows[k][:, :n]), rows[k][:, n:])
         for i in range(k + 1, stages):
             rows[i] = rows[i][:, n:] - ca.mtimes(rows[i][:, :n], row)
     return ca.Function(f"radau_{stages}_{ss.name}", given, [ca.vec(row)])
@@ -180,7 +180,7 @@ def _in_a_row(step: ca.Function, steps: int) -> ca.Function:
 
 
 @once
-def _inverse(n: int) -> ca.Function:
+def inverse(n: int) -> ca.Function:
     """Inverse of a matrix with a dominant diagonal; its rows may be of any magnitude."""
     A = ca.SX.sym("A", n, n)
     d = ca.diag(A)
@@ -227,7 +227,7 @@ def _radau_step(M: np.ndarray, t: np.ndarray, hs: np.ndarray) -> np.ndarray:
         t, hs: instants of the nodes, (angles, stages), and length of the step, (angles,), s.
     """
     N, stages, n = hs.size, M.shape[1], M.shape[2] - EXTRA
-    _, a = _radau(stages)
+    _, a = radau(stages)
     M = M[:, :, :n]
     drive = np.zeros((*t.shape, EXTRA, EXTRA))  # E at the nodes from its derivatives; and one
     drive[..., 0, :-1] = np.stack([t**i / math.factorial(i) for i in range(EXTRA - 1)], axis=2)
@@ -250,7 +250,7 @@ def _constant_transition(M: np.ndarray, h: np.ndarray, steps: int, leaps: int = 
     Returns:
         Shape (leaps, angles, n, n + EXTRA).
     """
-    c, _ = _radau(STAGES)
+    c, _ = radau(STAGES)
     hs, n = h / steps, M.shape[1] - EXTRA
     one = np.zeros(M.shape)
     for i in range(EXTRA - 1):

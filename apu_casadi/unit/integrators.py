@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import repeat
-from typing import TYPE_CHECKING, ClassVar, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -27,6 +27,7 @@ from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
+from apu_casadi.machine.collocated import Collocated
 from apu_casadi.machine.course import Course, Into, Numbers, apart
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
@@ -50,8 +51,8 @@ WAVEFORMS = tuple(
 #: :class:`MeanStep` does not hold, by "is healthy": with 200, means of a severe fault err by 4e-4.
 SUMMARY_SAMPLES = {True: 160, False: 400}
 FINE_SAMPLE = 50e-6  # s; what stored waveforms are computed with, at most
-SETTLED = 5e-3  # s; so long after a switch CVODES goes on, in the middle of a step if need be
-_NO_TIMES, _NO_WAVES = np.empty(0), np.empty((0, 0))
+SETTLED = 5e-3  # s; so long after a switch no step is propagated by tables
+NO_TIMES, NO_WAVES = np.empty(0), np.empty((0, 0))
 _LOG = logging.getLogger("apu_casadi")
 
 
@@ -150,8 +151,8 @@ class Integrated(NamedTuple):
     x: np.ndarray
     quad: tuple[str, ...]
     means: np.ndarray
-    t: np.ndarray = _NO_TIMES
-    w: np.ndarray = _NO_WAVES
+    t: np.ndarray = NO_TIMES
+    w: np.ndarray = NO_WAVES
     nsteps: int = 0
     exact: bool = True
 
@@ -191,7 +192,7 @@ class Integrator:
 
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return instants and waveforms of the steps of a block, of all its samples."""
-        return _NO_TIMES, _NO_WAVES
+        return NO_TIMES, NO_WAVES
 
 
 def integrators(
@@ -209,11 +210,8 @@ def integrators(
     sampled: list[Integrator] = [Samples(*given, fine=f) for f in (False, True)]
     if settings.waveform_dt is not None:
         return [*sampled, always]
-    whole = Means(*given)
-    if way is not None:
-        return [whole, always]
-    follow = Follow(always, Means(*given, after=SETTLED), settings)
-    return [whole, *sampled, follow, always]
+    whole, by_strides = Means(*given), ByStrides(phase, settings, means)
+    return [whole, *(sampled if way is None else ()), by_strides, always]
 
 
 F = TypeVar("F", MeanStep, Propagator)
@@ -300,35 +298,13 @@ class _Exact(Integrator, Generic[F]):
 
 
 class Means(_Exact[MeanStep]):
-    """Steps of which only means are wanted; the part of each that lies ``after`` a time, s."""
+    """Steps of which only means are wanted."""
 
     otherwise = "samples are needed also for means"
 
-    def __init__(
-        self,
-        phase: Phase,
-        settings: Settings,
-        means: StepMeans,
-        way: Way | None = None,
-        *,
-        after: float = 0.0,
-    ) -> None:
-        super().__init__(phase, settings, means, way)
-        self.after = after
-
     def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> MeanStep:
-        p, dt = self.phase, self.settings.dt
-        first = 1 - (dt - self.after) / dt
-        return MeanStep(
-            p.gen,
-            p.ss,
-            u,
-            theta,
-            dt=dt - self.after,
-            quad=self.quad,
-            within=(first, 1 - first),
-            harmonics=harmonics,
-        )
+        p, own = self.phase, {"dt": self.settings.dt, "quad": self.quad}
+        return MeanStep(p.gen, p.ss, u, theta, **own, harmonics=harmonics)  # type: ignore[arg-type]
 
     def __call__(self, step: Step) -> Integrated:
         """Advance over a whole exchange step."""
@@ -403,7 +379,7 @@ class Samples(_Exact[Propagator]):
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stored samples of the steps of a block."""
         if self.settings.waveform_dt is None:
-            return _NO_TIMES, _NO_WAVES
+            return NO_TIMES, NO_WAVES
         fast = self.fast()
         t = np.concatenate([fast.times(float(at))[self.stored] for at in grid[:-1]])
         if self.stored.step == 1:
@@ -436,11 +412,7 @@ class Stepwise(Integrator):
     def __call__(self, step: Step) -> Integrated:
         """Integrate over any step."""
         short = step.h * step.w_r < 2 * math.pi
-        made = self.over(step, self.means.quad(short=short, symmetric=self.phase.symmetric))
-        return made._replace(x=_wrapped(self.phase.ss, made.x))
-
-    def over(self, step: Step, quad: tuple[str, ...], share: float = 1.0) -> Integrated:
-        """Integrate over a step, which is the first ``share`` of a longer one."""
+        quad = self.means.quad(short=short, symmetric=self.phase.symmetric)
         s, fine = self.settings, self.phase.load.fineness
         run = stepper(
             self.model,
@@ -454,37 +426,33 @@ class Stepwise(Integrator):
         if s.way.ramp:
             x, u = np.append(x, step.w_r), u.copy()
             u[self._at] = step.slope
-        r = run(x, u, self.phase.theta, step.h, t0=step.t0, within=(0.0, share))
+        r = run(x, u, self.phase.theta, step.h, t0=step.t0)
         x_end, nsteps = r.x_end[: len(self.phase.ss.x)], int(r.stats.get("nsteps", 0))
         means = np.array([r.mean[k] for k in quad])
+        x_end = _wrapped(self.phase.ss, x_end)
         return Integrated(x_end, quad, means, r.t, r.y[self._rows], nsteps, exact=False)
 
 
-class Follow(Integrator):
-    """A step right after a switch: integrated until the windings have settled, then propagated."""
+class ByStrides(Integrator):
+    """Steps of any length, at any time, of which only means are wanted."""
 
-    first: Stepwise
-    rest: Means
-    settings: Settings
+    def __init__(self, phase: Phase, settings: Settings, means: StepMeans) -> None:
+        self.phase, self.settings, self.means = phase, settings, means
 
-    def __init__(self, first: Stepwise, rest: Means, settings: Settings) -> None:
-        self.first, self.rest, self.settings = first, rest, settings
+    def over(self, h: float) -> Collocated:
+        """Return what takes a step of length h, s."""
+        p, symmetric = self.phase, self.phase.symmetric
+        quad = self.means.quad(short=h * p.gen.machine.w_rated < 2 * math.pi, symmetric=symmetric)
+        longest = self.settings.dt, p.gen.machine.w_rated
+        own: dict[str, Any] = {"longest": longest, "quad": quad, "symmetric": symmetric}
+        return Collocated(p.ss, p.theta, h, **own)
 
     def __call__(self, step: Step) -> Integrated:
-        """Advance over the first exchange step after a switch."""
-        dt = self.settings.dt
-        if abs(step.h - dt) >= SAME_INSTANT or dt < 2 * SETTLED:
-            raise NotApplicable(f"a step of {step.h:g} s is not parted")
-        if step.since >= SETTLED - SAME_INSTANT:
-            raise NotApplicable("the last switch is long ago")
-        rest = self.rest.fast()
-        if not rest.valid(step.w_r):
-            raise NotApplicable(f"w_r = {step.w_r:.6g} rad/s is outside the tables")
-        share = SETTLED / dt
-        a = self.first.over(step._replace(h=SETTLED), self.rest.quad, share)
-        x, then = rest(a.x, step.u, t0=step.t0 + SETTLED)
-        means = share * a.means + (1 - share) * then.ravel()
-        return a._replace(x=_wrapped(self.rest.phase.ss, x), means=means)
+        """Advance over any step."""
+        one = self.over(step.h)
+        x, means = one(step.x, step.u)
+        x, n = _wrapped(self.phase.ss, x), one.strides
+        return Integrated(x, one.quad, means.ravel(), nsteps=n, exact=False)
 
 
 def _wrapped(ss: StateSpace, x: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from apu_casadi.core.errors import SimulationError
+from apu_casadi.core.errors import NotApplicable, SimulationError
 from apu_casadi.core.lanes.together import asking
 from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
@@ -26,7 +26,7 @@ from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Event, FaultChange, Holding, Jump, LoadChange
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.integrators import Settings
-from apu_casadi.unit.jointstep import BLOCK, LONG
+from apu_casadi.unit.jointstep import BLOCK, LONG, BlockResult
 from apu_casadi.unit.machines import Inputs, Machines
 from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
@@ -143,6 +143,7 @@ class JointRun:
         self.governor = apu.governor.start(float(gas["Wf"]))
         self.slope: float | None = 0.0  # of the speed over the last step, rad/s2; None: not known
         self._gas_step = gg.stepper if settings.fast else None
+        self._tried: tuple[int, set[int]] = -1, set()  # an instant, and what could not go on there
         self._by_blocks = settings.exact and asked.hook is None and not asked.noise.N
         off = np.abs(np.diff(asked.grid) - settings.dt) > SAME_INSTANT
         self._odd = np.append(np.flatnonzero(off), off.size)  # steps of other lengths, and the end
@@ -188,8 +189,30 @@ class JointRun:
             most = BLOCK if waves or self.asked.strict or (together and self._changing) else LONG
             first = min(free, most) // BLOCK * BLOCK
             sizes = [first] if together else dict.fromkeys((first, BLOCK))
-            ways[:0] = [partial(self._blocks, steps=n) for n in sizes if 0 < n <= free]
+            tries = [partial(self._blocks, steps=n) for n in sizes if 0 < n <= free]
+            if not (waves or self._changing):
+                tries.append(partial(self._one_by_one, steps=min(max(1, free), BLOCK - 1)))
+            ways[:0] = [partial(self._once, i, way) for i, way in enumerate(tries)]
         return first_able(ways, k)
+
+    def _once(self, way: int, call: Callable[[int], tuple[int, Row]], k: int) -> tuple[int, Row]:
+        """Try a way from instant k, but not again when the question of a later one is answered."""
+        if self._tried[0] != k:
+            self._tried = k, set()
+        if way in self._tried[1]:
+            raise NotApplicable("it has been tried")
+        try:
+            return call(k)
+        except NotApplicable:
+            self._tried[1].add(way)
+            raise
+
+    def _one_by_one(self, k: int, steps: int) -> tuple[int, Row]:
+        """Go on by steps of one length, each a function of its own; by one right after a switch."""
+        steps = steps if all(g.settled for g in self.machines.groups) else 1
+        grid, state = self.asked.grid[k : k + steps + 1], (self.x, self.z, self.governor)
+        done, made = self.machines.one_by_one(*state, self.u, self.theta, grid)
+        return self._went_by(done, made, self.here.factors)
 
     def _blocks(self, k: int, steps: int) -> tuple[int, Row]:
         grid, factors = self.asked.grid[k : k + steps + 1], self.here.factors
@@ -206,6 +229,12 @@ class JointRun:
                 factors = {n: v[:steps] if np.ndim(v) else v for n, v in factors.items()}
         else:
             done, made = self.machines.block(*state, self.u, self.theta, grid)
+        return self._went_by(done, made, factors)
+
+    def _went_by(
+        self, done: BlockResult, made: list[MachineMade], factors: Mapping[str, Any]
+    ) -> tuple[int, Row]:
+        """Go on from the end of blocks."""
         self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
         self.y = done.y[:, -1].copy()
         return done.y.shape[1], self._row(done.y, made, factors)

@@ -5,7 +5,9 @@ of the generators, governor, and the gas generator's discrete step, over a block
 For phases in which nothing is switched: with waveforms (:mod:`apu_casadi.machine.propagation`)
 where the machine's coefficients do not depend on the rotor angle, without them
 (:mod:`apu_casadi.machine.meanstep`) always.  What Python does between the steps of the ordinary
-loop costs as much as the models themselves.  Generators that differ stand side by side in it.
+loop costs as much as the models themselves.  Generators that differ stand side by side in it.  One
+step alone is such a function, too: between the last block and an event, of an odd length, or right
+after a switch (:mod:`apu_casadi.machine.collocated`).
 
 Gains and limits of the governor, gearbox and governed speed are inputs of the function.
 """
@@ -22,10 +24,11 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.lanes.together import Together, asking
+from apu_casadi.core.lanes.together import OFTEN, Together, asking
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
+from apu_casadi.machine.collocated import Collocated
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu
@@ -35,7 +38,7 @@ BLOCK = 10  # exchange steps in one call
 LONG = 200  # at most in a row of calls, whose results are handed on together
 
 
-Fast: TypeAlias = Propagator | MeanStep
+Fast: TypeAlias = Propagator | MeanStep | Collocated
 
 
 class MachineBlock(NamedTuple):
@@ -90,7 +93,13 @@ class _Machine(NamedTuple):
 
 
 def block_function(
-    machines: Sequence[Fast], gas_step: ca.Function, link: Link, name: str, *, wide: bool = False
+    machines: Sequence[Fast],
+    gas_step: ca.Function,
+    link: Link,
+    name: str,
+    *,
+    steps: int = BLOCK,
+    wide: bool = False,
 ) -> ca.Function:
     """Build the block: (carry, u, theta, [u_sg, theta_sg, numbers, series, dt]) -> (last, y, ...).
 
@@ -104,7 +113,8 @@ def block_function(
         gas_step: (N, u, theta, dt, z) -> (N, y, z, residual).
         link: gearbox and governor of any group; the numbers of each are inputs.
         name: of the function.
-        wide: whether all that is held over a step comes in ``BLOCK`` columns, one for each.
+        steps: of the exchange in it.
+        wide: whether all that is held over a step comes in a column for each.
     """
     law, (n_u, n_theta, n_z) = link.governor, (gas_step.numel_in(i) for i in (1, 2, 4))
     n_x = [len(m.ss.x) for m in machines]
@@ -144,9 +154,9 @@ def block_function(
     given_to = [*held]
     if wide:
         steady = [id(g.dt) for g in given]
-        given_to = [s if id(s) in steady else ca.MX.sym(s.name(), s.numel(), BLOCK) for s in held]
+        given_to = [s if id(s) in steady else ca.MX.sym(s.name(), s.numel(), steps) for s in held]
     now, rows = carry, []
-    for k in range(BLOCK):
+    for k in range(steps):
         these = [s[:, k] if s.size2() > 1 else s for s in given_to]
         now, *row = step(now, *these)
         rows.append(row)
@@ -161,6 +171,7 @@ class JointBlock(Rebuilt):
         apu: the unit.
         machines: what propagates each group; a ``Propagator`` must have constant coefficients.
         links: of each group.
+        steps: of the exchange in a block.
         wide: whether what is held over a step changes from step to step (:meth:`followed`).
     """
 
@@ -169,19 +180,22 @@ class JointBlock(Rebuilt):
     _likely = LONG // BLOCK  # blocks in a row that may well be right
 
     def __init__(
-        self, apu: Apu, machines: Sequence[Fast], links: Sequence[Link], *, wide: bool = False
+        self,
+        apu: Apu,
+        machines: Sequence[Fast],
+        links: Sequence[Link],
+        *,
+        steps: int = BLOCK,
+        wide: bool = False,
     ) -> None:
         """Build or fetch the compiled block."""
-        self.apu, self.machines = apu, tuple(machines)
-        self._fixed = [
-            (m.theta, link.numbers, m.parameters, m.dt)
-            for m, link in zip(machines, links, strict=True)
-        ]
+        self.apu, self.machines, self.steps = apu, tuple(machines), steps
+        self._links = [link.numbers for link in links]
         n_x = [len(m.ss.x) for m in machines]
         self._n_gov, self._n_x = len(apu.governor.X), n_x
         self._n_z = apu.gas_generator.family.step.numel_in(4)
         self._sampled = [m.advance.n_out() == 4 for m in machines]
-        self._call = _caller(apu.gas_generator.family, links[0], self.machines, wide)
+        self._call = _caller(apu.gas_generator.family, links[0], self.machines, steps, wide)
 
     def __call__(
         self,
@@ -200,7 +214,8 @@ class JointBlock(Rebuilt):
             u_sg: inputs of each group.
         """
         full = self.apu.gas_generator.full(theta)
-        held = [a for own, fixed in zip(u_sg, self._fixed, strict=True) for a in (own, *fixed)]
+        each = zip(u_sg, self.machines, self._links, strict=True)
+        held = [a for u, m, link in each for a in (u, m.theta, link, m.parameters, m.dt)]
         if asking():
             carry = np.concatenate([N, z, governor, *x_sg])
             return self._row(min(blocks, self._likely), carry, [u, full, *held])
@@ -262,7 +277,7 @@ class JointBlock(Rebuilt):
             last, *out = self._call(carry, *given)
             carry = last.copy()
             lasts.append(carry)
-            made.append(tuple([a.copy() for a in out]))
+            made.append(tuple([a.copy().reshape(a.shape[0], -1) for a in out]))
             if len(made) >= most or not self._seems_right(out):
                 break
         out = [c[0] if len(c) == 1 else np.concatenate(c, axis=1) for c in zip(*made, strict=True)]
@@ -316,14 +331,19 @@ class JointBlock(Rebuilt):
         return ""
 
 
-def _caller(family: CycleFunctions, link: Link, machines: Sequence[Fast], wide: bool) -> Together:
+def _caller(
+    family: CycleFunctions, link: Link, machines: Sequence[Fast], steps: int, wide: bool
+) -> Together:
     """One compiled block for each structure of gas generator, link and machines, and layout."""
 
     def make() -> Together:
-        kind = "joint_course_" if wide else "joint_block_"
+        kind = "joint_course_" if wide else "joint_block_" if steps > 1 else "joint_one_"
         name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
-        function = block_function(machines, family.step, link, name, wide=wide)
-        return Together(function, function, Gradual(function, level=3, copy=False))
+        function = block_function(machines, family.step, link, name, steps=steps, wide=wide)
+        # single steps by tables are a tenth of a block
+        few = steps == 1 and not any(isinstance(m, Collocated) for m in machines)
+        often = OFTEN * BLOCK if few else OFTEN
+        return Together(function, function, Gradual(function, level=3, copy=False), often=often)
 
-    key = (link.structure, wide, *(m.layout for m in machines), backend_in_use())
+    key = (link.structure, steps, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

@@ -125,6 +125,7 @@ class Machines:
         self._block: JointBlock | None = None
         self._no_block = ""
         self._wide: tuple[list[Any], JointBlock] | None = None
+        self._one: tuple[list[Any], JointBlock] | None = None
 
     def samples(self, grid: np.ndarray) -> int:
         """Waveform samples of a whole run, the start included; 0 where none are stored."""
@@ -226,6 +227,34 @@ class Machines:
         grid = grid[: done.y.shape[1] + 1]
         pairs = zip(self.groups, done.machines, strict=True)
         return done, [g.went_on(one, grid) for g, one in pairs]
+
+    def one_by_one(
+        self,
+        x: np.ndarray,
+        z: np.ndarray,
+        governor: tuple[float, ...],
+        u: np.ndarray,
+        theta: np.ndarray,
+        grid: np.ndarray,
+    ) -> tuple[BlockResult, list[MachineMade]]:
+        """Advance the whole unit over steps of one length, each a call of its own.
+
+        Raises:
+            NotApplicable: that is not possible here.
+        """
+        h = float(grid[1] - grid[0])
+        fast = [g.for_one(h) for g in self.groups]
+        layouts = [one.layout for one in fast]
+        if self._one is None or self._one[0] != layouts:
+            links = [g.link for g in self.groups]
+            self._one = layouts, JointBlock(self.apu, fast, links, steps=1)
+        block = self._one[1]
+        block.machines = fast  # of the same layouts, for this length
+        states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
+        done = block(x, z, governor, u, theta, states, inputs, grid.size - 1)
+        grid = grid[: done.y.shape[1] + 1]
+        each = zip(self.groups, fast, done.machines, strict=True)
+        return done, [g.went_by_one(one, made, grid) for g, one, made in each]
 
     def _check_block(self, grid: np.ndarray) -> None:
         if not all(g.settled for g in self.groups):

@@ -15,15 +15,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
+from apu_casadi.machine.collocated import Collocated
 from apu_casadi.machine.course import Into, Numbers
 from apu_casadi.machine.generator import Generator, GeneratorPoint, Spike
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import who
 from apu_casadi.unit.exchange import Link
 from apu_casadi.unit.integrators import (
+    NO_TIMES,
+    NO_WAVES,
     SETTLED,
+    ByStrides,
     Phase,
     Settings,
     Step,
@@ -198,6 +203,16 @@ class MachineStep:
         """Return what propagates over many steps at once; else NotApplicable."""
         return self._integrators[0].for_blocks()
 
+    def for_one(self, h: float) -> MeanStep | Propagator | Collocated:
+        """Return what takes a step of length h, s, whatever was before; else NotApplicable."""
+        if self.settled and abs(h - self.settings.dt) <= SAME_INSTANT:
+            return self.for_blocks()
+        by_strides = (i for i in self._integrators if isinstance(i, ByStrides))
+        found = next(by_strides, None)
+        if found is None:
+            raise NotApplicable("waveforms, or an integrator that was asked for")
+        return found.over(h)
+
     def columns(
         self, t: np.ndarray, before: float, into: Into
     ) -> tuple[MeanStep | Propagator, Iterator[Numbers]]:
@@ -227,6 +242,19 @@ class MachineStep:
         if self._linked is None:
             self._linked = np.repeat(self.link.numbers[:, None], BLOCK, axis=1)
         return self._linked
+
+    def went_by_one(
+        self, fast: MeanStep | Propagator | Collocated, done: MachineBlock, grid: np.ndarray
+    ) -> MachineMade:
+        """Go on from the end of steps of one length over a grid, s, each a block of its own."""
+        if isinstance(fast, Collocated):
+            self.nsteps += (grid.size - 1) * fast.strides
+        else:
+            self.propagated += grid.size - 1
+        self.w_r, self.x, h = float(done.w_r[-1]), done.x, fast.dt
+        self._since += float(grid[-1] - grid[0])
+        means = RawMeans.of(fast.quad, self.phase.symmetric, done.means, h, done.w_r, grid[1:])
+        return MachineMade(done.x, means, NO_TIMES, NO_WAVES)
 
     def went_on(self, done: MachineBlock, grid: np.ndarray, severity: Any = ()) -> MachineMade:
         """Go on from the end of blocks over a grid, s.

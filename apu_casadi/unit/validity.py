@@ -40,6 +40,7 @@ from apu_casadi.core.errors import (
 )
 from apu_casadi.core.profiles.profile import Varying, at, later
 from apu_casadi.core.sharing import once
+from apu_casadi.core.units import RPM
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
@@ -80,7 +81,6 @@ __all__ = [
     "unserved",
 ]
 
-RPM = 30.0 / math.pi
 EXCHANGE_LIMIT = 0.01
 """Estimated exchange error, of the speed's excursion, beyond which a run warns."""
 PAPER_STEP = 0.02

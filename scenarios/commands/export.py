@@ -35,7 +35,8 @@ _ASKED = f"""
 """
 _C = f"""
 names NAME +            | gas_generator.step (short: step), .f, .g, .residual, .rates;
-                        | generator.step, .f, .g, .z, .residual; ekf, the gas-path filter's step
+                        | generator.step, .f, .g, .z, .residual; ekf, ukf: steps of the
+                        | gas-path filter
 {_ASKED.strip()}
 --out DIR =results/c    | folder (default %(default)s)
 --check                 | compile and run the examples: every digit as Python's
