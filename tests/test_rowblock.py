@@ -2,17 +2,20 @@
 
 import dataclasses
 
+import casadi as ca
 import numpy as np
 import pytest
 from estimation_models import gappy, pendulum, pendulum_data, random_belief, random_linear
 
-from apu_casadi.core.backend import find_compiler, library
+from apu_casadi.core.backend import compiled, find_compiler, library
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.lanes.lanelibrary import lanes_in_use
+from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filterblock import BLOCK, PADDED, block_function, padded, row_function
 from estimators.filters.filtering import run
 from estimators.filters.rowblock import row_block
+from estimators.filters.ukf import ukf_step
 
 
 def many_states():
@@ -81,3 +84,34 @@ def test_bounds_and_iterations_have_no_such_form():
     upper = np.full(len(model.x), np.inf)
     upper[0] = 9.0
     assert ekf_step(dataclasses.replace(model, upper=upper)).rows() is None
+
+
+@pytest.mark.compiled
+@pytest.mark.ci
+def test_sigma_points_in_lanes_have_the_bits_of_the_loop():
+    """The block of a UKF, whose maps take their points together; its results are the loop's."""
+    if find_compiler() is None or lanes_in_use() == 1:
+        pytest.skip("no compiler, or no lanes")
+    model = pendulum()
+    step, data = ukf_step(model), pendulum_data(model, BLOCK)
+    block = block_function(step.shared, False, True, "vm", "vm")[1]
+    made = points_in_lanes(block)
+    assert made.class_name() == "External"
+    calls = [Caller(f, copy=False) for f in (made, compiled(block))]
+    prior, (y, R, u, dt) = random_belief(2, model), padded(data, 0)
+    for call in calls:
+        given = prior.mean, np.linalg.cholesky(prior.cov), np.zeros_like(prior.cov)
+        arguments = *given, u, y, R, dt, np.ravel(step.full(data.p))
+        for own, value in zip(call.inputs, arguments, strict=True):
+            own[...] = value.reshape(own.shape)
+        call.evaluate()
+    for mine, theirs in zip(*(call.outputs for call in calls), strict=True):
+        assert np.array_equal(mine, theirs) and np.isfinite(mine).all()
+
+
+@pytest.mark.compiled
+def test_a_function_without_points_is_compiled_as_it_is():
+    x = ca.SX.sym("x")
+    f = ca.Function("f", [x], [x + 1])
+    assert points_in_lanes(f) is compiled(f)
+    assert points_in_lanes(f, backend="vm") is f

@@ -11,6 +11,7 @@ import numpy as np
 
 from apu_casadi.core.backend import READY, compiled, library
 from apu_casadi.core.lanes.lanelibrary import lanes_in_use
+from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.sharing import kept, once
 from estimators.filters.rowblock import Rows, row_block
@@ -214,7 +215,7 @@ def block_function(
     if not half:
         one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
         block = block_of(one, name, len(carried), short=block_length(step.model) < BLOCK)
-        return compiled(block, backend=backend), block
+        return points_in_lanes(block, backend=backend), block
     # what hangs on the parameters alone is evaluated once in a block
     out, symbols, constant = ca.extract_parametric(ca.cse(out), p)
     c, of_p = ca.vertcat(*symbols), ca.Function(f"{name}_constants", [p], [ca.vertcat(*constant)])

@@ -42,8 +42,8 @@ from apu_casadi.core.lanes.lanecode import NoForm
 from apu_casadi.core.lanes.lanegraph import graph_writer
 from apu_casadi.core.sharing import BUILDING, keep, once
 
-__all__ = ["batch", "flags_of", "framed", "in_lanes", "lanes_in_use", "recalled", "source"]
-__all__ += ["unsupported"]
+__all__ = ["batch", "digest", "flags_of", "framed", "in_lanes", "lanes_in_use", "recalled"]
+__all__ += ["source", "unsupported"]
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
@@ -82,7 +82,7 @@ def _widest() -> int:
 
 
 @once
-def _digest() -> str:
+def digest() -> str:
     """Tell one writer of code from another."""
     h = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -154,7 +154,7 @@ def recalled(
         return None
     fixed = tuple(sorted(common))
 
-    own = f"{recipe} {n} lanes {fixed} {_digest()}"
+    own = f"{recipe} {n} lanes {fixed} {digest()}"
     with suppress(NoForm):
         return load_library(
             own, build, lambda fun: _written(fun, n, fixed), compile_missing=compile_missing
@@ -182,7 +182,7 @@ def unsupported(fun: ca.Function) -> str:
 
 
 def _code(fun: ca.Function, n: int, common: tuple[int, ...]) -> Code:
-    content = f"{fun.name()} {n} {common} {_digest()}\n{fun.serialize()}"
+    content = f"{fun.name()} {n} {common} {digest()}\n{fun.serialize()}"
     return Code(_name(fun, n), content, lambda: source(fun, n, common), flags_of(n))
 
 
