@@ -40,7 +40,7 @@ MOST = 500  # strides; in longer steps an adaptive integrator is as fast
 #: regulator that is met or left makes it larger.
 DRIVE_TOL = 3e-6
 #: Largest mean of what the stages' polynomials leave out, nominal units; means err by a thousandth.
-STAGE_TOL = 1.5e-3
+STAGE_TOL = 2e-3
 
 
 def shares(strides: int) -> tuple[np.ndarray, np.ndarray]:
