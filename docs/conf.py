@@ -15,16 +15,15 @@ release = version = __version__
 
 extensions = [
     "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "myst_nb",
     "sphinx_copybutton",
+    "site_navigation",
     "site_parts",
 ]
-templates_path = ["templates"]
-exclude_patterns = ["estimation/**", "templates/**"]
+exclude_patterns = ["estimation/**"]
 API = os.environ.get("APU_DOCS_API", "on") != "off"
-"""The reference made of docstrings takes minutes; ``APU_DOCS_API=off`` leaves it out."""
+"""``APU_DOCS_API=off`` leaves out the reference made of docstrings."""
 if not API:
     exclude_patterns += ["reference/api.md", "reference/made/**"]
 
@@ -34,7 +33,6 @@ html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_math_renderer = "mathml"
 
-autosummary_generate = API
 # a script that runs under a Python of its own
 autodoc_mock_imports = ["dpsimpy", "openmdao", "pycycle", "sklearn"]
 autodoc_typehints = "signature"

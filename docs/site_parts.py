@@ -6,6 +6,7 @@ MathML is drawn by the browser itself, so that the site needs no network.
 from argparse import _SubParsersAction
 from pathlib import Path
 
+import site_api
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
@@ -15,7 +16,6 @@ from scenarios import cli
 from scenarios.fileschema import file_schema
 
 HERE = Path(__file__).parent
-MADE = HERE / "made"
 
 
 def bounds(node: dict) -> str:
@@ -95,11 +95,18 @@ def write_pages(app: Sphinx) -> None:
     pages = {"scenario.md": scenario_page(file_schema()), "commands.md": commands_page()}
     for path in sorted((HERE.parent / "notebooks").glob("*.ipynb")):
         pages[f"notebooks/{path.name}"] = path.read_text(encoding="utf-8")
-    for path in MADE.rglob("*.*"):  # of a notebook that has another name now
-        if path.relative_to(MADE).as_posix() not in pages:
+    write_folder(HERE / "made", pages)
+    if "reference/api.md" not in app.config.exclude_patterns:
+        write_folder(HERE / "reference/made", site_api.pages(HERE.parent))
+
+
+def write_folder(folder: Path, pages: dict[str, str]) -> None:
+    """Write the pages that have changed, and remove those that are none any more."""
+    for path in folder.rglob("*.*"):
+        if path.relative_to(folder).as_posix() not in pages:
             path.unlink()
     for name, text in pages.items():
-        path = MADE / name
+        path = folder / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             files.write_text(path, text)
 

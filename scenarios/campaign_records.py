@@ -32,7 +32,7 @@ I_b_rms I_c_rms P_e P_loss_fault N_rpm_min N_rpm_max T4_max SM_percent_min
 {" ".join(HEALTH)} mu k_rf kappa h
 """
 COLUMNS = tuple(_COLUMNS.split())
-"""Numbers of :func:`apu_casadi.core.results.phase_summary` that are kept of each phase."""
+"""Numbers of :func:`apu_casadi.core.runsummary.phase_summary` that are kept of each phase."""
 OF_EACH = tuple(
     c for c in COLUMNS if c[:2] in ("V_", "I_", "P_") or c in ("mu", "k_rf", "kappa", "h")
 )

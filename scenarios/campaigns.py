@@ -244,7 +244,7 @@ def _run_some(tasks: Sequence[_Task]) -> list[dict[str, Any]]:
 
 def _result(ds: xr.Dataset) -> dict[str, Any]:
     """Return what the record of a run that was done says."""
-    from apu_casadi.core.results import phase_summary
+    from apu_casadi.unit.runsummary import phase_summary
     from apu_casadi.unit.validity import found_in
 
     return {
@@ -314,7 +314,7 @@ def run_campaign(
 
     Returns:
         xarray.Dataset on ``run`` and ``phase``: the quantities of
-        :func:`apu_casadi.core.results.phase_summary` (NaN where there is none), ``status`` with
+        :func:`apu_casadi.core.runsummary.phase_summary` (NaN where there is none), ``status`` with
         ``reason``, ``seed``, ``fault_phase``, ``seconds``, ``residual``, ``exchange_error``,
         ``warnings``.
 
@@ -498,7 +498,7 @@ Runs = Sequence[Mapping[str, Any]]
 def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Dataset:
     import xarray as xr
 
-    from apu_casadi.core.results import CHANNELS
+    from apu_casadi.unit.runsignals import RUN
 
     n, m = len(records), max(len(s.phases) for s in scenarios)
     rows = [r.get("phases", ()) for r in records]
@@ -516,7 +516,7 @@ def _dataset(scenarios: Sequence[Scenario], records: Runs, solver: str) -> xr.Da
                 a[i, j, : len(values) if len(values) > 1 else None] = [
                     np.nan if v is None else v for v in values
                 ]
-        unit, doc = _UNITS.get(k) or CHANNELS[k]
+        unit, doc = _UNITS.get(k) or (RUN[k].unit, RUN[k].doc)
         told = {"units": unit, "long_name": doc}
         own = k in OF_EACH and numbers > 1
         data[k] = (of_each, a, told) if own else (phases, a[:, :, 0], told)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.profiles.profile import Profile, Varying
-from apu_casadi.core.results import RPM
+from apu_casadi.core.units import RPM
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.load import Branches
 from apu_casadi.unit.usual import LOAD_SHARE, beyond, unusual

@@ -225,8 +225,8 @@ _TOLD = {"assumed": "assumed_engine", "implausible": "implausible"}
 
 def summary(ds: xr.Dataset) -> dict[str, Any]:
     """Return name, title and the phase-by-phase summary of a run, ready for JSON."""
-    from apu_casadi.core.results import phase_summary
     from apu_casadi.unit.departures import by_phase, rows_of
+    from apu_casadi.unit.runsummary import phase_summary
     from apu_casadi.unit.validity import found_in
 
     scenario, rows = _table(ds, "scenario"), phase_summary(ds)

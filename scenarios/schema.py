@@ -55,7 +55,7 @@ from apu_casadi.core import files
 from apu_casadi.core.checked import bounded
 from apu_casadi.core.errors import DataError, ScenarioError, nearest
 from apu_casadi.core.profiles.profile import Moved, Profile, Varying
-from apu_casadi.core.results import RPM
+from apu_casadi.core.units import RPM
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.control import GOVERNORS
 from apu_casadi.unit.events import (

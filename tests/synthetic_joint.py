@@ -5,6 +5,7 @@ import json
 import numpy as np
 
 from apu_casadi.core import results
+from apu_casadi.unit.runsignals import RUN
 
 PHASES = [
     {"name": "design point", "start": 0.0, "end": 2.0},
@@ -80,7 +81,7 @@ def synthetic_joint(*, waveforms=True, end=14.0, waveform_dt=50e-6):
         fast["v_a"][(tw >= 2.0) & (tw < 2.00005)] = 480.0  # the overvoltage of a load drop
         fast |= {"i_fault": 0.0, "V_fd": 30.0, "i_fd": 200.0, "T_e": 180.0, "P_inst": 4.5e5}
         times["time_w"], values["time_w"] = tw, fast
-    ds = results.dataset(times, values)
+    ds = results.dataset(times, values, signals=RUN)
     shown = [p for p in PHASES if p["start"] < end]
     shown[-1] = {**shown[-1], "end": end}
     ds.attrs["phases"] = json.dumps(shown)

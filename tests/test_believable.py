@@ -277,8 +277,9 @@ def test_a_change_that_no_filter_knows_is_doubted_though_nothing_was_reported(
     found = Causes(0.5, {best: 0.9, "hot winding": 0.1})
     monkeypatch.setattr(believable, "causes_of_change", lambda *_: found)
     monkeypatch.setattr(believable, "field_steps", lambda *_: [])
+    monkeypatch.setattr(believable, "offset_steps", lambda *_: [])
     zero = np.zeros(51)
-    side = SimpleNamespace(t=0.02 * np.arange(51), phase=zero, resets=(0.5,))
+    side = SimpleNamespace(t=0.02 * np.arange(51), phase=zero, resets=(0.5,), beliefs=None)
     ((told, doubt),) = machine_causes(side, None, ELECTRICAL, {})
     assert told is found and (doubt.kind if doubt else None) == (kind or None)
     # a step of the field's current alone makes no reset

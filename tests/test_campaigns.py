@@ -18,6 +18,7 @@ from apu_casadi.core.means import UNBALANCE
 from apu_casadi.core.profiles.profile import Varying, at
 from apu_casadi.core.profiles.shapes import Ramp
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.unit import runsummary
 from scenarios import campaign_records, campaigns, registry
 from scenarios.campaign_records import COLUMNS, RUNS
 from scenarios.campaigns import counts, random_faults, run_campaign
@@ -113,7 +114,7 @@ def test_summaries_are_those_of_single_runs(base, tmp_path):
     ds = run_campaign(runs, workers=1, out=tmp_path)
     assert counts(ds)["done"] == 2
     alone = registry.run(runs[1].change(waveform_dt=None), solver="propagator")
-    for j, row in enumerate(results.phase_summary(alone)):
+    for j, row in enumerate(runsummary.phase_summary(alone)):
         for k in ("T4", "N_rpm_min", "V_a_rms", "h", "f_W_t"):
             assert float(ds[k][1, j]) == pytest.approx(row[k], rel=1e-12)
     assert np.isnan(ds["k_rf"].values[:, 0]).all()
@@ -255,7 +256,7 @@ def sealed(record):
 def test_records_hold_every_number_of_a_summary(base):
     """The columns that are kept and checked are those that a summary has."""
     ds = registry.run(base.change(waveform_dt=None), solver="propagator")
-    for row in results.phase_summary(ds):
+    for row in runsummary.phase_summary(ds):
         numbers = {k for k, v in row.items() if v is None or isinstance(v, int | float)}
         numbers -= {"fault_phase"}  # a letter, or None: the campaign's own plan tells it
         numbers -= {*UNBALANCE, "worst"}  # records keep their form

@@ -19,7 +19,7 @@ import pytest
 
 from apu_casadi.core.errors import DataError, ScenarioError
 from scenarios import cli
-from scenarios.datasets import baselines, making, scoring
+from scenarios.datasets import baselines, making, scoring, waveforms
 from scenarios.datasets.recipe import CLASSES, Recipe, draw, read_recipe
 from scenarios.schema import Scenario
 
@@ -86,6 +86,58 @@ def test_a_wrong_recipe_is_told(changed, words):
         Recipe.of(table(**changed))
 
 
+def waves_of(run, n, seed):
+    """Waveforms of a run as they are measured."""
+    rng = np.random.default_rng(seed)
+    own = {w: rng.normal(size=n).astype(np.float32) for w in waveforms.WAVES}
+    return {"run": np.full(n, run, np.int32), "time": 1.0 + 1e-4 * np.arange(n), **own}
+
+
+def test_waveforms_are_netcdf_4_without_a_time_of_making(tmp_path, monkeypatch):
+    """Two runs of different lengths; the same bits later, every number back, units and names."""
+    xr = pytest.importorskip("xarray")
+    parts = [waves_of(3, 40, 1), waves_of(4, 30, 2)]
+    data = waveforms.packed(parts, "two runs")
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert waveforms.packed(parts, "two runs") == data
+    (tmp_path / "u.nc").write_bytes(data)
+    read = waveforms.frame(tmp_path / "u.nc")
+    expected = pd.concat([pd.DataFrame(p) for p in parts], ignore_index=True)
+    pd.testing.assert_frame_equal(read, expected)
+    with xr.open_dataset(tmp_path / "u.nc", decode_times=False) as ds:
+        assert ds["i_a"].dims == ("generator", "sample") and ds["i_a"].attrs["units"] == "A"
+        assert set(ds.coords) == {"generator", "run", "time"}
+        assert ds.attrs["Conventions"].startswith("CF") and "date_created" not in ds.attrs
+        assert all(v.attrs["long_name"] and v.attrs["units"] for v in ds.variables.values())
+        np.testing.assert_array_equal(ds["v_b"].sel(generator=2), expected["v_b_2"])
+    (tmp_path / "u.nc").write_bytes(data[:-700])
+    with pytest.raises(DataError, match=r"u\.nc: damaged"):
+        waveforms.frame(tmp_path / "u.nc")
+
+
+def test_a_set_made_before_waveforms_were_netcdf_is_read(tmp_path):
+    for part in ("gaspath", "electrical"):
+        (tmp_path / part).mkdir()
+    gas, waves = {"run": [0], "time": [0.0]}, waves_of(0, 20, 1)
+    pd.DataFrame(gas).to_parquet(tmp_path / "gaspath/unit_00002.parquet")
+    pd.DataFrame(waves).to_parquet(tmp_path / "electrical/unit_00002.parquet")
+    labels = {"run": np.array([0]), "unit": np.array([2])}
+    ((_, _, read),) = baselines.runs_of(tmp_path, labels)
+    pd.testing.assert_frame_equal(read, pd.DataFrame(waves))
+    (tmp_path / "electrical/unit_00002.parquet").write_bytes(b"PAR1")
+    with pytest.raises(DataError, match=r"unit_00002.parquet: damaged"):
+        next(baselines.runs_of(tmp_path, labels))
+
+
+def test_packages_that_files_need_are_asked_for_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(making, "find_spec", lambda name: None)
+    for rate, words in ((1e4, r"pyarrow and h5netcdf: .*\[parquet,netcdf4\]"), (0, r"\[parquet\]")):
+        r = dataclasses.replace(REFERENCE, waveforms={**REFERENCE.waveforms, "rate": rate})
+        with pytest.raises(DataError, match=words):
+            making.make_dataset(r, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
 @pytest.mark.long
 def test_what_a_data_set_holds(small, made):
     labels = scoring.read_labels(made)
@@ -103,8 +155,9 @@ def test_what_a_data_set_holds(small, made):
         names = [n for n in ("T3", "T5", "P3") if n != d.labels["sensor"]]
         for n in names:
             assert gas[f"X_s.{n}"].iloc[5] == pytest.approx(gas[f"X_v.{n}"].iloc[5], rel=0.03)
-        waves = pd.read_parquet(made / f"electrical/unit_{u:05d}.parquet")
+        waves = waveforms.frame(made / f"electrical/unit_{u:05d}.nc")
         assert len(waves) == 750 and not waves.isna().any().any()
+        assert list(waves) == ["run", "time", *waveforms.WAVES] and set(waves["run"]) == {u}
     assert Counter(labels["class"]) == {c: int(small.classes[c]) for c in CLASSES}
 
 
@@ -383,6 +436,9 @@ def test_metadata_names_every_file_and_column(small, made):
     fields = {r["@id"]: [f["name"] for f in r["field"]] for r in meta["recordSet"]}
     assert fields["gaspath_samples"] == list(making.gas_path_columns())
     assert fields["runs"] == list(pd.read_parquet(made / "runs.parquet"))
+    sets = {d["@id"]: d for d in meta["distribution"]}
+    assert sets["electrical"]["includes"] == "electrical/*.nc"
+    assert "i_fd [A]" in sets["electrical"]["description"]
     card = (made / "CARD.md").read_text()
     assert "11 runs" in card and "{{" not in card and "| `X_s.T5` | K |" in card
     assert math.isfinite(small.duration)

@@ -15,6 +15,7 @@ from synthetic_joint import synthetic_joint
 from apu_casadi.core import results
 from apu_casadi.core.errors import ApuError, DataError, ScenarioError
 from apu_casadi.gaspath.calibration import read_points, write_points
+from apu_casadi.unit import runsummary
 from scenarios import registry
 from scenarios.commands.calibrate import published_points
 from scenarios.pages import estimation_page
@@ -37,7 +38,7 @@ def read_scenario(path):
 
 
 def read_run(path):
-    return results.phase_summary(results.load(path))
+    return runsummary.phase_summary(results.load(path))
 
 
 def read_study(path):

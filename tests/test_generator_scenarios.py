@@ -6,8 +6,8 @@ import pickle
 import pytest
 
 from apu_casadi import Apu, FaultChange, LoadChange, SeriesLoad, Ttsc
-from apu_casadi.core import results
 from apu_casadi.core.errors import ScenarioError
+from apu_casadi.unit import runsummary
 from scenarios import registry
 from scenarios.campaigns import random_faults, run_campaign
 from scenarios.commands import run as run_command
@@ -195,7 +195,7 @@ def test_figures_draw_each_generator(ds, tmp_path):
 @pytest.mark.long
 def test_the_library_has_a_fault_in_one_machine():
     one, both = (registry.run(n, waveform_dt=None) for n in ("joint_one_machine", "joint"))
-    a, b = (results.phase_summary(x) for x in (one, both))
+    a, b = (runsummary.phase_summary(x) for x in (one, both))
     asked = [rows[3]["PW_kW"] - rows[2]["PW_kW"] for rows in (a, b)]
     assert asked[0] == pytest.approx(asked[1] / 2, rel=1e-4)
     healthy = a[3]["generators"][0]
@@ -216,7 +216,7 @@ def test_a_campaign_keeps_each_generator(tmp_path):
     assert made["PW_kW"].dims == ("run", "phase")
     again = run_campaign(runs, workers=1, out=tmp_path)
     assert again.drop_vars("seconds").identical(made.drop_vars("seconds"))
-    rows = results.phase_summary(registry.run(runs[0], solver="propagator"))
+    rows = runsummary.phase_summary(registry.run(runs[0], solver="propagator"))
     assert made["I_c_rms"].values[0, 1, 1] == rows[1]["generators"][1]["I_c_rms"]
     assert "generator" not in run_campaign([alike], workers=1).dims
 

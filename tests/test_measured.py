@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import dataset
+from apu_casadi.unit.runsignals import RUN
 from estimators.apu.recordings.layout import Reading, read_layout
 from estimators.apu.recordings.measured import read_recording
 
@@ -129,7 +130,7 @@ def test_generators_of_a_run():
     """A dimension of generators becomes a quantity for each; what has others is told."""
     waves = np.array([I["i_a"], I["i_b"]])
     ds = dataset({"time": [0.0, 0.02], "time_w": t}, {"time": {"T5": [700.0, 701.0]},
-                 "time_w": {"i_a": waves}}, generators=2)  # fmt: skip
+                 "time_w": {"i_a": waves}}, signals=RUN, generators=2)  # fmt: skip
     ds["spectrum"] = (("time", "order"), np.ones((2, 3)))
     data = read_recording(ds)
     assert tuple(sorted(data)) == ("T5", "i_a_1", "i_a_2")

@@ -8,6 +8,7 @@ import pytest
 
 from apu_casadi.core import results
 from apu_casadi.core.errors import ScenarioError
+from apu_casadi.unit.runsignals import RUN
 from scenarios.cli import main
 from scenarios.studies import multirate_study as study
 
@@ -30,7 +31,7 @@ def run_of(dt, *, N=1.0, P=1.0, V=1.0):
     after = t > study.T_EVENT
     values = {"N": 3775 + 100 * N * after, "P_total": 2e5 * np.where(after, P, 1.0)}
     values["P_e"] = 1e5 * np.where(after, V, 1.0) ** 2  # into a resistive load
-    return results.dataset({"time": t}, {"time": values})
+    return results.dataset({"time": t}, {"time": values}, signals=RUN)
 
 
 def test_norms_are_what_they_say():

@@ -41,8 +41,6 @@ TABLES = {
 }
 # file and table: why a choice of these names stands there
 CHOSEN: dict[tuple[str, str], str] = {
-    ("apu_casadi/core/results.py", "health factors"): "core knows no gas path: rows of a summary",
-    ("apu_casadi/core/results.py", "severity of a short circuit"): "as above",
     ("scenarios/commands/given.py", "ambient conditions"): "the flags of the options",
     ("scenarios/figures/runplots.py", "loads"): "short words for the lane of a figure",
     ("apu_casadi/machine/terminals.py", "electrical sensors"): "inputs of the model at terminals",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import ScenarioError
-from apu_casadi.core.results import RPM
+from apu_casadi.core.units import RPM
 from scenarios.figures.moduleplots import MODULE_FIGURES
 from scenarios.pages import errata_page, validation_page
 from scenarios.validation import comparison, paper_figures

@@ -10,7 +10,6 @@ from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.profiles.points import Points, Steps
 from apu_casadi.core.profiles.profile import varying
 from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
-from apu_casadi.core.results import phases
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -18,6 +17,7 @@ from apu_casadi.unit.apu import Apu, trim
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
 from apu_casadi.unit.monolithic import simulate_monolithic
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.runsummary import phases
 from estimators.apu.severity import severity
 from scenarios import registry
 from scenarios.commands.run import table

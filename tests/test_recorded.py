@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.results import dataset, save
 from apu_casadi.core.units import UNITS, convert
+from apu_casadi.unit.runsignals import RUN
 from estimators.apu.recordings.recorded import parse_mapping, read_table
 
 
@@ -152,7 +153,7 @@ def test_time(tmp_path):
 
 def test_netcdf_with_units_in_attributes(tmp_path):
     """What the package itself saves; a column in kPa; another dimension is left out."""
-    ds = dataset({"time": [0.0, 0.02]}, {"time": {"T4": [1200.0, np.nan]}})
+    ds = dataset({"time": [0.0, 0.02]}, {"time": {"T4": [1200.0, np.nan]}}, signals=RUN)
     ds["P3"] = ("time", [800.0, 810.0], {"units": "kPa"})
     ds["other"] = ("k", [1.0, 2.0, 3.0])
     t = read_table(save(ds, tmp_path / "run.nc"))
@@ -164,7 +165,10 @@ def test_netcdf_with_units_in_attributes(tmp_path):
 
 def test_damaged_netcdf(tmp_path):
     """Cut in the middle, or another kind of file altogether."""
-    path = save(dataset({"time": [0.0, 1.0]}, {"time": {"T4": [1.0, 2.0]}}), tmp_path / "run.nc")
+    path = save(
+        dataset({"time": [0.0, 1.0]}, {"time": {"T4": [1.0, 2.0]}}, signals=RUN),
+        tmp_path / "run.nc",
+    )
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(DataError, match="damaged netCDF file of 60 bytes"):
         read_table(path)

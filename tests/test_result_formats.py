@@ -6,6 +6,7 @@ from numpy.testing import assert_array_equal
 
 from apu_casadi.core import cf, resultformats, results
 from apu_casadi.core.errors import DataError, ParameterError
+from apu_casadi.unit.runsignals import RUN
 from estimators.apu.recordings.measured import read_recording
 from scenarios import cli, registry
 
@@ -25,6 +26,7 @@ def ds():
                 "v_a": np.outer([325, 326], np.sin(2500 * w)),
             },
         },
+        signals=RUN,
         attrs={"title": "two generators", "seed": 3},
         generators=2,
     )

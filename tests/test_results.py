@@ -7,6 +7,8 @@ from synthetic_joint import synthetic_joint
 from apu_casadi.core import cf, results
 from apu_casadi.core.errors import DataError, SignalError
 from apu_casadi.core.signals import Signal
+from apu_casadi.unit import runsummary
+from apu_casadi.unit.runsignals import RUN
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +24,13 @@ def test_every_variable_has_unit_and_meaning(ds):
 def test_dataset_refuses_what_it_cannot_label():
     time = {"time": [0.0, 0.02]}
     with pytest.raises(SignalError, match=r"unit of 'WF' unknown \(did you mean 'Wf'\?\)"):
-        results.dataset(time, {"time": {"WF": 1.0}})
+        results.dataset(time, {"time": {"WF": 1.0}}, signals=RUN)
     with pytest.raises(SignalError, match=r"T4: shape \(2,\) as time expected, got \(3,\)"):
-        results.dataset(time, {"time": {"T4": np.zeros(3)}})
+        results.dataset(time, {"time": {"T4": np.zeros(3)}}, signals=RUN)
     with pytest.raises(SignalError, match="strictly increasing"):
-        results.dataset({"time": [0.0, 0.0]}, {})
+        results.dataset({"time": [0.0, 0.0]}, {}, signals=RUN)
     with pytest.raises(SignalError, match=r"unknown coordinate 'tme' \(did you mean 'time'"):
-        results.dataset(time, {"tme": {}})
+        results.dataset(time, {"tme": {}}, signals=RUN)
     mine = results.dataset(time, {"time": {"beta": 0.5}}, signals=[Signal("beta", "1", "map line")])
     assert mine["beta"].attrs == {"units": "1", "long_name": "map line"}
     assert mine["beta"].values.tolist() == [0.5, 0.5]
@@ -65,7 +67,10 @@ def test_missing_and_damaged_files_are_data_errors(tmp_path):
     with pytest.raises(DataError, match="not a netCDF 3 file"):
         results.load(path)
     small = results.dataset(
-        {"time": [0.0, 0.02]}, {"time": {"T4": [1.0, 2.0], "P3": [1.0, 2.0]}}, attrs={"a": "b"}
+        {"time": [0.0, 0.02]},
+        {"time": {"T4": [1.0, 2.0], "P3": [1.0, 2.0]}},
+        signals=RUN,
+        attrs={"a": "b"},
     )
     whole = results.save(small, path).read_bytes()
     for size in range(4, len(whole)):
@@ -78,7 +83,7 @@ def test_missing_and_damaged_files_are_data_errors(tmp_path):
 
 
 def test_summary_averages_the_end_of_each_phase(ds):
-    rows = results.phase_summary(ds)
+    rows = runsummary.phase_summary(ds)
     assert [r["name"] for r in rows] == [
         "design point",
         "load drop",
@@ -99,7 +104,7 @@ def test_summary_averages_the_end_of_each_phase(ds):
 
 
 def test_summary_gives_the_severity_whole(ds):
-    rows = results.phase_summary(ds)
+    rows = runsummary.phase_summary(ds)
     assert [rows[2][k] for k in ("mu", "k_rf", "kappa", "h")] == [0.0, None, None, 0.0]
     assert [rows[3][k] for k in ("mu", "k_rf", "kappa")] == [0.05, 20.0, 0.05]
     assert rows[3]["h"] == pytest.approx(0.05 / 20.95)
@@ -107,12 +112,12 @@ def test_summary_gives_the_severity_whole(ds):
 
 def test_summary_of_a_short_run_and_of_a_wrong_dataset(ds):
     short = synthetic_joint(waveforms=False, end=0.1)
-    assert results.phase_summary(short)[0]["window"] == pytest.approx(0.1)
+    assert runsummary.phase_summary(short)[0]["window"] == pytest.approx(0.1)
     del short.attrs["phases"]
-    assert results.phase_summary(short)[0]["name"] == "run"
+    assert runsummary.phase_summary(short)[0]["name"] == "run"
     with pytest.raises(DataError, match="the dataset lacks T4, mu"):
-        results.phase_summary(ds.drop_vars(["T4", "mu"]))
+        runsummary.phase_summary(ds.drop_vars(["T4", "mu"]))
     with pytest.raises(DataError, match="attribute 'phases' is not a list"):
-        results.phase_summary(ds.assign_attrs(phases="[1]"))
+        runsummary.phase_summary(ds.assign_attrs(phases="[1]"))
     with pytest.raises(DataError, match="holds no sample"):
-        results.phase_summary(ds.assign_attrs(phases='[{"name": "x", "start": 20, "end": 21}]'))
+        runsummary.phase_summary(ds.assign_attrs(phases='[{"name": "x", "start": 20, "end": 21}]'))

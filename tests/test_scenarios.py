@@ -11,7 +11,9 @@ from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.unit import runsummary
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, in_order
+from apu_casadi.unit.runsignals import RUN
 from scenarios import registry, units
 from scenarios.reading import read_fault, read_load
 from scenarios.schema import Change, Phase, Scenario
@@ -389,7 +391,9 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     def simulate_joint(apu, **given):
         seen.update(given)
         given["progress"](0.1, 0.1)
-        return results.dataset({"time": np.array([0.0, 0.02])}, {"time": {"N": 3775.0}})
+        return results.dataset(
+            {"time": np.array([0.0, 0.02])}, {"time": {"N": 3775.0}}, signals=RUN
+        )
 
     multirate = types.ModuleType("apu_casadi.unit.multirate")
     multirate.simulate_joint = simulate_joint
@@ -413,4 +417,4 @@ def test_run_hands_everything_to_the_simulation(monkeypatch):
     assert seen["seed"] == 3 and seen["ambient"] == Ambient(dT_isa=5.0)
     assert len(seen["events"]) == 3
     assert registry.name_of(ds) == "joint"
-    assert results.phases(ds)[0]["name"] == "design point"
+    assert runsummary.phases(ds)[0]["name"] == "design point"

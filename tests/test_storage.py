@@ -18,7 +18,7 @@ from apu_casadi.core import cf, netcdf3, results, runstorage
 from apu_casadi.core.errors import DataError
 from apu_casadi.core.filearrays import File, RowFile, lazy
 from apu_casadi.machine.measurement import MeasurementNoise
-from apu_casadi.unit import recorder
+from apu_casadi.unit import recorder, runsummary
 from apu_casadi.unit.machines import Of
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.stepmeans import StepMeans
@@ -147,7 +147,7 @@ def test_a_summary_of_what_is_no_run_is_refused(in_memory):
     ):
         ds = in_memory.assign(T4=T4) if T4 else in_memory.drop_vars("T4")
         with pytest.raises(DataError, match=message):
-            results.phase_summary(ds)
+            runsummary.phase_summary(ds)
 
 
 def test_a_file_with_a_growing_dimension_is_read(tmp_path):
@@ -240,7 +240,7 @@ def test_a_run_kept_in_a_file_has_the_same_bits(in_memory, piece, tmp_path, monk
     for name, v in in_memory.variables.items():
         assert ds[name].values.tobytes() == v.values.tobytes(), name
         assert ds[name].attrs == v.attrs
-    assert results.phase_summary(ds) == results.phase_summary(in_memory)
+    assert runsummary.phase_summary(ds) == runsummary.phase_summary(in_memory)
     a = results.save(ds, tmp_path / "a.nc").read_bytes()
     assert a == results.save(in_memory, tmp_path / "b.nc").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.nc", "b.nc"]

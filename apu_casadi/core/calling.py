@@ -207,7 +207,8 @@ class Mapped:
         wide += [fun.name_out(i) for i in range(fun.n_out()) if fun.size2_out(i) != width]
         if wide:
             raise BackendError(f"{self._name}: {', '.join(wide)} must be columns to be mapped")
-        self.fun, self._width, self._common = fun, width, common
+        self.fun: ca.Function = fun
+        self._width, self._common = width, common
         self.n_threads: int = max(1, available_threads() if n_threads is None else int(n_threads))
         # chunks are multiples of the thread count; the last one is filled up with its last column
         sizes = sorted({max(1, c) for c in (16, 128, chunk) if c <= chunk} | {chunk})

@@ -54,6 +54,7 @@ class NotApplicable(SimulationError):  # noqa: N818 - not a failure
 class ValidityError(SimulationError):
     """A run that was to be strict left the range in which the model holds; ``t`` says when, s."""
 
+    words: str
     t: float
 
     def __init__(self, words: str, t: float = math.nan) -> None:

@@ -1,17 +1,16 @@
 """Labelled results: datasets whose every variable has a unit and a meaning, kept as netCDF.
 
-A joint run has two time coordinates: ``time`` [s], the exchange grid of gas generator and machine,
-and ``time_w`` [s], the waveform samples (absent if no waveforms were asked for).  Where generators
-differ during the run, what belongs to one of them (``I_a_rms``, ``P_e``, ``mu``, ``v_a``) has the
-dimension ``generator`` before that of time, with their numbers from 1 as coordinate; where all stay
-alike, as in the paper, it has not: then it is that of each.  ``P_total`` and ``P_inst`` are the
-unit's.  :func:`of_generator` gives the second form of either.
+A joint run (its signals: :mod:`apu_casadi.unit.runsignals`) has two time coordinates: ``time`` [s],
+the exchange grid of gas generator and machine, and ``time_w`` [s], the waveform samples (absent if
+no waveforms were asked for).  Where generators differ during the run, what belongs to one of them
+(``I_a_rms``, ``P_e``, ``mu``, ``v_a``) has the dimension ``generator`` before that of time, with
+their numbers from 1 as coordinate; where all stay alike, as in the paper, it has not: then it is
+that of each.  ``P_total`` and ``P_inst`` are the unit's.  :func:`of_generator` gives the second
+form of either.
 """
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -28,67 +27,6 @@ if TYPE_CHECKING:
 
     from apu_casadi.core.signals import Signal
 
-RPM = 30.0 / math.pi
-"""Revolutions per minute in one rad/s."""
-
-SUMMARY_WINDOW = 0.5
-"""Length [s] of the window at the end of a phase over which :func:`phase_summary` averages."""
-
-
-def _stations() -> dict[str, tuple[str, str]]:
-    places = {
-        "1": "ambient inlet",
-        "2": "compressor inlet",
-        "3": "compressor outlet",
-        "4": "combustor outlet",
-        "41": "turbine rotor inlet",
-        "5": "turbine outlet",
-        "8": "exhaust outlet",
-    }
-    table = {}
-    for n, place in places.items():
-        table[f"T{n}"] = ("K", f"{place} total temperature")
-        if n != "41":
-            table[f"P{n}"] = ("Pa", f"{place} total pressure")
-        if n != "1":
-            table[f"W{n}"] = ("kg/s", f"{place} mass flow")
-    table["P41"] = ("Pa", "turbine rotor inlet total pressure")
-    table["W31"] = ("kg/s", "combustor inlet mass flow")
-    table["Ps3"] = ("Pa", "compressor outlet static pressure")
-    return table
-
-
-CHANNELS: Mapping[str, tuple[str, str]] = {
-    "N": ("rad/s", "gas generator shaft speed"),
-    "PW": ("W", "shaft power delivered (PWSD)"),
-    "Wf": ("kg/s", "fuel flow"),
-    "SFC": ("kg/(W s)", "fuel flow over shaft and accessory power"),
-    "SNOx": ("1", "NOx severity index"),
-    "SM": ("1", "compressor surge (stability) margin"),
-    **_stations(),
-    "residual": ("1", "largest scaled residual of the gas path equations"),
-    "f_eta_c": ("1", "compressor efficiency factor"),
-    "f_W_c": ("1", "compressor flow capacity factor"),
-    "f_eta_t": ("1", "turbine efficiency factor"),
-    "f_W_t": ("1", "turbine flow capacity factor"),
-    "mu": ("1", "shorted fraction of the turns of a phase (0: healthy)"),
-    "k_rf": ("1", "fault resistance over that of the shorted turns (nan: healthy)"),
-    "kappa": ("1", "leakage partition of the shorted turns (nan: healthy)"),
-    "P_total": ("W", "mean mechanical power of both generators over one exchange (eq 8)"),
-    "P_e": ("W", "mean electrical output of one generator over one exchange"),
-    "P_loss_fault": ("W", "mean extra loss of the fault in one generator over one exchange"),
-    **{f"V_{p}_rms": ("V", f"phase {p} voltage, settled rms over one exchange") for p in "abc"},
-    **{f"I_{p}_rms": ("A", f"phase {p} current, settled rms over one exchange") for p in "abc"},
-    **{f"v_{p}": ("V", f"phase {p} terminal voltage") for p in "abc"},
-    **{f"i_{p}": ("A", f"phase {p} current") for p in "abc"},
-    "i_fault": ("A", "current of the fault branch"),
-    "V_fd": ("V", "field voltage"),
-    "i_fd": ("A", "field current"),
-    "T_e": ("N m", "electromagnetic torque of one generator"),
-    "P_inst": ("W", "instantaneous power of eq 8, both generators"),
-}
-"""Unit and meaning of every variable that a joint run may hold, by name."""
-
 GENERATOR = "generator"
 """Dimension of what generators have of their own, where they differ; numbers from 1."""
 _TOLD = ("units", "long_name")
@@ -102,7 +40,7 @@ def dataset(
     times: Mapping[str, Any],
     values: Mapping[str, Mapping[str, Any]],
     *,
-    signals: Iterable[Signal] = (),
+    signals: Iterable[Signal],
     attrs: Mapping[str, str | int | float] | None = None,
     generators: int = 0,
 ) -> xr.Dataset:
@@ -112,7 +50,7 @@ def dataset(
         times: time coordinates [s] by name, each strictly increasing, shape (n,).
         values: per time coordinate, arrays of shape (n,) or (generators, n), also lazy ones of
             :mod:`apu_casadi.core.filearrays`, or scalars by variable name.
-        signals: units and meanings; they come before those of :data:`CHANNELS`.
+        signals: units and meanings of all of them; of two that have the same name the last counts.
         attrs: attributes of the dataset; text or numbers.
         generators: their number, for what each has of its own.
 
@@ -124,13 +62,14 @@ def dataset(
             time coordinate that is not increasing.
 
     Examples:
-        >>> ds = dataset({"time": [0.0, 0.02]}, {"time": {"T4": [1273.0, 1272.0]}})
+        >>> T4 = Signal("T4", "K", "combustor outlet total temperature")
+        >>> ds = dataset({"time": [0.0, 0.02]}, {"time": {"T4": [1273.0, 1272.0]}}, signals=[T4])
         >>> ds["T4"].attrs["units"]
         'K'
     """
     import xarray as xr
 
-    known = {**CHANNELS, **{s.name: (s.unit, s.doc) for s in signals}}
+    known = {s.name: (s.unit, s.doc) for s in signals}
     coords = {}
     for dim, t in times.items():
         t = np.asarray(t, dtype=float)
@@ -184,10 +123,10 @@ def of_generator(ds: xr.Dataset, number: int = 1) -> xr.Dataset:
     """
     if GENERATOR in ds.coords:
         if number not in ds[GENERATOR].values:
-            raise DataError(f"{_source(ds)}generator {number}: {generators_of(ds)} are there")
+            raise DataError(f"{source_of(ds)}generator {number}: {generators_of(ds)} are there")
         return ds.sel({GENERATOR: number}, drop=True)
     if not 1 <= number <= int(ds.attrs.get("generators", 2)):
-        raise DataError(f"{_source(ds)}generator {number}: there are {ds.attrs['generators']}")
+        raise DataError(f"{source_of(ds)}generator {number}: there are {ds.attrs['generators']}")
     return ds
 
 
@@ -244,209 +183,7 @@ def load(path: str | os.PathLike[str], *, lazy: bool = False) -> xr.Dataset:
     return ds
 
 
-def _source(ds: xr.Dataset) -> str:
-    """Return the file that a dataset was read from, as the beginning of a message."""
+def source_of(ds: xr.Dataset) -> str:
+    """Return the file that a dataset was read from, as the beginning of a message, or ``""``."""
     source = ds.encoding.get("source")
     return f"{source}: " if source else ""
-
-
-def phases(ds: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the phases of a run as dictionaries with name, start [s] and end [s].
-
-    Without a ``phases`` attribute the whole run is one phase.
-
-    Raises:
-        DataError: no ``time`` coordinate, or an attribute that holds something else.
-    """
-    if "time" not in ds.coords or ds.sizes.get("time", 0) < 2:
-        raise DataError(
-            f"{_source(ds)}the dataset lacks a 'time' coordinate of at least two samples"
-        )
-    t = ds["time"].values
-    if (
-        t.ndim != 1
-        or t.dtype.kind not in "fiu"
-        or not (np.isfinite(t).all() and np.all(t[1:] > t[:-1]))
-    ):
-        raise DataError(f"{_source(ds)}'time' does not increase from sample to sample")
-    text = ds.attrs.get("phases")
-    if text is None:
-        return [{"name": "run", "start": float(t[0]), "end": float(t[-1])}]
-    try:
-        rows = json.loads(text)
-        rows = [
-            {"name": str(r["name"]), "start": float(r["start"]), "end": float(r["end"])}
-            for r in rows
-        ]
-    except (TypeError, ValueError, KeyError) as e:
-        raise DataError(
-            f"{_source(ds)}attribute 'phases' is not a list of name, start and end: {e!r}"
-        ) from e
-    if not rows:
-        raise DataError(f"{_source(ds)}attribute 'phases' is an empty list")
-    for r in rows:
-        if not r["end"] > r["start"]:
-            raise DataError(
-                f"{_source(ds)}phase {r['name']!r} ends at {r['end']:g} s, before it starts"
-            )
-    return rows
-
-
-def severity_h(mu: np.ndarray, k_rf: np.ndarray) -> np.ndarray:
-    """Return h = mu/(k_rf + 1 - mu) of arrays; 0 without a fault, where k_rf is NaN."""
-    return np.where(mu > 0, mu / (np.nan_to_num(k_rf) + 1.0 - mu), 0.0)
-
-
-def severity(mu: float, k_rf: float, kappa: float) -> dict[str, float | None]:
-    """Return mu, k_rf, kappa and h = mu/(k_rf + 1 - mu) together; None where there is no fault."""
-    if not mu > 0:
-        return {"mu": 0.0, "k_rf": None, "kappa": None, "h": 0.0}
-    return {"mu": mu, "k_rf": k_rf, "kappa": kappa, "h": mu / (k_rf + 1.0 - mu)}
-
-
-_MEANS = (
-    ("N_rpm", "N", RPM),
-    ("PW_kW", "PW", 1e-3),
-    ("Wf", "Wf", 1.0),
-    ("SFC", "SFC", 1.0),
-    ("T3", "T3", 1.0),
-    ("P3_kPa", "P3", 1e-3),
-    ("T4", "T4", 1.0),
-    ("T5", "T5", 1.0),
-    ("SM_percent", "SM", 100.0),
-)
-_MEANS_OF_EACH = (*(f"{q}_{p}_rms" for q in "VI" for p in "abc"), "P_e", "P_loss_fault")
-_HEALTH = ("f_eta_c", "f_W_c", "f_eta_t", "f_W_t")
-_SEVERITY = ("mu", "k_rf", "kappa")
-_HEALTHY_NAN = ("k_rf", "kappa")
-
-
-class _Columns:
-    """Values of a dataset by name; those in a file are read anew each time, not all are held."""
-
-    def __init__(self, ds: xr.Dataset) -> None:
-        self.ds = ds
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        v = self.ds[name]
-        if v.dims != ("time",) or v.dtype.kind not in "fiu":
-            where = ", ".join(map(str, v.dims)) or "no dimension"
-            raise DataError(
-                f"{_source(self.ds)}{name}: numbers on time are expected, "
-                f"{v.dtype} on {where} found"
-            )
-        values: np.ndarray = v.values
-        if name not in _HEALTHY_NAN and not np.isfinite(values).all():
-            k = int(np.flatnonzero(~np.isfinite(values))[0])
-            raise DataError(
-                f"{_source(self.ds)}{name} = {values[k]:g} at t = {self.ds['time'].values[k]:g} s "
-                "is no finite number"
-            )
-        return values
-
-
-def _holding(ds: xr.Dataset, attribute: str, key: str, end: float, number: int) -> str | None:
-    """Return what the run's attribute says of a generator just before ``end`` [s]."""
-    try:
-        rows = [r for r in json.loads(ds.attrs[attribute]) if r.get(GENERATOR, number) == number]
-        held = [r for r in rows if float(r["t"]) < end - 1e-9]
-        return None if held[-1][key] is None else str(held[-1][key])
-    except (KeyError, TypeError, ValueError, IndexError):
-        return None
-
-
-def phase_summary(ds: xr.Dataset) -> list[dict[str, Any]]:
-    """Summarise a joint run phase by phase.
-
-    Each row holds name, start, end [s] and window [s]; the means over the last 0.5 s of the phase
-    (over all of a shorter one) of N_rpm, PW_kW, Wf [kg/s], SFC [kg/(W s)], T3, T4, T5 [K], P3_kPa,
-    SM_percent, V_a_rms ... [V], I_a_rms ... [A], and P_e and P_loss_fault [W] of one generator,
-    and V_2_over_V_1 and I_2_over_I_1 where the dataset has them; the
-    extremes over the phase N_rpm_min, N_rpm_max, T4_max [K], SM_percent_min; the health factors at
-    its end; and the severity of the stator fault at its end, always as mu, k_rf, kappa together
-    (and h, which follows from them; k_rf and kappa are None when healthy), with ``fault_phase``;
-    the same of the ``worst`` fault in it, None without one;
-    and the ``load`` at its end in words.  The last two are None where the dataset does not tell.
-    Where generators differ, all that is of a generator is in ``generators`` instead: a list with
-    one table for each, which has its number as ``generator``.
-
-    Raises:
-        DataError: a variable is missing, is not finite or no number, or a phase holds no sample.
-    """
-    needed = [v for _, v, _ in _MEANS] + [*_MEANS_OF_EACH, *_SEVERITY, *_HEALTH]
-    missing = [v for v in needed if v not in ds]
-    if missing:
-        raise DataError(f"{_source(ds)}the dataset lacks {', '.join(missing)}")
-    spans = phases(ds)
-    t = ds["time"].values
-    tol = 1e-9
-    col, numbers = _Columns(ds), generators_of(ds)
-    each = {k: _Columns(of_generator(ds, k)) for k in numbers}
-    rows = []
-    for k, p in enumerate(spans):
-        # a sample is the end of a step: the one at a boundary belongs to the earlier phase
-        before_end = t <= p["end"] + tol
-        whole = ((t > p["start"] + tol) | ((k == 0) & (t >= p["start"] - tol))) & before_end
-        window = min(SUMMARY_WINDOW, p["end"] - p["start"])
-        tail = (t > p["end"] - window + tol) & before_end
-        if not tail.any():
-            raise DataError(
-                f"{_source(ds)}phase {p['name']!r} [{p['start']:g}, {p['end']:g}] s holds no "
-                f"sample; time runs from {t[0]:g} to {t[-1]:g} s"
-            )
-        row: dict[str, Any] = {**p, "window": window}
-        for key, v, scale in _MEANS:
-            row[key] = float(np.mean(col[v][tail]) * scale)
-        inside = {v: col[v][whole] for v in ("N", "T4", "SM")}
-        row["N_rpm_min"] = float(inside["N"].min() * RPM)
-        row["N_rpm_max"] = float(inside["N"].max() * RPM)
-        row["T4_max"] = float(inside["T4"].max())
-        row["SM_percent_min"] = float(inside["SM"].min() * 100.0)
-        end = int(np.flatnonzero(tail)[-1])
-        row.update({v: float(col[v][end]) for v in _HEALTH})
-        of_each = [
-            _of_one(each[k], tail, end)
-            | _held(ds, each[k], end, p["end"], k)
-            | _worst(ds, each[k], whole, p["end"], k)
-            for k in numbers
-        ]
-        if GENERATOR in ds.coords:
-            row["generators"] = [
-                {GENERATOR: k, **own} for k, own in zip(numbers, of_each, strict=True)
-            ]
-        else:
-            row |= of_each[0]
-        rows.append(row)
-    return rows
-
-
-_UNBALANCE = ("V_2_over_V_1", "I_2_over_I_1")
-
-
-def _of_one(col: _Columns, tail: np.ndarray, end: int) -> dict[str, Any]:
-    """Return means over the end of a phase of one generator, and the severity of its fault."""
-    more = [v for v in _UNBALANCE if v in col.ds]  # files of before lack them
-    means = {v: float(np.mean(col[v][tail])) for v in (*_MEANS_OF_EACH, *more)}
-    return means | severity(*(float(col[v][end]) for v in _SEVERITY))
-
-
-def _worst(
-    ds: xr.Dataset, col: _Columns, whole: np.ndarray, t: float, number: int
-) -> dict[str, Any]:
-    """Return the severity of a generator's worst fault in a phase, which may be over at its end."""
-    rows = np.flatnonzero(whole & (col["mu"] > 0))
-    if not rows.size:
-        return {"worst": None}
-    h = severity_h(*(np.asarray(col[v])[rows] for v in ("mu", "k_rf")))
-    k = int(rows[int(np.argmax(h))])
-    phase = _holding(ds, "faults", "phase", t, number)
-    return {"worst": severity(*(float(col[v][k]) for v in _SEVERITY)) | {"fault_phase": phase}}
-
-
-def _held(ds: xr.Dataset, col: _Columns, end: int, t: float, number: int) -> dict[str, Any]:
-    """Return phase of the fault and load of a generator at the end of a phase."""
-    faulty = col["mu"][end]
-    return {
-        "fault_phase": _holding(ds, "faults", "phase", t, number) if faulty else None,
-        "load": _holding(ds, "loads", "load", t, number),
-    }

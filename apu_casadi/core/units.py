@@ -9,9 +9,11 @@ import numpy as np
 
 from apu_casadi.core.errors import DataError, nearest
 
-__all__ = ["ALL_UNITS", "GAUGE", "UNITS", "convert", "gauge_of", "header", "split_unit"]
+__all__ = ["ALL_UNITS", "GAUGE", "RPM", "UNITS", "convert", "gauge_of", "header", "split_unit"]
 __all__ += ["unit_of"]
 
+RPM = 30.0 / np.pi
+"""Revolutions per minute in one rad/s."""
 _PSI, _LB, _INCH = 6894.757293168, 0.45359237, 0.0254  # Pa, kg, m
 _MERCURY, _WATER = 133322.387415, 9806.65  # Pa for a metre of mercury (0 degC), of water (4 degC)
 #: By SI unit: what one of each unit is in it.

@@ -42,7 +42,11 @@ __all__ = ["Generator", "GeneratorPoint", "fault_of_kind", "load_of_kind"]
 NEUTRALS = ("grounded", "isolated")
 EXCITATIONS = ("regulated", "constant")
 POWERS = ("paper", "torque")
-CHOICES = {"neutral": NEUTRALS, "excitation": EXCITATIONS, "power": POWERS}
+CHOICES: dict[str, tuple[str, ...]] = {
+    "neutral": NEUTRALS,
+    "excitation": EXCITATIONS,
+    "power": POWERS,
+}
 """What is chosen by a word, and its words."""
 
 #: Voltage just after a switch, over the rated peak, that is warned of: a drop from rated load to

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import ApuWarning
-from apu_casadi.core.results import phases
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits
+from apu_casadi.unit.runsummary import phases
 
 if TYPE_CHECKING:
     from apu_casadi.unit.stepmeans import Excess

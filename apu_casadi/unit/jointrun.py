@@ -123,10 +123,12 @@ class JointRun:
     apu: Apu
     asked: Asked
     settings: Settings
+    rng: np.random.Generator
     now: Holding
     here: Holding
     point: JointPoint
     machines: Machines
+    shaft: Link
     x: np.ndarray
     u: np.ndarray
     theta: np.ndarray

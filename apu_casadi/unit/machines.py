@@ -92,6 +92,9 @@ class Machines:
         changes: of loads and faults in it; a course of tables goes no further.
     """
 
+    apu: Apu
+    settings: Settings
+    means: StepMeans
     groups: list[MachineStep]
 
     def __init__(

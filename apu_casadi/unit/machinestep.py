@@ -80,6 +80,7 @@ class MachineStep:
     settings: Settings
     V_ref: float
     w_r: Any
+    phase: Phase
     x: np.ndarray
     u: np.ndarray
     means: StepMeans

@@ -22,6 +22,7 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.departures import Departure, excess_of
 from apu_casadi.unit.events import Event, FaultChange
 from apu_casadi.unit.integrators import WAVEFORMS
+from apu_casadi.unit.runsignals import RUN
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans, phasor_signals
 
 if TYPE_CHECKING:
@@ -349,7 +350,7 @@ class Recorder:
             more: signals of what stands in the run beside the own ones.
         """
         gg, y_sg, size = self.gg, apu.generator.state_space().y, len(self._by_number)
-        signals = [*gg.Y, *phasor_signals(), *self.severities, *_powers(size), *more]
+        signals = [*RUN, *gg.Y, *phasor_signals(), *self.severities, *_powers(size), *more]
 
         def measured(signal: Any, values: np.ndarray) -> dict[str, Any]:
             name = f"{signal.name}_meas"

@@ -41,6 +41,7 @@ from apu_casadi.core.errors import (
 )
 from apu_casadi.core.profiles.profile import Varying, at, later
 from apu_casadi.core.sharing import keep, once
+from apu_casadi.core.units import RPM
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from apu_casadi.machine.loads.load import Load
+    from apu_casadi.unit.exchange import Link
 
 __all__ = [
     "EXCHANGE_LIMIT",
@@ -80,7 +82,6 @@ __all__ = [
     "unserved",
 ]
 
-RPM = 30.0 / math.pi
 EXCHANGE_LIMIT = 0.01
 """Estimated exchange error, of the speed's excursion, beyond which a run warns."""
 PAPER_STEP = 0.02
@@ -305,6 +306,16 @@ class FollowedRotor:
         apu, point: the unit, and the steady point that the run starts from.
         t, N, Wf: of the run, of which the first values count here.
     """
+
+    link: Link
+    N_0: float
+    Wf_0: float
+    a: float
+    b: float
+    state: np.ndarray
+    error: float
+    excursion: float
+    grew: float
 
     def __init__(
         self, apu: Apu, point: OperatingPoint, t: np.ndarray, N: np.ndarray, Wf: np.ndarray

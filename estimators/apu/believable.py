@@ -35,11 +35,12 @@ from scipy.special import ndtr, ndtri
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.creeping import Creep, creep, quiet_of
-from estimators.apu.electrical.causes import Causes, causes_of_change
+from estimators.apu.electrical.causes import Causes, causes_of_change, onset_of
 from estimators.apu.electrical.residuals import field_steps, unexplained_waves
+from estimators.apu.electrical.smallchanges import offset_steps, severity_changes
 from estimators.apu.electrical.terminalsignals import PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
-from estimators.apu.gaspathmodel import DT, engine_function
+from estimators.apu.gaspathmodel import engine_function
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.apu.trust import GAS, Doubt, part_of, severity
 from estimators.information.innovationtests import Finding, findings, least
@@ -85,6 +86,7 @@ STEEP_H = 0.03  # the same of a severity
 RESTLESS = 0.1  # s, in which the electrical filter begins anew three times only if it is wrong
 MOST_JUMPS = 8
 RECENT = 0.1  # s, before a report, in which a reset is its own
+SLOWLY = 0.06  # s, before a report, in which a short circuit came that made no reset
 SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
 FEWEST_SAMPLES = 100
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
@@ -179,6 +181,7 @@ def machine_doubts(
     machine: MachineParameters,
     sensors: SensorSet,
     samples: Mapping[str, np.ndarray],
+    causes: Sequence[Causes] = (),
 ) -> Iterator[Doubt]:
     """Say why what is estimated of a generator is not to be believed.
 
@@ -186,8 +189,10 @@ def machine_doubts(
         side: the estimate.
         machine, sensors: as the filter knows them; the sensors with their own noise.
         samples: as the filter took them.
+        causes: of its changes, of :func:`machine_causes`: a short circuit is an explanation.
     """
     found = [t for t, _ in _reports(side)]
+    found += [c.t for c in causes if c.best.startswith("short circuit")]
     resets = [float(t) for t in side.resets]
     waves = unexplained_waves(
         machine, sensors, samples, side.result, resets=resets, faults=found, level=LEVEL
@@ -258,28 +263,48 @@ def machine_causes(
 ) -> Iterator[tuple[Causes, Doubt | None]]:
     """Tell what the first changes of a generator are, and where the report says something else.
 
-    A change is a reported short circuit, a new beginning of the filter without a report, or a step
-    of the field's current alone, which gain errors hide from the filter.
+    A change is a reported short circuit, a new beginning of the filter without a report, or what
+    gain errors hide from the filter: a rise of a severity, a step of a current's offset, or one of
+    the field's current alone.
 
     Args:
         side, machine, sensors, samples: as of :func:`machine_doubts`.
     """
     reports, resets = _reports(side), [float(t) for t in side.resets]
-    known = [t for t, _ in reports]
-    # a small one makes no reset: it came about when it was found, if it was not there before
-    begins = {
-        t: max([r for r in resets if t - RECENT <= r <= t + 1e-9], default=max(t - DT, side.t[0]))
-        for t in known
-    }
-    changes = [(begins[t], f"short circuit {p}") for t, p in reports]
-    changes += [(t, "") for t in resets if t not in begins.values()]
-    changes += [(t, "") for t in field_steps(samples, sensors, [t for t, _ in changes])]
+    t0, dt = float(side.t[0]), float(side.t[1] - side.t[0])
+
+    def came(phase: str, first: float, last: float) -> float:
+        within = max(first, t0), last
+        return onset_of(machine, sensors, samples, phase, within)
+
+    changes: list[tuple[float, str]] = []
+    for t, p in reports:
+        own = [r for r in resets if t - RECENT <= r <= t + 1e-9]
+        # a small one makes no reset: it came before it was found, if it was not there before
+        changes.append((max(own) if own else came(p, t - SLOWLY, t), f"short circuit {p}"))
+    changes += [(t, "") for t in resets if t not in dict(changes)]
+    for sure, after, i in severity_changes(side):
+        if not _near(changes, float(side.t[after]) - dt, float(side.t[sure])):
+            first, last = (float(side.t[k]) for k in (after, sure))
+            changes.append((came(PHASES[i], first - 2 * dt, last), ""))
+    offsets = [s for s in offset_steps(samples, sensors) if not _near(changes, s.t - RECENT, s.t)]
+    known = [t for t, _ in changes] + [s.t for s in offsets]
+    changes += [(t, "") for t in field_steps(samples, sensors, known)]
+    for s in offsets:
+        # as little probable otherwise as ``LEVEL``: no machine gives a direct current that lasts
+        name = f"sensor {s.name}"
+        found = Causes(s.t, {name: 1 - LEVEL, "healthy": LEVEL}, {name: {"bias": 1.0}})
+        yield found, _unsaid(found)
     for t, said in sorted(changes)[:MOST_CAUSES]:
-        found = causes_of_change(machine, sensors, samples, t)
-        if found is None:
+        weighed = causes_of_change(machine, sensors, samples, t)
+        if weighed is None:
             continue
         what = f"what is reported as a {said} at {t:g} s"
-        yield found, _rather(found, said, what) if said else _unsaid(found)
+        yield weighed, _rather(weighed, said, what) if said else _unsaid(weighed)
+
+
+def _near(changes: Sequence[tuple[float, str]], first: float, last: float) -> bool:
+    return any(first <= t <= last + RECENT for t, _ in changes)
 
 
 def _unsaid(found: Causes) -> Doubt | None:

@@ -33,17 +33,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.results import (
-    GENERATOR,
-    dataset,
-    generators_of,
-    of_generator,
-    severity_h,
-)
+from apu_casadi.core.results import GENERATOR, dataset, generators_of, of_generator
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.runsummary import severity_h
 from estimators.apu.electrical.electricalside import (
     GAIN_SHARE,
     ElectricalSide,

@@ -127,7 +127,7 @@ class Waves:
             return None
         how = side, self.apu.generator.machine, self.sensors, a
         causes[name], odd = told(machine_causes(*how))
-        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
+        doubts += (d.of(name) for d in (*machine_doubts(*how, causes[name]), *odd))
         return side
 
     def samples(self, notes: list[str], begin: float = -math.inf) -> dict[str, np.ndarray]:

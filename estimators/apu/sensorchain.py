@@ -32,6 +32,9 @@ class Draws:
         machine: number of the generator, 0 for the gas path.
     """
 
+    seed: int | None
+    machine: int
+
     def __init__(self, seed: int | None, machine: int = 0) -> None:
         self.seed, self.machine = seed, machine
 

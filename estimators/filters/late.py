@@ -61,6 +61,10 @@ class RunningFilter:
         DataError: ``keep`` negative, or ``start`` not finite.
     """
 
+    model: FilterModel
+    keep: float
+    belief: Belief
+
     def __init__(
         self,
         model: FilterModel | FilterStep,

@@ -30,6 +30,10 @@ class Runs:
         step, prior, backend: as of :func:`estimators.filters.filtering.run`.
     """
 
+    step: FilterStep
+    prior: Belief
+    backend: str | None
+
     def __init__(self, step: FilterStep, prior: Belief, backend: str | None = None) -> None:
         self.step, self.prior, self.backend = step, prior, backend
         self._done: list[tuple[Recording, FilterResult]] = []

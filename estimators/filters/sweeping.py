@@ -73,6 +73,10 @@ class Sweep:
         remember: what a piece has done is kept for another one from the same start.
     """
 
+    model: FilterModel
+    data: Recording
+    wide: bool
+
     def __init__(
         self,
         model: FilterModel,

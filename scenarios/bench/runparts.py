@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.calling import available_threads
-from apu_casadi.core.results import phase_summary
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.runsummary import phase_summary
 from scenarios import registry
 from scenarios.bench.measuring import Row, Size, apu, child, part, python, timed
 from scenarios.campaigns import counts, random_faults, run_campaign

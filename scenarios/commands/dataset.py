@@ -15,6 +15,7 @@ import argparse
 import dataclasses
 import sys
 import time
+from collections.abc import Callable
 
 from scenarios.shell import jsontext, usage
 from scenarios.shell.progress import bar
@@ -52,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     usage.actions(parser, (*rows, ("page", _page, _PAGE)))
 
 
-run = usage.act
+run: Callable[[argparse.Namespace], int] = usage.act
 
 
 def resume(args: argparse.Namespace) -> str:

@@ -94,7 +94,7 @@ def resume(args: argparse.Namespace) -> str:
     return f"finished parts of the study are kept in {args.out}; the same command goes on"
 
 
-run = usage.act
+run: Callable[[argparse.Namespace], int] = usage.act
 
 
 # ------------------------------------------------------------------------------ data

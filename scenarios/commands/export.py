@@ -13,6 +13,7 @@ exchange it is one continuous model.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,8 @@ _ASKED = f"""
 """
 _C = f"""
 names NAME +            | gas_generator.step (short: step), .f, .g, .residual, .rates;
-                        | generator.step, .f, .g, .z, .residual; ekf, the gas-path filter's step
+                        | generator.step, .f, .g, .z, .residual; ekf, ukf: steps of the
+                        | gas-path filter
 {_ASKED.strip()}
 --out DIR =results/c    | folder (default %(default)s)
 --check                 | compile and run the examples: every digit as Python's
@@ -56,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     usage.actions(parser, (("c", _c, _C), ("fmu", _fmu, _FMU)))
 
 
-run = usage.act
+run: Callable[[argparse.Namespace], int] = usage.act
 
 
 def _asked(args: argparse.Namespace) -> Asked:

@@ -23,9 +23,10 @@ from apu_casadi.core.errors import ApuError, ApuWarning, DataError, nearest
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.sensors import GAS_PATH
 from estimators.apu.trust import GAS
+from scenarios.datasets import waveforms
 from scenarios.datasets.making import VARIED
 from scenarios.datasets.recipe import CLASSES
-from scenarios.datasets.scoring import read_labels
+from scenarios.datasets.scoring import parquet, read_labels
 
 Progress = Callable[[float, float], None]
 Rows = list[dict[str, Any]]
@@ -37,7 +38,6 @@ _ALARM = 4.0  # robust standard deviations of healthy training runs: a reading t
 
 def runs_of(folder: str | Path, labels: Mapping[str, np.ndarray]) -> Iterator[tuple[int, Any, Any]]:
     """Yield number, gas path and waveforms (or None) of each run, as pandas.DataFrames."""
-    pandas = import_module("pandas")
     where = dict(zip(labels["run"].tolist(), labels["unit"].tolist(), strict=True))
     unit: int | None = None
     tables: dict[str, Any] = {}
@@ -46,8 +46,10 @@ def runs_of(folder: str | Path, labels: Mapping[str, np.ndarray]) -> Iterator[tu
             unit, tables = where[run], {}
             for part in ("gaspath", "electrical"):
                 path = Path(folder) / part / f"unit_{unit:05d}.parquet"
-                if path.is_file():
-                    tables[part] = pandas.read_parquet(io.BytesIO(files.read_bytes(path)))
+                if (packed := path.with_suffix(waveforms.ENDING)).is_file():
+                    tables[part] = waveforms.frame(packed)
+                elif path.is_file():  # also waveforms of a set made before they were netCDF
+                    tables[part] = parquet(path)
         gas, waves = (t[t["run"] == run] if (t := tables.get(p)) is not None else None
                       for p in ("gaspath", "electrical"))  # fmt: skip
         if gas is None:

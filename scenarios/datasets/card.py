@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from apu_casadi.core.cf import KEYWORDS
 from apu_casadi.core.version import installed
+from scenarios.datasets import waveforms
 
 if TYPE_CHECKING:
     from scenarios.datasets.recipe import Recipe
@@ -36,8 +37,9 @@ do not have.
   `sensor`, its kind and relative size; health factors; `unit`, `split`, `status`, `reason`.
 - `gaspath/unit_*.parquet`: every 20 ms. `W.` conditions, `X_s.` measured, `X_v.` true, `T.` health
   and severity.
-- `electrical/unit_*.parquet`: voltages and currents of both generators around the onset, measured,
-  at {{rate}} Hz; of healthy runs the middle. Stored in single precision (6e-8, far below noise).
+- `electrical/unit_*.nc`: netCDF-4. Voltages and currents of both generators around the onset,
+  measured, at {{rate}} Hz; of healthy runs the middle. `v_a(generator, sample)`, with `run` and
+  `time` of each sample. Stored in single precision (6e-8, far below noise), packed without loss.
 - `checksums.sha256`: `sha256sum -c checksums.sha256`.
 
 ## Columns
@@ -63,7 +65,6 @@ def data_card(
     r: Recipe,
     rows: Sequence[Mapping[str, Any]],
     columns: Mapping[str, tuple[str, str]],
-    waves: Mapping[str, str],
     told: Mapping[str, Any],
 ) -> str:
     """Return the card as Markdown."""
@@ -73,7 +74,7 @@ def data_card(
     classes = [f"| {k} | " + " | ".join(str(count[k, s]) for s in splits) + " |" for k in kinds]
     status = Counter(row["status"] for row in rows)
     table = [f"| `{n}` | {unit} | {doc} |" for n, (unit, doc) in columns.items()]
-    table += [f"| `{n}` | {unit} | as measured |" for n, unit in waves.items()]
+    table += [f"| `{n}` | {u} | {waveforms.meaning(n)} |" for n, u in waveforms.UNITS.items()]
     values = {
         "name": r.name,
         "title": r.title,
@@ -95,6 +96,7 @@ def data_card(
     return text
 
 
+_PARQUET = "application/x-parquet"
 _TYPES = {bool: "sc:Boolean", int: "sc:Integer", float: "sc:Float", str: "sc:Text"}
 _WORDS = """
 citeAs column equivalentProperty extract field fileObject fileProperty fileSet format includes
@@ -116,23 +118,35 @@ _CONTEXT: dict[str, Any] = {
 }
 
 
+_VARIABLES = ", ".join(f"{n} [{unit}]" for n, unit in waveforms.UNITS.items())
+_FOLDERS = {
+    "gaspath": (".parquet", _PARQUET, "every 20 ms: conditions, readings, truth"),
+    "electrical": (
+        waveforms.ENDING,
+        waveforms.FORMAT,
+        f"netCDF-4, waveforms around the onset: {_VARIABLES} over generator and sample; run and "
+        "time of each sample",
+    ),
+}
+"""Ending, format and content of each folder; Croissant 1.0 has no way into netCDF, hence no records
+of waveforms: the metadata has their files and says what is in them."""
+
+
 def croissant(
     r: Recipe,
     sums: Mapping[str, str],
     labels: Mapping[str, Any],
     columns: Mapping[str, tuple[str, str]],
-    waves: Mapping[str, str],
     day: str,
 ) -> dict[str, Any]:
     """Return Croissant 1.0 metadata, dated: files, and the columns of each table."""
-    parquet = "application/x-parquet"
     files: list[dict[str, Any]] = [
         {
             "@type": "cr:FileObject",
             "@id": "runs.parquet",
             "name": "runs.parquet",
             "contentUrl": "runs.parquet",
-            "encodingFormat": parquet,
+            "encodingFormat": _PARQUET,
             "sha256": sums["runs.parquet"],
         }
     ]
@@ -142,21 +156,19 @@ def croissant(
             "@type": "cr:FileSet",
             "@id": folder,
             "name": folder,
-            "includes": f"{folder}/*.parquet",
-            "encodingFormat": parquet,
+            "includes": f"{folder}/*{ending}",
+            "encodingFormat": form,
+            "description": about,
         }
-        for folder in folders
+        for folder, (ending, form, about) in _FOLDERS.items()
+        if folder in folders
     ]
     own = {n: (_TYPES[type(v)], "label") for n, v in labels.items()}
-    gas = {n: ("sc:Integer" if n == "run" else "sc:Float", f"{d} [{u}]")
-           for n, (u, d) in columns.items()}  # fmt: skip
-    own_waves = {"run": ("sc:Integer", "number of the run"), "time": ("sc:Float", "[s]")}
-    own_waves |= {n: ("sc:Float", f"as measured [{unit}]") for n, unit in waves.items()}
+    types = {n: "sc:Integer" if n == "run" else "sc:Float" for n in columns}
+    gas = {n: (types[n], f"{d} [{u}]") for n, (u, d) in columns.items()}
     sets = [_records("runs", "fileObject", "runs.parquet", own)]
-    sets += [
-        _records(f"{f}_samples", "fileSet", f, gas if f == "gaspath" else own_waves)
-        for f in folders
-    ]
+    if "gaspath" in folders:
+        sets.append(_records("gaspath_samples", "fileSet", "gaspath", gas))
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

@@ -4,7 +4,7 @@ Layout, in the manner of N-CMAPSS::
 
     runs.parquet                 one row a run: Y (labels) and A (unit, run, split, status, reason)
     gaspath/unit_00012.parquet   W (conditions), X_s (measured), X_v (truth), T (health, faults)
-    electrical/unit_00012.parquet  voltages and currents around the onset, as measured
+    electrical/unit_00012.nc     voltages and currents around the onset, as measured, netCDF-4
     recipe.json, CARD.md, croissant.json, checksums.sha256
 
 Columns of the gas path are named ``W.altitude``, ``X_s.T3``, ...; units are in CARD.md.  A unit is
@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +32,15 @@ from apu_casadi.core import files
 from apu_casadi.core.backend import package_digest
 from apu_casadi.core.cf import now
 from apu_casadi.core.errors import ApuError, ApuWarning, DataError, SimulationError
-from apu_casadi.core.results import CHANNELS, severity_h
 from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.runsignals import RUN
+from apu_casadi.unit.runsummary import severity_h
 from estimators.apu.measuring import measure_run
-from estimators.apu.sensors import ELECTRICAL, GAS_PATH
+from estimators.apu.sensors import GAS_PATH
 from scenarios import registry
+from scenarios.datasets import waveforms
 from scenarios.datasets.card import croissant, data_card
 from scenarios.datasets.recipe import Drawn, Recipe, draw
 from scenarios.schema import Scenario
@@ -48,8 +51,6 @@ from scenarios.shell.workers import LOST, each_task, stoppable
 RUNS, LOCK, SUMS = "runs.parquet", "dataset.lock", "checksums.sha256"
 VARIED = tuple(n for n in CONDITIONS if n != "war")  # what a recipe draws of the day
 VIRTUAL = ("T2", "T3", "P3", "T4", "T41", "T5", "P5", "W2", "SM", "PW", "Wf", "N")
-WAVES = {f"{s.name}_{k}": s.unit for k in (1, 2) for s in ELECTRICAL.sensors}
-"""Unit of each column of the waveforms: what is measured at generators 1 and 2."""
 Progress = Callable[[int, int], None]
 
 
@@ -60,8 +61,8 @@ def gas_path_columns() -> dict[str, tuple[str, str]]:
     found |= {f"W.{n}": (CONDITIONS[n].unit, CONDITIONS[n].doc) for n in VARIED}
     found["W.P_e"] = ("W", "electrical output, both generators")
     found |= {f"X_s.{s.name}": (s.unit, "as measured") for s in GAS_PATH.sensors}
-    found |= {f"X_v.{n}": CHANNELS[n] for n in VIRTUAL}
-    found |= {f"T.{n}": CHANNELS[n] for n in HEALTH}
+    found |= {f"X_v.{n}": (RUN[n].unit, RUN[n].doc) for n in VIRTUAL}
+    found |= {f"T.{n}": (RUN[n].unit, RUN[n].doc) for n in HEALTH}
     return found | {"T.h": ("1", "mu/(k_rf + 1 - mu) of the short circuit")}
 
 
@@ -149,7 +150,7 @@ def _waves(r: Recipe, d: Drawn, read: Any) -> dict[str, np.ndarray]:
     n = int(inside.sum())
     out: dict[str, np.ndarray] = {"run": np.full(n, d.labels["run"], dtype=np.int32)}
     out["time"] = t[inside]
-    for name in WAVES:
+    for name in waveforms.WAVES:
         plain = name if name in read else name.rpartition("_")[0]  # generators that are alike
         out[name] = read[plain].values[inside].astype(np.float32)
     return out
@@ -167,11 +168,9 @@ def make_unit(recipe: Mapping[str, Any], unit: int) -> dict[str, Any]:
         rows.append(labels)
         gas += [g] if g else []
         waves += [w] if w else []
-    made = {
-        f"{folder}/unit_{unit:05d}.parquet": _parquet(parts)
-        for folder, parts in (("gaspath", gas), ("electrical", waves))
-        if parts
-    }
+    made = {f"gaspath/unit_{unit:05d}.parquet": _parquet(gas)} if gas else {}
+    if waves:
+        made[f"electrical/unit_{unit:05d}{waveforms.ENDING}"] = waveforms.packed(waves, r.title)
     return {"rows": rows, "files": made}
 
 
@@ -180,11 +179,18 @@ def _parquet(parts: list[dict[str, np.ndarray]]) -> bytes:
         {n: np.concatenate([p[n] for p in parts]) for n in parts[0]}
     )
     f = io.BytesIO()
-    try:
-        frame.to_parquet(f, index=False)
-    except ImportError as e:
-        raise DataError(f"a data set needs: pip install 'apu-casadi[parquet]' ({e})") from None
+    frame.to_parquet(f, index=False)
     return f.getvalue()
+
+
+def _packages(r: Recipe) -> None:
+    """Refuse to begin without what the files are written by."""
+    needed = {"pyarrow": "parquet"} | ({"h5netcdf": "netcdf4"} if r.waveforms.get("rate") else {})
+    if missing := [n for n in needed if find_spec(n) is None]:
+        extras = ",".join(needed.values())
+        raise DataError(
+            f"a data set needs {' and '.join(missing)}: pip install 'apu-casadi[{extras}]'"
+        )
 
 
 def make_dataset(
@@ -209,8 +215,10 @@ def make_dataset(
         Number of runs by status.
 
     Raises:
-        DataError: the folder belongs to another recipe or version, or cannot be written.
+        DataError: the folder belongs to another recipe or version, or cannot be written, or
+            a package for its files is missing.
     """
+    _packages(r)
     folder = files.folder(out)
     table = json.loads(json.dumps(asdict(r)))
     told = {"recipe": table, "program": package_digest()}
@@ -328,8 +336,8 @@ def _finish(folder: Path, r: Recipe, told: Mapping[str, Any]) -> dict[str, int]:
     sums = {n: s for record in records for n, s in record["files"].items()}
     sums[RUNS] = _sum(table)
     columns = gas_path_columns()
-    files.write_text(folder / "CARD.md", data_card(r, rows, columns, WAVES, told))
-    meta = croissant(r, sums, rows[0], columns, WAVES, told["begun"])
+    files.write_text(folder / "CARD.md", data_card(r, rows, columns, told))
+    meta = croissant(r, sums, rows[0], columns, told["begun"])
     files.write_text(folder / "croissant.json", jsontext.dumps(meta) + "\n")
     lines = [f"{s}  {n}\n" for n, s in sorted(sums.items())]
     files.write_text(folder / SUMS, "".join(lines))

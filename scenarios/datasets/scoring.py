@@ -35,6 +35,21 @@ FALSE_ALARMS = 0.05
 LEVEL = 1.959963984540054  # of a 95 % band
 
 
+def parquet(path: Path) -> Any:
+    """Return a table of a data set as a pandas.DataFrame.
+
+    Raises:
+        DataError: a damaged file, or no package that reads it.
+    """
+    raw = io.BytesIO(files.read_bytes(path))
+    try:
+        return import_module("pandas").read_parquet(raw)
+    except ImportError as e:
+        raise DataError(f"{path} needs: pip install 'apu-casadi[parquet]' ({e})") from None
+    except Exception as e:  # damaged files fail with any type
+        raise DataError(f"{path}: damaged ({type(e).__name__}: {e})") from None
+
+
 def read_labels(folder: str | Path) -> dict[str, np.ndarray]:
     """Return the labels of a data set's runs that were done, by column.
 
@@ -44,13 +59,8 @@ def read_labels(folder: str | Path) -> dict[str, np.ndarray]:
     path = Path(folder) / RUNS
     if not path.is_file():
         raise DataError(f"{path} is not there: the folder of apu dataset make is expected")
-    try:
-        frame = import_module("pandas").read_parquet(io.BytesIO(files.read_bytes(path)))
-    except ImportError as e:
-        raise DataError(f"{path} needs: pip install 'apu-casadi[parquet]' ({e})") from None
-    except Exception as e:
-        raise DataError(f"{path}: damaged ({type(e).__name__}: {e})") from None
-    frame = frame[frame["status"] == "done"]
+    frame = parquet(path)
+    frame[frame["status"] == "done"]
     return {str(n): frame[n].to_numpy() for n in frame}
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -28,7 +29,9 @@ from apu_casadi.unit.events import Ambient
 from apu_casadi.unit.stepmeans import MEANS
 from estimators.apu.gaspath import ITERATED, ITERATIONS, GasPathFilter, gas_path_filter
 from estimators.filters.ekf import ekf_step
-from estimators.filters.filtering import STATS, STEP_IN, STEP_OUT
+from estimators.filters.filtering import STATS, STEP_IN, STEP_OUT, FilterStep
+from estimators.filters.ukf import ukf_step
+from estimators.models.filtermodel import FilterModel
 from scenarios.export.ccode import Exported, Vector, scalar
 
 _DT = scalar("dt", "s", "length of the step")
@@ -289,19 +292,33 @@ def _gen_residual(asked: Asked) -> Exported:
 
 @_function("ekf")
 def _ekf(asked: Asked) -> Exported:
+    return _of_filter(
+        asked, "gas_path_ekf", partial(ekf_step, iterations=ITERATIONS, iterated=ITERATED)
+    )
+
+
+@_function("ukf")
+def _ukf(asked: Asked) -> Exported:
+    return _of_filter(asked, "gas_path_ukf", ukf_step)
+
+
+def _of_filter(asked: Asked, name: str, make: Callable[[FilterModel], FilterStep]) -> Exported:
     gg, gas = asked.unit.gas_generator, asked.gas
     found = gas_path_filter(gg)
     model, prior = found.model, found.prior()
-    step = ekf_step(model, ITERATIONS, ITERATED)
+    step = make(model)
+    cov = np.linalg.cholesky(prior.cov) if step.root else prior.cov
+    what = "root L of the covariance L L', with" if step.root else "covariance with"
     numbers = step.full(np.zeros(0))
     x, y, u_gg = model.x, {n: gas[n] for n in model.y.names}, gg.U.unpack(gas.u)
     u = {n: v for n, v in u_gg.items() if n in model.u}
     u |= {f"sigma_{n}": _sigma(found, n, v) for n, v in u.items() if f"sigma_{n}" in model.u}
     P = Signals([Signal(s.name, "1", f"covariance with {s.name}") for s in x])
+    carried = Signals([Signal(s.name, "1", f"{what} {s.name}") for s in x])
     R = Signals([Signal(s.name, "1", "variance; below zero: not measured") for s in model.y])
     known = {
         "m": Vector("m", x, _tuple(prior.mean)),
-        "P": Vector("P", P, _tuple(prior.cov), square=True),
+        "P": Vector("P", carried, _tuple(cov), square=True),
         "u": Vector("u", model.u, _tuple(model.u.pack(u))),
         "p": Vector("numbers", step.shared.model.p, _tuple(numbers), constant=True),
         "y": Vector("y", model.y, tuple(y.values())),
@@ -309,13 +326,14 @@ def _ekf(asked: Asked) -> Exported:
         "dt": Vector("dt", _DT, (gg.dt,)),
     }
     made = {k: Vector(k, x) for k in ("m1", "m_f")}
-    made |= {k: Vector(k, P, square=True) for k in ("P1", "P_f", "C")}
+    made |= {k: Vector(k, P, square=True) for k in ("P_f", "C")}
+    made["P1"] = Vector("P1", carried, square=True)
     made |= {"nu": Vector("nu", model.y), "S": Vector("S", R, square=True)}
     made["stats"] = Vector("stats", Signals([Signal(k, "1", "of this sample") for k in STATS]))
     return Exported(
-        "gas_path_ekf",
+        name,
         "one step of the gas-path filter: correct the belief m, P, then predict m1, P1.",
-        _parted("gas_path_ekf", step.shared.function),
+        _parted(name, step.shared.function),
         tuple(known[k] for k in STEP_IN),
         tuple(made[k] for k in STEP_OUT),
         hand=(("m1", "m"), ("P1", "P")),

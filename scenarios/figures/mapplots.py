@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, MapError, OperatingPointError, SignalError
-from apu_casadi.core.results import phases
 from apu_casadi.gaspath.maps.scaledmaps import map_function
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
+from apu_casadi.unit.runsummary import phases
 from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import scenario_of
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import RPM
+from apu_casadi.core.units import RPM
 from scenarios.figures import figstyle as fs
 from scenarios.figures.threephase import cycle_rms
 

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import RPM, of_generator, phases, severity_h
+from apu_casadi.core.results import of_generator
+from apu_casadi.core.units import RPM
+from apu_casadi.unit.runsummary import phases, severity_h
 from scenarios.figures import figstyle as fs
 from scenarios.figures.runwords import scenario_of
 

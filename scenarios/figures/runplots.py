@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import RPM, generators_of, of_generator, phases, severity_h
+from apu_casadi.core.results import generators_of, of_generator
+from apu_casadi.core.units import RPM
 from apu_casadi.gaspath.health import HEALTH_FACTORS
+from apu_casadi.unit.runsummary import phases, severity_h
 from scenarios.figures import figstyle as fs
 from scenarios.figures.chosen import quietest
 from scenarios.figures.runwords import SEVERITY, caption_of, fault_phase, scenario_of, severity_note

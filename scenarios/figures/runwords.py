@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import GENERATOR, generators_of, of_generator, severity_h
+from apu_casadi.core.results import GENERATOR, generators_of, of_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.unit.runsummary import severity_h
 from scenarios.figures.figstyle import caption
 
 if TYPE_CHECKING:

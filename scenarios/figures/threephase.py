@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.results import generators_of, of_generator, phases
+from apu_casadi.core.results import generators_of, of_generator
+from apu_casadi.unit.runsummary import phases
 from scenarios.figures import figstyle as fs
 from scenarios.figures.chosen import largest
 from scenarios.figures.runwords import caption_of

@@ -16,8 +16,8 @@ import numpy as np
 
 from apu_casadi.core import simulation
 from apu_casadi.core.errors import OperatingPointError
-from apu_casadi.core.results import RPM, phase_summary
 from apu_casadi.core.sharing import once
+from apu_casadi.core.units import RPM
 from apu_casadi.gaspath.steady.steadypoint import OperatingPoint
 from apu_casadi.gaspath.steady.trimming import trim_gas_generator
 from apu_casadi.machine.faults.ttsc import Ttsc
@@ -27,6 +27,7 @@ from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.control import GovernorParameters
 from apu_casadi.unit.events import LoadChange
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.runsummary import phase_summary
 from scenarios import registry
 from scenarios.pages import shaftpower
 from scenarios.shell.template import Template

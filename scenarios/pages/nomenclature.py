@@ -15,13 +15,13 @@ from typing import Any
 
 from apu_casadi.core.errors import ParameterError
 from apu_casadi.core.parameters import Parameters
-from apu_casadi.core.results import CHANNELS
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.machine.faults.fault import FAULTS
 from apu_casadi.machine.generator import NEUTRALS, Generator
 from apu_casadi.machine.loads.load import LOADS
 from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.runsignals import RUN
 from scenarios.shell.template import Template
 
 TEXT = Template.of("nomenclature.md")
@@ -135,7 +135,7 @@ def page() -> str:
     apu = Apu()
     models = _variants(apu.generator)
     known = {s.name for s in GasGenerator.Y}
-    channels = [(f"`{n}`", *of) for n, of in CHANNELS.items() if n not in known]
+    channels = [(f"`{s.name}`", s.unit, s.doc) for s in RUN if s.name not in known]
     sets = {
         "gas_generator": ("Gas generator, design data", apu.gas_generator.parameters),
         "compressor_map": ("Compressor map", apu.gas_generator.compressor_map.calibration),

@@ -75,9 +75,11 @@ class Parser(argparse.ArgumentParser):
 
     def _unknown(self, arguments: Sequence[str]) -> NoReturn:
         """End with status 2: options that there are not, and the nearest one there is."""
-        known = [o for o in self._option_string_actions if o.startswith("--")]
-        near = nearest(arguments[0].partition("=")[0], known)
-        self.error(f"unrecognized arguments: {' '.join(arguments)} {near}")
+        known = [o[2:] for o in self._option_string_actions if o.startswith("--")]
+        word = arguments[0].partition("=")[0].removeprefix("--").lower()  # dashes make all alike
+        near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+        told = f" (did you mean '--{near[0]}'?)" if near else ""
+        self.error(f"unrecognized arguments: {' '.join(arguments)}{told}")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse what is none of an argument's choices; the nearest one is named."""

@@ -253,8 +253,8 @@ def table10() -> list[Row]:
     The paper's errors (gas generator 2.361e-6, 2.084e-5, 2.088e-5; generator 6.628e-3, 7.130e-3)
     are against GasTurb and SM-MATLAB runs that are not published.
     """
-    from apu_casadi.core.results import phase_summary
     from apu_casadi.unit.apu import Apu
+    from apu_casadi.unit.runsummary import phase_summary
     from scenarios import registry
     from scenarios.validation.comparison import reference
 

@@ -46,7 +46,11 @@ __all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "source", "unsupport
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
-FLAGS = {2: (), 4: ("-mavx2",), 8: ("-mavx512f", "-mavx512dq", "-mavx512vl")}
+FLAGS: dict[int, tuple[str, ...]] = {
+    2: (),
+    4: ("-mavx2",),
+    8: ("-mavx512f", "-mavx512dq", "-mavx512vl"),
+}
 _NEEDS = {4: {"avx2"}, 8: {"avx512f", "avx512dq", "avx512vl"}}
 COMMON_FLAGS = ("-ffp-contract=off", "-Wno-psabi")
 _X86 = ("x86_64", "AMD64")

@@ -140,7 +140,8 @@ class Together:
         *,
         often: int = OFTEN,
     ) -> None:
-        self.fun, self.of = fun, of
+        self.fun: ca.Function = fun
+        self.of: ca.Function = of
         self._one = one  # a member's own is never made where all ask
         self._in_lanes: Caller | None = None
         self._left = self._often = 0 if one is None else often

@@ -34,7 +34,6 @@ from typing import Any, ClassVar, Self
 from apu_casadi.core.checked import bounded, number
 from apu_casadi.core.errors import ParameterError, ScenarioError
 from apu_casadi.core.register import Key, read_table
-from apu_casadi.core.results import CHANNELS
 from apu_casadi.core.signals import Signal
 from apu_casadi.machine.faults.fault import FAULTS, AtFault, Branch, Fault, Own
 from apu_casadi.machine.loads.load import Load
@@ -80,9 +79,20 @@ class Ttsc(Fault):
         {"k_rf": Key("h", "1", "mu/(k_rf + 1 - mu), in place of k_rf", 0.0, 99.0, open_lo=True)}
     )
     reversing: ClassVar[tuple[str, ...]] = ("i_fault",)
-    severities: ClassVar[tuple[Signal, ...]] = tuple(
-        Signal(name, *CHANNELS[name], default=healthy)
-        for name, healthy in (("mu", 0.0), ("k_rf", math.nan), ("kappa", math.nan))
+    severities: ClassVar[tuple[Signal, ...]] = (
+        Signal("mu", "1", "shorted fraction of the turns of a phase (0: healthy)", default=0.0),
+        Signal(
+            "k_rf",
+            "1",
+            "fault resistance over that of the shorted turns (nan: healthy)",
+            default=math.nan,
+        ),
+        Signal(
+            "kappa",
+            "1",
+            "leakage partition of the shorted turns (nan: healthy)",
+            default=math.nan,
+        ),
     )
 
     def __post_init__(self) -> None:

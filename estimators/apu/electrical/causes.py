@@ -18,9 +18,9 @@ harmonics           the currents have harmonics that the voltages have not
 =================== ============================================================================
 
 What a failed current sensor reads is taken for noise about the prediction of the other sensors,
-with the variance that is found, and harmonics have the amplitudes that are found; half the
-logarithm of the number of readings is taken off for each (Schwarz 1978, Annals of Statistics 6,
-461).
+with the variance that is found, or for its own noise about an offset, and harmonics have the
+amplitudes that are found; half the logarithm of the number of readings is taken off for each
+(Schwarz 1978, Annals of Statistics 6, 461).
 
 Shorted turns of the field (:mod:`apu_casadi.machine.faults.fieldshort`) leave its flux, referred to
 all turns, where it is, and raise what is read of its current, the voltage and the resistance, both
@@ -54,7 +54,7 @@ from estimators.information.posterior import named_posterior
 from estimators.models.filtermodel import Unknown
 from estimators.models.recording import Recording
 
-__all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "kind_of", "probabilities"]
+__all__ = ["BEFORE", "PRIOR", "Causes", "causes_of_change", "kind_of", "onset_of", "probabilities"]
 
 BEFORE, AFTER = 0.01, 0.03  # s of the piece around the change
 UNKNOWN = 1e4  # A; standard deviation of a reading that says nothing
@@ -73,6 +73,7 @@ PRIOR = {
     "harmonics": 0.3,
 }
 FEWEST = 100  # samples that a verdict takes
+COARSE, FINEST = 0.01, 0.00125  # s; between the instants that are tried for an onset
 TURNS = (
     0.1  # scale of the share of the field's turns that are shorted, and of an error of its current
 )
@@ -223,13 +224,19 @@ class _Piece:
         with np.errstate(invalid="ignore"):
             spread = np.sqrt(np.maximum(r.innovation_variance[row] - UNKNOWN**2, 0.0))
         spread = np.hypot(spread, self.sensors.sigma(name, 0.0))
-        told = data.t[late], data.y[row, late], shown[late], spread[late]
+        spread = spread[late]
+        told = data.t[late], data.y[row, late], shown[late], spread
         self.failed[f"sensor {name}"] = failure(*told)
         at = late & np.isfinite(r.innovation[row])
         nu, S = r.innovation[row, at], r.innovation_variance[row, at]
         found = max(float(np.mean(nu**2)), float(np.min(S)) * 1e-9)
         own = -0.5 * (nu**2 / S + np.log(2 * math.pi * S)).sum()
-        instead = -0.5 * nu.size * (1 + math.log(2 * math.pi * found))
+        noisy = -0.5 * nu.size * (1 + math.log(2 * math.pi * found))
+        s = spread[at[late]]  # its own noise, about what it is off
+        z, one = nu / s, 1 / s
+        off = z - one * float(one @ z) / max(float(one @ one), 1e-300)
+        biased = -0.5 * float(off @ off + np.log(2 * math.pi * s**2).sum())
+        instead = float(np.logaddexp(noisy, biased)) - math.log(2.0)
         return float(r.loglik - own + instead) - 0.5 * math.log(max(nu.size, 2))
 
     def voltages_off(self) -> float:
@@ -290,6 +297,44 @@ class _Piece:
             c = np.linalg.lstsq(B, z, rcond=None)[0]
             gain += 0.5 * (z @ z - np.sum((z - B @ c) ** 2)) - 0.5 * b.shape[1] * math.log(z.size)
         return float(r.loglik + gain)
+
+
+def onset_of(
+    machine: MachineParameters,
+    sensors: SensorSet,
+    samples: Mapping[str, np.ndarray],
+    phase: str,
+    within: tuple[float, float],
+    *,
+    backend: str | None = None,
+) -> float:
+    """Return the likeliest instant at which a short circuit of a phase came, to ``FINEST``, s.
+
+    Args:
+        machine, sensors, samples, backend: as of :func:`causes_of_change`.
+        phase: of it.
+        within: between which it is looked for, s.
+    """
+    t, (first, last) = samples["t"], within
+    at = (t >= first - BEFORE - 1e-9) & (t <= last + AFTER + 1e-9)
+    backend = backend or rarely("onset of a change")
+    piece = _Piece(machine, sensors, {n: v[at] for n, v in samples.items()}, first, backend)
+    tried: dict[float, float] = {}
+
+    def likely(change: float) -> float:
+        if change not in tried:
+            try:
+                tried[change] = replace(piece, change=change).shorted(phase)
+            except ApuError:
+                tried[change] = -math.inf
+        return tried[change]
+
+    step = COARSE
+    best = max((float(v) for v in np.arange(first, last + step / 2, step)), key=likely)
+    while step > FINEST:
+        step /= 2
+        best = max((v for v in (best, best - step, best + step) if first <= v <= last), key=likely)
+    return best
 
 
 def causes_of_change(

@@ -43,6 +43,8 @@ CHUNK = 80 * RESET_WINDOW  # samples that are filtered before they are judged
 class LostError(EstimationError):
     """The model does not fit the data; ``resets``: where the filter began anew, s."""
 
+    resets: tuple[float, ...]
+
     def __init__(self, resets: Sequence[float], text: str) -> None:
         super().__init__(text)
         self.resets = tuple(resets)

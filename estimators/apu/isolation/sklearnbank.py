@@ -32,7 +32,7 @@ except ImportError as e:
 
 __all__ = ["IsolationBank", "rows_of"]
 
-NAMES = tuple(c.name for c in CLASSES)
+NAMES: tuple[str, ...] = tuple(c.name for c in CLASSES)
 _CHANNELS = len(OUTPUTS) + 2
 
 
@@ -50,6 +50,11 @@ class IsolationBank(ClassifierMixin, BaseEstimator):
         protocol: layout of a window, and priors; the default one if None.
         gas_generator: the engine as the filters know it; the default one if None.
     """
+
+    method: str
+    protocol: Protocol | None
+    gas_generator: GasGenerator | None
+    classes_: np.ndarray
 
     def __init__(
         self,

@@ -25,7 +25,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from apu_casadi.core.errors import DataError, nearest
 from apu_casadi.core.tables.columns import cut
@@ -65,8 +65,9 @@ class Reading(TableLayout):
     sort: bool = False
     engine: GasGenerator = field(default_factory=GasGenerator)
 
-    known_head = skips_unnamed = False
-    remedies = {
+    known_head: ClassVar[bool] = False
+    skips_unnamed: ClassVar[bool] = False
+    remedies: ClassVar[Mapping[str, str]] = {
         **TableLayout.remedies,
         "decimal": "give --decimal comma or point",
         "gap": " (an empty cell is a gap): correct it, or give --missing={} if it stands for a gap",

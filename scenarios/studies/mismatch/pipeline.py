@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import ApuError
-from apu_casadi.core.results import severity_h
 from apu_casadi.core.sharing import last
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.multirate import simulate_joint
+from apu_casadi.unit.runsummary import severity_h
 from estimators.apu.gaspath import window_means
 from estimators.apu.measuring import measure_run
 from estimators.apu.recorded_estimate import RecordedEstimate, estimate
