@@ -141,9 +141,8 @@ class Stepper(Rebuilt):
     def _integrator(self, ss: StateSpace) -> _Buffered:
         sym = _symbols(ss)
         nx, nz, nu, nt = (len(s) for s in (ss.x, ss.z, ss.u, ss.theta))
-        p, time = sym.sym("p", nu + nt + 3), sym.sym("time")
+        p, time = sym.sym("p", nu + nt + 1), sym.sym("time")
         u, theta, dt = p[:nu], p[nu : nu + nt], p[nu + nt]
-        share = p[nu + nt + 1] + p[nu + nt + 2] * time
         xs = sym.sym("xs", nx)
         x = xs * ss.x.nominals
         dae = {"x": xs, "p": p}
@@ -167,7 +166,7 @@ class Stepper(Rebuilt):
             options |= {"suppress_algebraic": True, "calc_ic": True, "first_time": 1e-3}
         if self.quad:
             y, asked = ss.g(x, u, theta), [Term.of(name) for name in self.quad]
-            terms = [q.expression(ss, x, y, share) / q.nominal(ss) for q in asked]
+            terms = [q.expression(ss, x, y, time) / q.nominal(ss) for q in asked]
             # harmonics are those of one angle, which each term would take anew
             dae |= {"t": time, "quad": ca.cse(ca.vertcat(*terms))}
         name = f"{ss.name}_{self.solver}"
@@ -180,11 +179,10 @@ class Stepper(Rebuilt):
         u: Any,
         theta: Any,
         dt: float,
-        within: tuple[float, float] = (0.0, 1.0),
     ) -> tuple[np.ndarray, ...]:
         """Return states at the outputs, shape (nx, n), and the means asked for, scaled."""
         full = self.ss.full(theta)
-        scaled, p = x0 / self.ss.x.nominals, np.concatenate([u, full, [dt], within])
+        scaled, p = x0 / self.ss.x.nominals, np.concatenate([u, full, [dt]])
         if self.solver != "idas":
             xf, qf = self._F(scaled, p, np.zeros(0))
             return xf * self.ss.x.nominals[:, None], qf
@@ -207,7 +205,6 @@ class Stepper(Rebuilt):
         dt: float = 0.02,
         *,
         t0: float = 0.0,
-        within: tuple[float, float] = (0.0, 1.0),
     ) -> StepResult:
         """Integrate from ``t0`` to ``t0 + dt``.
 
@@ -216,8 +213,6 @@ class Stepper(Rebuilt):
                 ``ss.x.pack`` and its like; shapes (nx,), (nu,), (nt,).
             dt: length of the step, s, > 0.
             t0: time of the start, s; for the output instants and messages only.
-            within: where this step begins in a longer one, and which share of it it is; for the
-                weight of weighted means.
 
         Raises:
             SignalError: a vector of the wrong length or with values that are not finite.
@@ -232,7 +227,7 @@ class Stepper(Rebuilt):
             raise SimulationError(f"{ss.name}: step length must be > 0, got {dt!r} s")
         try:
             with watched():
-                x, means = self._solve(x0, u, theta, dt, within)
+                x, means = self._solve(x0, u, theta, dt)
         except RuntimeError as error:
             raise self._failure(error, x0, u, theta, dt, t0) from None
         if not np.all(np.isfinite(x)):

@@ -33,14 +33,14 @@ from apu_casadi.machine.transition import SPEED_RANGE, coefficients, inverse, ra
 
 STAGES = 4
 #: Strides in a turn of the rotor, by "is symmetric": what ripples under a fault needs more.
-STRIDES = {True: 8, False: 20}
+STRIDES = {True: 16, False: 20}
 DOUBLED = 20  # strides at the start, each as long as all before it: from 0.2 ns on
 MOST = 500  # strides; in longer steps an adaptive integrator is as fast
 #: Largest error of E_fd, per unit, that the windings see at the end of a stride: a limit of the
 #: regulator that is met or left makes it larger.
-DRIVE_TOL = 3e-6
+DRIVE_TOL = 2e-6
 #: Largest mean of what the stages' polynomials leave out, nominal units; means err by a thousandth.
-STAGE_TOL = 1.5e-3
+STAGE_TOL = 2e-3
 
 
 def shares(strides: int) -> tuple[np.ndarray, np.ndarray]:

@@ -50,7 +50,7 @@ SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
 #: a step makes the regulator see; loads and faults that change in time have one in every step.
 JUMP_TOL = 3e-7
 NO_JUMP = 1e-6  # change of transition matrices that is none: tables err by 1e-8
-END_TOL = 1e-5  # nominal units: doubt about the state at the end, whose error is much smaller
+END_TOL = 3e-5  # nominal units: doubt about the state at the end, whose error is much smaller
 _PHASE = ("_a", "_b", "_c")
 _PHASES = 5  # rotor angles that tell the harmonics 0, 1, 2 apart
 

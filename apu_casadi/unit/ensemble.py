@@ -3,8 +3,8 @@
 Each member is the run that :func:`~apu_casadi.unit.multirate.simulate_joint` would make, bit for
 bit: it has its own events, loads, faults, health and noise, and stops, fails or warns by itself.
 What is shared is the evaluation of compiled blocks, several members at once, and the time that it
-takes; what a member does between blocks (steps after a switch, tables of a new fault, its dataset)
-it does as a single run does.
+takes, steps after a switch among them; what a member does between blocks (tables of a new fault,
+its dataset) it does as a single run does.
 
 Memory is that of a chunk of members, and of what is kept of each: let ``keep`` reduce the dataset
 where there are thousands.

@@ -3,8 +3,9 @@
 An integrator is made for one *phase*, a load and a fault, and asked for steps.  One that cannot
 take a step raises :class:`~apu_casadi.core.errors.NotApplicable` with the reason, and the next
 one is asked.  Exact propagation holds for a linear load, a speed that is held, a whole exchange
-step, and not right after a switch, when the windings settle within microseconds; CVODES and IDAS
-always can.  With a C compiler it is a hundred times faster than real time.
+step, and not right after a switch, when the windings settle within microseconds: there steps are
+taken stride by stride (:mod:`apu_casadi.machine.collocated`) where no waveforms are wanted; CVODES
+and IDAS always can.  With a C compiler it is a hundred times faster than real time.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from apu_casadi.core.errors import NotApplicable, SimulationError
 from apu_casadi.core.lanes.together import asking
 from apu_casadi.core.profiles.profile import Profile, Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
+from apu_casadi.core.sharing import keep
 from apu_casadi.gaspath.conditions import AMBIENT
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.unit import validity
@@ -31,6 +32,8 @@ from apu_casadi.unit.machines import Inputs, Machines
 from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Row
+
+STARTS = 16  # steady points of starts that are kept for a unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +97,21 @@ class Columns:
         return given, factors
 
 
+def _start(apu: Apu, here: Holding, *, settled: bool) -> JointPoint:
+    """Return the steady point of a start; that of runs that start alike is found once."""
+    loads: tuple[Any, ...] = tuple(here.loads)
+    faults = tuple(here.faults) if settled else None
+    if not settled:
+        loads = tuple(load.balanced_part for load in loads)
+    more = {} if here.N_ref is None else {"N_ref": here.N_ref}
+    key = (loads, faults, here.ambient, tuple(sorted(here.factors.items())), here.N_ref)
+
+    def found() -> JointPoint:
+        return apu.steady_state(loads, faults, ambient=here.ambient, health=here.factors, **more)
+
+    return keep(apu, JointPoint, key, found, limit=STARTS, locked=False)
+
+
 class JointRun:
     """The unit from its steady start on.
 
@@ -123,13 +141,7 @@ class JointRun:
     ) -> None:
         self.apu, self.asked, self.settings, self.rng = apu, asked, settings, rng
         self.now, self.here = asked.start, asked.start.at(0.0)  # as asked, and its numbers
-        there: tuple[Any, ...] = ([load.balanced_part for load in self.here.loads], None)
-        if asked.settled:
-            there = self.here.loads, self.here.faults
-        more = {} if self.here.N_ref is None else {"N_ref": self.here.N_ref}
-        self.point = apu.steady_state(
-            *there, ambient=self.here.ambient, health=self.here.factors, **more
-        )
+        self.point = _start(apu, self.here, settled=asked.settled)
         own: dict[str, Any] = {"end": float(asked.grid[-1]), "settled": asked.settled}
         own["changes"] = [e for e in asked.events if isinstance(e, LoadChange | FaultChange)]
         self.machines = Machines(apu, self.point, self.here, settings, asked.phasors, **own)

@@ -24,7 +24,7 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.lanes.together import OFTEN, Together, asking
+from apu_casadi.core.lanes.together import Together, asking
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
@@ -341,9 +341,8 @@ def _caller(
         name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
         function = block_function(machines, family.step, link, name, steps=steps, wide=wide)
         # single steps by tables are a tenth of a block
-        few = steps == 1 and not any(isinstance(m, Collocated) for m in machines)
-        often = OFTEN * BLOCK if few else OFTEN
-        return Together(function, function, Gradual(function, level=3, copy=False), often=often)
+        small = 1 if any(isinstance(m, Collocated) for m in machines) else BLOCK // steps
+        return Together(function, function, Gradual(function, level=3, copy=False), small=small)
 
     key = (link.structure, steps, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

@@ -26,6 +26,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import mul
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -39,7 +40,7 @@ from apu_casadi.core.errors import (
     ValidityWarning,
 )
 from apu_casadi.core.profiles.profile import Varying, at, later
-from apu_casadi.core.sharing import once
+from apu_casadi.core.sharing import keep, once
 from apu_casadi.core.units import RPM
 from apu_casadi.gaspath.gasgenerator import GasGenerator
 from apu_casadi.gaspath.steady.steadypoint import Limits, OperatingPoint
@@ -383,24 +384,21 @@ class FollowedRotor:
     def _driven(self, h: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Return the speeds after steps of lengths h by their disturbances."""
         low, high = self.link.governor.Wf_min, self.link.governor.Wf_max
-        m, v, speeds = self.state.size, np.append(self.state, [0.0, 1.0]), []
-        now = float(self._demand @ v)
+        speeds = list[float]()
+        now, state = float(self._demand @ [*self.state, 0.0, 1.0]), self.state.tolist()
         steps = np.round(h, 12).tolist()  # equal but for rounding: one exponential
-        last, move = math.nan, np.empty(0)
+        last, move = math.nan, list[list[float]]()
         for step, dist in zip(steps, d.tolist(), strict=True):
             if step != last:
-                last, move = step, self._move(step)
-            v[m] = dist
-            after = move.dot(v)
-            then = float(after[m])
-            if low < now < high and low < then < high:
-                v[:m] = after[:m]
-            else:
-                v[:m] = self._by_parts(v[:m], step, dist)
-                then = float(self._demand @ v)
-            now = then
-            speeds.append(float(v[0]))
-        self.state = v[:m].copy()
+                last, move = step, self._move(step).tolist()
+            v = (*state, dist, 1.0)  # so few numbers are quicker without arrays
+            *after, then = [sum(map(mul, row, v)) for row in move]
+            if not (low < now < high and low < then < high):
+                after = self._by_parts(np.array(state), step, dist).tolist()
+                then = float(self._demand @ [*after, dist, 1.0])
+            now, state = then, after
+            speeds.append(state[0])
+        self.state = np.array(state)
         return np.array(speeds)
 
     def _by_parts(self, state: np.ndarray, h: float, dist: float) -> np.ndarray:
@@ -428,6 +426,11 @@ def _law(governor: Governor) -> ca.Function:
 
 def _slopes(gg: GasGenerator, point: OperatingPoint) -> tuple[float, float]:
     """Return d(dN/dt)/dN, 1/s, and d(dN/dt)/dWf, (rad/s2)/(kg/s), at a steady point."""
+    key = tuple(np.asarray(a, float).tobytes() for a in (point.x, point.z, point.u, point.theta))
+    return keep(gg, _slopes, key, lambda: _slopes_at(gg, point), limit=16, locked=False)
+
+
+def _slopes_at(gg: GasGenerator, point: OperatingPoint) -> tuple[float, float]:
     x, u, theta = point.x, np.array(point.u, float), point.theta
     ode, slope, *_ = gg.cycle.dfdx(x, point.z, u, theta)
     u[0] *= 1 + (step := 1e-4)

@@ -129,7 +129,8 @@ class Together:
         fun: as compiled for one call.
         of: what it was compiled from, with dense inputs and outputs.
         one: evaluates one call, compiled or not; a ``Caller`` of ``fun`` if not given.  With it,
-            code in lanes is compiled after ``often`` calls only; a library that is there is loaded.
+            code in lanes is compiled after ``OFTEN`` calls only; a library that is there is loaded.
+        small: calls of it that cost as much as one of others; so many times ``OFTEN``.
     """
 
     def __init__(
@@ -138,13 +139,13 @@ class Together:
         of: ca.Function,
         one: Single | None = None,
         *,
-        often: int = OFTEN,
+        small: int = 1,
     ) -> None:
         self.fun: ca.Function = fun
         self.of: ca.Function = of
         self._one = one  # a member's own is never made where all ask
         self._in_lanes: Caller | None = None
-        self._left = self._often = 0 if one is None else often
+        self._left = self._often = 0 if one is None else small * OFTEN
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
     def __call__(self, *given: Any) -> tuple[np.ndarray, ...]:
@@ -256,7 +257,7 @@ class Together:
 
     def _ready(self) -> bool:
         """Whether lanes may be used: they are compiled, or the calls so far are worth it."""
-        if self._in_lanes is None and self._left == self._often > 0:
+        if self._in_lanes is None and self._left == self._often:
             made = in_lanes(self.of, build=False)
             if made.class_name() == "External":
                 self._in_lanes = Caller(made, copy=False)
