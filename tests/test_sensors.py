@@ -367,3 +367,29 @@ def test_a_prior_is_taken_and_a_wrong_state_named(drop, many):
     for name, words in (("f_eta", "did you mean 'f_eta_"), ("h_a", "h_a is a severity")):
         with pytest.raises(DataError, match=words):
             estimate(m, sensors=many, prior=Prior({name: 1.0}), backend="vm")
+
+
+def test_an_angle_is_read_modulo_a_turn(drop, tmp_path):
+    """Declared in a file, measured, recorded and estimated: as one that counts its turns.
+
+    What turns is a tenth of the speed, which is known to some 9 rad/s beforehand.
+    """
+    text = '[phase]\nquantity = "N"\nfactor = 0.1\nunit = "1"\nnoise = 0.5\n'
+    found = {}
+    for name, more in {"counts": "", "wrapped": "turn = 7.0\n"}.items():
+        path = tmp_path / f"{name}.toml"
+        path.write_text(text + more)
+        of = read_sensors(path)
+        recorded = measure_run(drop, Apu(), 3, sensors=of)["gaspath"]
+        found[name] = estimate(read_recording(recorded), only="gaspath", sensors=of)
+        found[f"{name} readings"] = recorded["phase"].values
+    turns = (found["counts readings"] - found["wrapped readings"]) / 7.0
+    assert np.allclose(turns, np.round(turns)) and np.ptp(found["wrapped readings"]) < 7.0
+    assert np.abs(found["wrapped readings"]).max() <= 3.5 < found["counts readings"].min()
+    counts, wrapped = found["counts"].gaspath, found["wrapped"].gaspath
+    assert np.allclose(wrapped["N"], counts["N"], rtol=1e-9)
+    assert np.allclose(wrapped["N_sigma"], counts["N_sigma"], rtol=1e-9)
+    plain = estimate(read_recording(measure_run(drop, Apu(), 3)["gaspath"]), only="gaspath")
+    assert float(wrapped["N_sigma"][-1]) < 0.8 * float(plain.gaspath["N_sigma"][-1])
+    with pytest.raises(ParameterError, match="has no gain, delay"):
+        Sensor("phase", 0.1, False, 0.1, "1", "", reads=("N",), turn=7.0, delay=0.1)

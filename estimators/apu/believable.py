@@ -278,17 +278,18 @@ def machine_causes(
         return onset_of(machine, sensors, samples, phase, within)
 
     rises = [
-        (side.t[k] - 2 * dt, float(side.t[m]), PHASES[i]) for m, k, i in severity_changes(side)
+        (side.t[k] - 2 * dt, float(side.t[m]), PHASES[i])
+        for m, k, i in severity_changes(side.beliefs)
     ]
     changes: list[tuple[float, str]] = []
     crept: dict[float, str] = {}
     for t, p in reports:
         # a small one makes no reset: it came before it was found, if it was not there before
         own = [r for r in resets if t - RECENT <= r <= t + 1e-9]
-        rose = [(a, b) for a, b, q in rises if p == q and b <= t + 1e-9]
-        begin = max(own) if own else came(p, *(rose[0] if rose else (t - SLOWLY, t)))
+        about = [(a, b) for a, b, q in rises if p == q and b <= t + 1e-9]
+        begin = max(own) if own else came(p, *(about[0] if about else (t - SLOWLY, t)))
         changes.append((begin, f"short circuit {p}"))
-        crept |= {begin: p} if rose and not own else {}
+        crept |= {begin: p} if about and not own else {}
     changes += [(t, "") for t in resets if t not in dict(changes)]
     for first, last, p in rises:
         if not _near(changes, first, last):

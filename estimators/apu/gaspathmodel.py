@@ -37,6 +37,7 @@ from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.gaspath.stations import THETA, U, X, Y
 from apu_casadi.unit.control import Governor, GovernorParameters
 from estimators.apu.sensors import GAS_PATH, Sensor
+from estimators.models.angles import angular
 from estimators.models.filtermodel import FilterModel, Unknown, augment
 
 __all__ = [
@@ -252,6 +253,8 @@ def gas_path_model(
     how |= {"biases": biases, "governed": governed, "power_jumps": power_jumps, "sensors": sensors}
     how["loss"] = loss
     made = _family(engines, **how).member(gg.held)
+    if angles := {s.name: s.turn for s in sensors if s.turn}:
+        made = angular(made, angles)
     return augment(made, dict(free)) if free else made
 
 

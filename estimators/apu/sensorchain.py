@@ -107,6 +107,7 @@ def disturbed(
             v = v + s.bias_mean + offset + s.drift * np.cumsum(steps)
         if s.quantum:
             v = s.quantum * np.round(v / s.quantum)
+        v = v - s.turn * np.floor(v / s.turn + 0.5) if s.turn else v
         out[n] = v if s.limits is None else np.clip(v, *s.limits)
     return out
 

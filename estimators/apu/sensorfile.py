@@ -69,6 +69,7 @@ KEYS = (
     Key("delay", "s", "by which a reading is older than its stamp", 0, 1e4),
     Key("jitter", "s", "standard deviation of the instant of each sample", 0, 1e4),
     Key("quantum", "", "step of the digits", 0, 1e12),
+    Key("turn", "", "period of an angle, which is read modulo it", 0, 1e12),
     Key("rate", "Hz", "of the readings; default: every instant that is sampled", 0, 1e12, True),
     Key("factor", "", "reading over quantity, in their units", -1e12, 1e12),
 )
@@ -82,7 +83,7 @@ _TEXTS |= {"clock": "what samples it: sensors of one clock share their jitter"}
 _ALL = (*_BY_NAME, *_SPANS, *_FLAGS, *_TEXTS)
 _OWN = {"lag": "tau", "range": "limits"}  # names of Sensor, where they differ
 _SI = {si for si, _, _ in UNITS.values()}
-_SCALED = ("bias", "bias_mean", "drift", "quantum")
+_SCALED = ("bias", "bias_mean", "drift", "quantum", "turn")
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,8 @@ def _in_si(name: str, given: dict[str, Any], base: Sensor) -> dict[str, Any]:
             raise DataError(f"{name}: noise of {new['noise']:g} times the reading: give its unit")
     elif new.get("relative", base.relative) != base.relative:
         raise DataError(f"{name}: relative without noise")
+    if half := new.get("turn", base.turn) / 2:
+        new.setdefault("plausible", (-half, half))
     if factor is not None:
         new |= {"factor": factor * scale, "unit": si}
         if si != base.unit:

@@ -65,7 +65,8 @@ def _itself(value: Any) -> Any:
 NUMBERS = ("1", "2", "3", "4")
 #: What a filter makes of a constant error: a state, one that is considered, or nothing.
 WAYS = ("estimated", "considered", "known")
-_POSITIVE = ("noise", "gain", "tau", "bias", "drift", "delay", "jitter", "quantum", "extra")
+_POSITIVE = ("noise", "gain", "tau", "bias", "drift", "delay", "jitter", "quantum", "turn", "extra")
+_NO_ANGLE = ("relative", "gain", "gain_mean", "tau", "delay", "jitter", "limits")
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,8 @@ class Sensor:
         clock: what samples it; sensors of one clock share their jitter.  "": its own.
         quantum: step of its digits, unit.
         limits: lowest and highest value that it can show, unit; there it saturates.
+        turn: of an angle, its period, unit: it shows what is within half of it of zero, and a
+            filter takes differences modulo it.  0: it is none.
         factor: reading over what it reads: ``unit`` over that of the output.
         fails: whether it can fail; hypotheses of failures are about those that can.
         extra: further white noise in a recording, unit: what jitter makes of its fastest change.
@@ -124,6 +127,7 @@ class Sensor:
     jitter: float = 0.0
     quantum: float = 0.0
     limits: tuple[float, float] | None = None
+    turn: float = 0.0
     factor: float = 1.0
     fails: bool = True
     extra: float = 0.0
@@ -146,6 +150,10 @@ class Sensor:
             if getattr(self, label) not in WAYS:
                 way = getattr(self, label)
                 raise ParameterError(f"sensor {self.name}: {label} {way!r} {nearest(way, WAYS)}")
+        if self.turn and (bad := [n for n in _NO_ANGLE if getattr(self, n)]):
+            raise ParameterError(
+                f"sensor {self.name}: an angle that is read modulo a turn has no {', '.join(bad)}"
+            )
         if self.drift and self.bias_as != "estimated":
             raise ParameterError(f"sensor {self.name}: a bias that drifts must be estimated")
         object.__setattr__(self, "reads", tuple(self.reads) or (self.name,))
@@ -218,7 +226,7 @@ class Sensor:
 
     def model(self) -> Sensor:
         """Return the sensor with what its equations hang on, its errors left out."""
-        kept = {n: getattr(self, n) for n in ("reads", "value", "tau", "factor")}
+        kept = {n: getattr(self, n) for n in ("reads", "value", "tau", "turn", "factor")}
         return Sensor(self.name, 0.0, self.relative, 0.0, self.unit, "", **kept)
 
 

@@ -31,7 +31,7 @@ from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.hypotheses import Hypotheses, SeverityPrior, loose_in_common
-from estimators.apu.electrical.smallchanges import following
+from estimators.apu.electrical.smallchanges import Beliefs, following
 from estimators.apu.electrical.terminalsignals import DELAY, PHASES_I, PHASES_V
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import (
@@ -157,19 +157,6 @@ def loosened(sensors: SensorSet) -> SensorSet:
         gain = s.unsure("gain") * float(size or 0.0) / math.sqrt(2)
         noise[s.name] = math.hypot(s.noise, gain, s.unsure("bias"))
     return sensors.change(**noise)
-
-
-class Beliefs(NamedTuple):
-    """Joint beliefs at the ends of n windows.
-
-    Args:
-        names: severities ``h_a``, mean power ``P``, W, and errors that the filter considers.
-        mean, cov: of these, (n, m) and (n, m, m).
-    """
-
-    names: tuple[str, ...]
-    mean: np.ndarray
-    cov: np.ndarray
 
 
 class _Windows(NamedTuple):

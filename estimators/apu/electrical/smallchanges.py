@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,10 +29,14 @@ from estimators.apu.electrical.terminalsignals import PHASES_I, PHASES_V
 from estimators.apu.electrical.tuning import FAULT_LEVEL
 from estimators.apu.sensors import SensorSet
 
-if TYPE_CHECKING:
-    from estimators.apu.electrical.electricalside import Beliefs, ElectricalSide
-
-__all__ = ["OffsetStep", "change_statistic", "following", "offset_steps", "severity_changes"]
+__all__ = [
+    "Beliefs",
+    "OffsetStep",
+    "change_statistic",
+    "following",
+    "offset_steps",
+    "severity_changes",
+]
 
 #: Windows between what is compared, and number of the later ones whose mean is.
 PAIRS = ((1, 1), (2, 1), (3, 2), (5, 2), (10, 5), (20, 10))
@@ -45,6 +49,19 @@ PERIODS = 10  # electrical periods over which an offset is averaged
 OFFSET = 8.0  # standard deviations of its change
 LASTING = 3  # windows in which it is there
 GAPS = 0.02  # share of missing samples, each of which adds some hundredths of an ampere
+
+
+class Beliefs(NamedTuple):
+    """Joint beliefs at the ends of n windows.
+
+    Args:
+        names: severities ``h_a``, mean power ``P``, W, and errors that the filter considers.
+        mean, cov: of these, (n, m) and (n, m, m).
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    cov: np.ndarray
 
 
 def change_statistic(of: Beliefs, lag: int, width: int, first: int = START) -> np.ndarray:
@@ -88,14 +105,17 @@ def _mean(x: np.ndarray, after: np.ndarray, upto: np.ndarray) -> np.ndarray:
     return np.asarray((total[upto + 1] - total[after + 1]) / n)
 
 
-def severity_changes(side: ElectricalSide) -> list[tuple[int, int, int]]:
+def severity_changes(of: Beliefs | None) -> list[tuple[int, int, int]]:
     """Return the rises of a severity that errors of gains do not explain, the first of each.
+
+    Args:
+        of: beliefs at the ends of the windows; None: of a filter without severities.
 
     Returns:
         Instants of the estimate, (by which it is sure, after which it came), and the phase, from 0.
     """
     out: list[tuple[int, int, int]] = []
-    begin, of = START, side.beliefs
+    begin = START
     while of is not None:
         z = np.array([change_statistic(of, *pair, begin) for pair in PAIRS])
         # where one falls, the other two rise by half against what all have in common

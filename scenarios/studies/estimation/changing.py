@@ -221,7 +221,7 @@ def _short(name: str, seed: int) -> dict[str, Any]:
     side, m = e.sides[1], e.machines[1]
     said = m["faulty_phase"].values.astype(int)
     alarms = [float(m["time"].values[k]) for k in 1 + np.flatnonzero(said[1:] > said[:-1])]
-    alarms += [float(side.t[k]) for k, _, _ in severity_changes(side)]
+    alarms += [float(side.t[k]) for k, _, _ in severity_changes(side.beliefs)]
     h, s = (m[f"h_{phase}{end}"].values for end in ("", "_sigma"))
     right = f"machine 1: short circuit {phase}"
     return _told(e, alarms, ONSET, right) | _scored(m["time"].values - ONSET, h, s, c)
