@@ -80,8 +80,7 @@ class FilterStep(Parametric):
             triangular factors L of the covariance L L'.
         wide: makes the same filter in square-root form, for beliefs whose covariance double
             precision does not hold; None where there is none.
-        rows: takes the step apart, for blocks whose lanes are rows; None where there is no such
-            form, or returns None.
+        rows: takes the step apart, for blocks whose lanes are rows; None, or returns it: no form.
     """
 
     model: FilterModel
@@ -389,13 +388,11 @@ def sweep_of(
     """Return the filter over parts of a recording; None if it is not carried by covariances."""
     if not in_halves(step.shared) or prior.root is not None or not step.model.y.names:
         return None
-    wide = step.wide is not None
-    if wide and narrow(prior.cov):
+    if (wide := step.wide is not None) and narrow(prior.cov):
         return None
-    by_rows = row_function(step.shared, backend, backend_in_use())
-    block = by_rows
-    if block is None:
-        block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
+    how_made = backend, backend_in_use()
+    by_rows = row_function(step.shared, *how_made)
+    block = by_rows or block_function(step.shared, False, cov_at is None, *how_made)[0]
     how: dict[str, Any] = {"wide": wide, "cov_at": cov_at, "remember": remember}
     return Sweep(step.model, block, data, step.full(data.p), rows=by_rows is not None, **how)
 

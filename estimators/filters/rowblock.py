@@ -18,7 +18,6 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import casadi as ca
@@ -27,7 +26,7 @@ from apu_casadi.core.backend import Code
 from apu_casadi.core.lanes.lanecode import Writer, number
 from apu_casadi.core.lanes.lanelibrary import flags_of, framed
 from apu_casadi.core.reciprocals import as_written, by_reciprocals
-from apu_casadi.core.sharing import once
+from apu_casadi.core.sharing import derived, once
 
 __all__ = ["SOME", "Rows", "row_block"]
 
@@ -188,22 +187,22 @@ class _Layout:
         """Vectors of a column of states."""
         return -(-self.nx // self.lanes)
 
-    @cached_property
+    @derived
     def entries(self) -> list[tuple[int, int, ca.SX]]:
         """Of F: row, column and expression."""
         return [*zip(*self.F.sparsity().get_triplet(), self.F.nonzeros(), strict=True)]
 
-    @cached_property
+    @derived
     def varying(self) -> list[tuple[int, int, ca.SX]]:
         """Those that are no constants."""
         return [e for e in self.entries if not e[2].is_constant()]
 
-    @cached_property
+    @derived
     def rows(self) -> list[list[int]]:
         """Columns of states that each row has entries in."""
         return [[j for i, j, _ in self.entries if i == r and j < self.nx] for r in range(self.nx)]
 
-    @cached_property
+    @derived
     def unit(self) -> list[int]:
         """The one state that is the row, as far as states go; -1: another row."""
         ones = {(i, j) for i, j, e in self.entries if e.is_constant() and float(e) == 1.0}
