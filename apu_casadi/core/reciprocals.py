@@ -7,18 +7,35 @@ the same few numbers again and again.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import casadi as ca
 
-__all__ = ["by_reciprocals"]
+__all__ = ["as_written", "by_reciprocals"]
 
 LEAST = 2  # quotients by a number from which its reciprocal pays
 
 
-def by_reciprocals(fun: ca.Function) -> ca.Function:
+@contextmanager
+def as_written() -> Iterator[None]:
+    """Let operations on symbols stay as they are written."""
+    before = ca.GlobalOptions.getSimplificationOnTheFly()
+    ca.GlobalOptions.setSimplificationOnTheFly(False)
+    try:
+        yield
+    finally:
+        ca.GlobalOptions.setSimplificationOnTheFly(before)
+
+
+def by_reciprocals(fun: ca.Function, *, least: int = LEAST) -> ca.Function:
     """Return an SX function in which a/b and c/b are a (1/b) and c (1/b).
 
     Its results differ from those of ``fun`` by some roundings.
+
+    Args:
+        fun: the function.
+        least: quotients by one number from which it is done.
     """
     steps = [
         (fun.instruction_id(k), fun.instruction_input(k), fun.instruction_output(k))
@@ -33,15 +50,9 @@ def by_reciprocals(fun: ca.Function) -> ca.Function:
         if op != ca.OP_OUTPUT:
             holds[o[0]] = k
     given = fun.sx_in()
-    # CasADi would make a (1/b) a/b again
-    before = ca.GlobalOptions.getSimplificationOnTheFly()
-    ca.GlobalOptions.setSimplificationOnTheFly(False)
-    try:
-        made = _rebuilt(
-            fun, given, steps, {k: b for k, b in divisor.items() if divides[b] >= LEAST}
-        )
-    finally:
-        ca.GlobalOptions.setSimplificationOnTheFly(before)
+    divisor = {k: b for k, b in divisor.items() if divides[b] >= least}
+    with as_written():  # CasADi would make a (1/b) a/b again
+        made = _rebuilt(fun, given, steps, divisor)
     how = {"is_diff_in": fun.is_diff_in()}
     return ca.Function(fun.name(), given, made, fun.name_in(), fun.name_out(), how)
 

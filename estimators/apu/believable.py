@@ -35,12 +35,12 @@ from scipy.special import ndtr, ndtri
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.creeping import Creep, creep, quiet_of
-from estimators.apu.electrical.causes import Causes, causes_of_change, onset_of
+from estimators.apu.electrical.causes import PRIOR, Causes, causes_of_change, onset_of
 from estimators.apu.electrical.residuals import field_steps, unexplained_waves
-from estimators.apu.electrical.smallchanges import offset_steps, severity_changes
-from estimators.apu.electrical.terminalsignals import PHASES_V
+from estimators.apu.electrical.smallchanges import OffsetStep, offset_steps, severity_changes
+from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
-from estimators.apu.gaspathmodel import engine_function
+from estimators.apu.gaspathmodel import DT, engine_function
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.apu.trust import GAS, Doubt, part_of, severity
 from estimators.information.innovationtests import Finding, findings, least
@@ -277,30 +277,60 @@ def machine_causes(
         within = max(first, t0), last
         return onset_of(machine, sensors, samples, phase, within)
 
+    rises = [
+        (side.t[k] - 2 * dt, float(side.t[m]), PHASES[i]) for m, k, i in severity_changes(side)
+    ]
     changes: list[tuple[float, str]] = []
+    crept: dict[float, str] = {}
     for t, p in reports:
-        own = [r for r in resets if t - RECENT <= r <= t + 1e-9]
         # a small one makes no reset: it came before it was found, if it was not there before
-        changes.append((max(own) if own else came(p, t - SLOWLY, t), f"short circuit {p}"))
+        own = [r for r in resets if t - RECENT <= r <= t + 1e-9]
+        rose = [(a, b) for a, b, q in rises if p == q and b <= t + 1e-9]
+        begin = max(own) if own else came(p, *(rose[0] if rose else (t - SLOWLY, t)))
+        changes.append((begin, f"short circuit {p}"))
+        crept |= {begin: p} if rose and not own else {}
     changes += [(t, "") for t in resets if t not in dict(changes)]
-    for sure, after, i in severity_changes(side):
-        if not _near(changes, float(side.t[after]) - dt, float(side.t[sure])):
-            first, last = (float(side.t[k]) for k in (after, sure))
-            changes.append((came(PHASES[i], first - 2 * dt, last), ""))
-    offsets = [s for s in offset_steps(samples, sensors) if not _near(changes, s.t - RECENT, s.t)]
-    known = [t for t, _ in changes] + [s.t for s in offsets]
+    for first, last, p in rises:
+        if not _near(changes, first, last):
+            changes.append((came(p, first, last), ""))
+            crept[changes[-1][0]] = p
+    offsets = offset_steps(samples, sensors)
+    alone = [o for o in offsets if not any(_of(o, t) for t, _ in changes)]
+    known = [t for t, _ in changes] + [o.t for o in alone]
     changes += [(t, "") for t in field_steps(samples, sensors, known)]
-    for s in offsets:
-        # as little probable otherwise as ``LEVEL``: no machine gives a direct current that lasts
-        name = f"sensor {s.name}"
-        found = Causes(s.t, {name: 1 - LEVEL, "healthy": LEVEL}, {name: {"bias": 1.0}})
-        yield found, _unsaid(found)
+    for o in alone:
+        yield _offset(o), _unsaid(_offset(o))
     for t, said in sorted(changes)[:MOST_CAUSES]:
-        weighed = causes_of_change(machine, sensors, samples, t)
-        if weighed is None:
+        failed = next((_offset(o) for o in offsets if _of(o, t)), None)
+        told = failed or causes_of_change(machine, sensors, samples, t)
+        if told is None:
             continue
+        if t in crept and told.best == "healthy":
+            told = _crept(t, crept[t])
         what = f"what is reported as a {said} at {t:g} s"
-        yield weighed, _rather(weighed, said, what) if said else _unsaid(weighed)
+        yield told, _rather(told, said, what) if said else _unsaid(told)
+
+
+def _of(step: OffsetStep, t: float) -> bool:
+    """Whether a change at an instant may be that of an offset."""
+    return step.t - DT <= t <= step.t + RECENT
+
+
+def _offset(step: OffsetStep) -> Causes:
+    """What a change of an offset is: no machine gives a direct current that lasts."""
+    name = f"sensor {step.name}"
+    return Causes(step.t, {name: 1 - LEVEL, "healthy": LEVEL}, {name: {"bias": 1.0}})
+
+
+def _crept(t: float, phase: str) -> Causes:
+    """What a severity's rise is that is too slow for the piece about any instant of it.
+
+    A gain of the phase's current that drifts looks alike under a load that is a resistance.
+    """
+    share = {f"short circuit {phase}": PRIOR["short circuit"] / len(PHASES)}
+    share[f"sensor i_{phase}"] = PRIOR["sensor"] / len(MEASURED)
+    shares = {n: (1 - LEVEL) * v / sum(share.values()) for n, v in share.items()}
+    return Causes(t, shares | {"healthy": LEVEL}, {f"sensor i_{phase}": {"drift": 1.0}})
 
 
 def _near(changes: Sequence[tuple[float, str]], first: float, last: float) -> bool:
@@ -329,7 +359,7 @@ def lost(why: Exception, first: Causes | None = None) -> Doubt:
 
 def _rather(found: Causes, said: str, what: str) -> Doubt | None:
     """The doubt about a report that its probability raises."""
-    if found.probability[said] >= SURELY:
+    if found.probability.get(said, 0.0) >= SURELY:
         return None
     text = f"{found.best} ({100 * found.probability[found.best]:.0f} %)"
     return Doubt("sensor", f"{what} is rather: {text}")

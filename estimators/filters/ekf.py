@@ -25,13 +25,16 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from apu_casadi.core.errors import ParameterError, nearest
+from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.sharing import kept, of_family, once
 from estimators.filters.algebra import backward, cholesky, forward, root_and_inverse, symmetric
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import STEP_IN, STEP_OUT, FilterResult, FilterStep, run
 from estimators.filters.rootfilter import ekf_root_step
+from estimators.filters.rowblock import Rows
 from estimators.filters.stepparts import (
     iterated_update,
     kind_of,
@@ -152,19 +155,29 @@ class _Factored(NamedTuple):
     B: Any
 
 
+def _rooted(H: ca.SX, PH: ca.SX, nu: ca.SX, R: ca.SX, measured: ca.SX) -> tuple[Any, ...]:
+    """S of an update and its root, inverses of the root's diagonal, L^-1 nu, NIS and likelihood."""
+    S = symmetric(H @ PH + ca.diag(R))
+    L, inverse = root_and_inverse(S)
+    a = forward(L, nu, inverse)
+    nis = ca.dot(a, a)
+    logdet = 2 * sum((ca.log(L[i, i]) for i in range(H.shape[0])), ca.SX(0))
+    loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
+    return S, L, inverse, a, nis, loglik
+
+
 def _factored(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) -> _Factored:
     """Update state and noise: with S = L L' and B = L^-1 H P, the covariance loses B'B.
 
     No Joseph form: of a sample far better than the belief, variances lose as many digits as it is
     better, see :data:`estimators.filters.filtering.WIDE`.  What is considered keeps its own.
     """
-    nx, n, ny = P.shape[0], H.shape[1], H.shape[0]
+    nx, n = P.shape[0], H.shape[1]
     there = R >= 0
-    H = ca.diag(there) @ H
+    H, measured = ca.diag(there) @ H, ca.sum1(there)
     PH = ca.vertcat(P @ H[:, :nx].T, H[:, nx:].T)
-    S = symmetric(H @ PH + ca.diag(ca.if_else(there, R, 1)))
-    L, inverse = root_and_inverse(S)
-    a, B = forward(L, there * nu, inverse), forward(L, PH.T, inverse)
+    S, L, inverse, a, nis, loglik = _rooted(H, PH, there * nu, ca.if_else(there, R, 1), measured)
+    B = forward(L, PH.T, inverse)
     d = B.T @ a
     off = symmetric(B.T @ B)
     held = list(fixed)
@@ -172,10 +185,36 @@ def _factored(P: ca.SX, H: ca.SX, nu: ca.SX, R: ca.SX, fixed: tuple[int, ...]) -
         d[held] = 0
         off[held, held] = 0
     Pa = ca.diagcat(P, ca.SX.eye(n - nx))
-    nis, measured = ca.dot(a, a), ca.sum1(there)
-    logdet = 2 * sum((ca.log(L[i, i]) for i in range(ny)), ca.SX(0))
-    loglik = -0.5 * (nis + logdet + measured * math.log(2 * math.pi))
     return _Factored(d, Pa - off, S, nis, loglik, measured, B)
+
+
+def _in_parts(model: FilterModel) -> Rows | None:
+    """The plain filter's step in parts, for blocks whose lanes are rows; None with bounds."""
+    if np.isfinite(model.lower).any() or np.isfinite(model.upper).any():
+        return None
+    nx, _, _, nw, ny = model.sizes
+    fixed = tuple(model.x.indices(model.consider))
+    m, _, u, p, y, R, dt = step_symbols(model, ca.SX)
+    outputs, forecast = linearisation(model, ca.SX, u, p, dt)
+    there = R >= 0
+    h, H, check = outputs(ca.vertcat(m, ca.SX.zeros(nw)), u, p)
+    e, H = model.innovation(y, h), ca.diag(there) @ H
+    told = ca.densify(ca.if_else(there, e, 0))
+    read = there * e, ca.vertcat(*H.nonzeros()), ca.if_else(there, R, 1), told, check
+    at = ca.SX.sym("at", nx + nw)
+    # what is considered stays as it is
+    s = ca.vertcat(*(m[i] if i in fixed else at[i] for i in range(nx + nw)))
+    ahead = forecast(s, u, p, dt)
+
+    H, PH = ca.SX.sym("H", H.sparsity()), ca.SX.sym("PH", nx, ny)
+    R1, nu, measured = ca.SX.sym("R", ny), ca.SX.sym("nu", ny), ca.SX.sym("measured")
+    whole = ca.vertcat(PH, H[:, nx:].T)
+    S, L, inverse, a, nis, loglik = _rooted(H, whole, nu, R1, measured)
+    out = [ca.densify(L), inverse, a, ca.diag(S), ca.vertcat(nis, loglik, measured)]
+    # a block divides by the diagonal of L once for each state
+    gain = by_reciprocals(ca.Function("gain", [H, PH, R1, nu, measured], ca.cse(out)), least=1)
+    parts = (m, at, u, p, y, R, dt), (*read, ca.sum1(there)), (*ahead,)
+    return Rows(*parts, gain, fixed, tuple((model.walk**2).tolist()))
 
 
 def _carried(P: ca.SX, F: ca.SX, B: ca.SX, fixed: tuple[int, ...]) -> tuple[ca.SX, ca.SX]:
@@ -251,7 +290,8 @@ def ekf_step(model: FilterModel, iterations: int = 1, iterated: str = "all") -> 
     name = f"ekf{suffix(iterations, iterated)}_{model.name}"
     function = ca.Function(name, [m, P, u, p, y, R, dt], out, STEP_IN, STEP_OUT)
     wide = partial(ekf_root_step, model, iterations, iterated)
-    return FilterStep(model, function, wide=wide)
+    rows = partial(_in_parts, model) if scalar else None
+    return FilterStep(model, function, wide=wide, rows=rows)
 
 
 def extended_kalman_filter(

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import compiled
+from apu_casadi.core.backend import READY, compiled, library
+from apu_casadi.core.lanes.lanelibrary import lanes_in_use
+from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.reciprocals import by_reciprocals
 from apu_casadi.core.sharing import kept, once
+from estimators.filters.rowblock import Rows, row_block
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "WIDE"]
+__all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "ROWS", "WIDE"]
 __all__ += ["block_function", "block_length", "block_of", "in_halves", "narrow", "packed_diagonal"]
-__all__ += ["padded", "unpacked"]
+__all__ += ["padded", "row_function", "unpacked"]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
+ROWS = 4 * BLOCK  # the same where a block's length costs nothing
 STEP_IN = ["m", "P", "u", "p", "y", "R", "dt"]
 STEP_OUT = ["m1", "P1", "m_f", "P_f", "C", "nu", "S", "stats"]
 """Of a step: belief before the sample, inputs, parameters, sample, variances (< 0: not measured),
@@ -51,6 +56,10 @@ class Step(Protocol):
     @property
     def gives_roots(self) -> bool:
         """Whether the step hands roots of covariances on."""
+
+    @property
+    def rows(self) -> Callable[[], Rows | None] | None:
+        """What takes the step apart for blocks whose lanes are rows."""
 
 
 def block_length(model: FilterModel) -> int:
@@ -206,7 +215,7 @@ def block_function(
     if not half:
         one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
         block = block_of(one, name, len(carried), short=block_length(step.model) < BLOCK)
-        return compiled(block, backend=backend), block
+        return points_in_lanes(block, backend=backend), block
     # what hangs on the parameters alone is evaluated once in a block
     out, symbols, constant = ca.extract_parametric(ca.cse(out), p)
     c, of_p = ca.vertcat(*symbols), ca.Function(f"{name}_constants", [p], [ca.vertcat(*constant)])
@@ -215,6 +224,20 @@ def block_function(
     of_halves = block_of(one, f"{name}_half", len(carried), short=block_length(step.model) < BLOCK)
     block = _whole(of_halves, of_p, name, len(carried), pattern)
     return compiled(block, backend=backend), block
+
+
+@kept
+def row_function(step: Step, backend: str | None, _in_use: str) -> ca.Function | None:
+    """Return ``ROWS`` steps compiled with rows as lanes; None where there is no such form.
+
+    See :func:`estimators.filters.rowblock.row_block`.
+    """
+    lanes, parts = lanes_in_use(), None if step.rows is None else step.rows()
+    if lanes == 1 or parts is None:
+        return None
+    code = row_block(f"{step.function.name()}_rows", parts, ROWS, lanes, padded=PADDED)
+    wanted = None if backend == READY else backend
+    return library(code, backend=wanted, build=backend != READY)
 
 
 def _whole(

@@ -37,8 +37,10 @@ from estimators.filters.filterblock import (
     narrow,
     packed_diagonal,
     padded,
+    row_function,
     unpacked,
 )
+from estimators.filters.rowblock import Rows
 from estimators.filters.sweeping import Piece, Sweep
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
@@ -78,12 +80,15 @@ class FilterStep(Parametric):
             triangular factors L of the covariance L L'.
         wide: makes the same filter in square-root form, for beliefs whose covariance double
             precision does not hold; None where there is none.
+        rows: takes the step apart, for blocks whose lanes are rows; None where there is no such
+            form, or returns None.
     """
 
     model: FilterModel
     function: ca.Function
     root: bool = False
     wide: Callable[[], FilterStep] | None = None
+    rows: Callable[[], Rows | None] | None = None
 
     def __post_init__(self) -> None:
         f, (nx, nu, np_, _, ny) = self.function, self.model.sizes
@@ -387,9 +392,12 @@ def sweep_of(
     wide = step.wide is not None
     if wide and narrow(prior.cov):
         return None
-    block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
+    by_rows = row_function(step.shared, backend, backend_in_use())
+    block = by_rows
+    if block is None:
+        block = block_function(step.shared, False, cov_at is None, backend, backend_in_use())[0]
     how: dict[str, Any] = {"wide": wide, "cov_at": cov_at, "remember": remember}
-    return Sweep(step.model, block, data, step.full(data.p), **how)
+    return Sweep(step.model, block, data, step.full(data.p), rows=by_rows is not None, **how)
 
 
 def result_of(

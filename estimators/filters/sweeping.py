@@ -18,12 +18,14 @@ from estimators.filters.belief import Belief
 from estimators.filters.filterblock import (
     BLOCK,
     PADDED,
+    ROWS,
     WIDE,
     block_length,
     narrow_ones,
     packed_diagonal,
     unpacked,
 )
+from estimators.filters.rowblock import SOME
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
@@ -69,6 +71,7 @@ class Sweep:
         data: the recording.
         p: parameters as the step takes them.
         wide: whether there is a form with roots to go on in.
+        rows: the block is one of :func:`~.filterblock.row_function`.
         cov_at: samples whose covariances are wanted, ascending; None: none.
         remember: what a piece has done is kept for another one from the same start.
     """
@@ -85,13 +88,15 @@ class Sweep:
         p: np.ndarray,
         *,
         wide: bool,
+        rows: bool = False,
         cov_at: np.ndarray | None = None,
         remember: bool = False,
     ) -> None:
-        self.model, self.data, self.wide, self._short = model, data, wide, cov_at is None
+        self.model, self.data, self.wide, self._rows = model, data, wide, rows
+        self._short = rows or cov_at is None  # variances only, and the last sample's covariance
         self._wanted = np.array([] if cov_at is None else cov_at, dtype=int)
         self._call = Caller(block, copy=False)
-        self._length, self._remember = block_length(model), remember
+        self._length, self._remember = ROWS if rows else block_length(model), remember
         self._call.inputs[-1].ravel(order="K")[:] = np.ravel(p)
         missing = np.isnan(data.y)
         self._y = np.where(missing, 0.0, data.y)
@@ -114,48 +119,50 @@ class Sweep:
             belief: at the first of them, before it.
             progress: called with what is done and all after each block.
         """
-        K, n, length = self.data.size, stop - start, self._length
+        K, n = self.data.size, stop - start
         nx, ny = belief.mean.size, self._y.shape[0]
-        # one sample more, of which nothing is told, for the belief about it
-        more = int(stop < K and n % length > 0)
         mean, var = np.empty((nx, n)), np.empty((nx, n))
         nu, S, stats = np.empty((ny, n)), np.empty((ny, n)), np.empty((_STATS, n))
         here = self._wanted[(self._wanted >= start) & (self._wanted < stop)] - start
         some, ends = np.empty((here.size, nx, nx)), []
+        edges = self._edges(n, here)
+        # one sample more, of which nothing is told, for the belief about it
+        more = int(stop < K and n - edges[-2] < self._length and not self._rows)
         call, first = self._call, 3 if self._short else 2
         given, made = call.inputs[:first], call.outputs
         m_f, P_f, *rest = made[first : first + 5]
-        rows = packed_diagonal(nx)
+        diagonal = slice(None) if self._short else packed_diagonal(nx)
         given[0][:], given[1][:] = belief.mean, belief.cov
         starts: list[tuple[np.ndarray, ...]] = []
-        done = judged = 0
+        block = judged = 0
         if self._last is not None and self._last[0] is belief and self._last[1] == start:
             # the same beginning: at the last block that is the same
             _, _, before, known = self._last
-            block = min((n - 1) // length, len(before) - 1)
-            done = judged = block * length
+            block = min(len(edges) - 2, len(before) - 1)
+            judged = edges[block]
             starts = before[:block]
             for target, source in zip((mean, var, nu, S, stats), known[:5], strict=True):
-                target[:, :done] = source[:, :done]
-            some[here < done] = known.some[: int((here < done).sum())]
+                target[:, :judged] = source[:, :judged]
+            some[here < judged] = known.some[: int((here < judged).sum())]
             _copy(before[block], given)
-        for at in range(done, n, length):
-            r = slice(at, min(at + length, n))
-            self._fill(start + r.start, start + r.stop, more if r.stop == n else 0)
+        every = 1 if self._rows else 4 * BLOCK // self._length
+        for b in range(block, len(edges) - 1):
+            r = slice(edges[b], edges[b + 1])
+            inside = slice(*np.searchsorted(here, (r.start, r.stop)))
+            ours = here[inside] - r.start
+            self._fill(start + r.start, start + r.stop, more if r.stop == n else 0, ours)
             if self._remember:
                 starts.append(tuple(a.copy() for a in given))
             call.evaluate()
             k = r.stop - r.start
-            mean[:, r] = m_f[:, :k]
-            var[:, r] = (P_f if self._short else P_f[rows])[:, :k]
+            mean[:, r], var[:, r] = m_f[:, :k], P_f[diagonal, :k]
             for target, source in zip((nu, S, stats), rest, strict=True):
                 target[:, r] = source[:, :k]
-            inside = slice(*np.searchsorted(here, (r.start, r.stop)))
-            if inside.stop > inside.start:
-                some[inside] = unpacked(P_f[:, here[inside] - r.start], nx)
-            if at // length % (4 * BLOCK // length) == 0:
+            if ours.size:
+                some[inside] = unpacked(made[8][:, : ours.size] if self._rows else P_f[:, ours], nx)
+            if b % every == 0:
                 ends.append(made[1].reshape(nx, nx).copy())
-            if at == 0 or at // length % _LOOK == 0 or r.stop == n:
+            if b % (_LOOK * BLOCK // self._length) == 0 or r.stop == n:
                 if not self._good(start, slice(judged, r.stop), (mean, var, S, stats), ends):
                     return None
                 judged, ends = r.stop, []
@@ -176,9 +183,21 @@ class Sweep:
             self._last = belief, start, starts, piece
         return piece
 
-    def _fill(self, start: int, stop: int, more: int) -> None:
+    def _edges(self, n: int, wanted: np.ndarray) -> list[int]:
+        """Return where blocks begin, and where the last one of n samples ends."""
+        if not self._rows:
+            return [*range(0, n, self._length), n]
+        # the covariance is looked at after the first ``BLOCK``, and after each ``ROWS`` from there
+        return sorted({0, *range(BLOCK, n, ROWS), *wanted[SOME::SOME].tolist(), n})
+
+    def _fill(self, start: int, stop: int, more: int, wanted: np.ndarray) -> None:
         """Put samples into the buffers, and what fills the block up."""
-        u, y, R, dt = self._call.inputs[-5:-1]
+        first = 3 if self._short else 2
+        u, y, R, dt = self._call.inputs[first : first + 4]
+        if self._rows:
+            keep = self._call.inputs[-2]
+            keep[:] = 0.0
+            keep.ravel()[wanted] = 1.0
         n, all_of = stop - start, slice(start, stop)
         for given, own in ((u, self.data.u), (y, self._y), (R, self._R), (dt, self._dt[None])):
             given[:, :n] = own[:, all_of]

@@ -28,6 +28,14 @@ WAVES = {f"{n}_{k}": unit for k in MACHINES for n, unit in UNITS.items()}
 """Unit of each column, generator by generator."""
 ENDING, FORMAT = ".nc", "application/x-netcdf"
 _SAMPLE = "sample"
+_IN_MEMORY: dict[str, Any] = {
+    "driver": "core",
+    "backing_store": False,
+    "rdcc_nbytes": 0,
+    "track_order": True,
+}
+"""Without a cache of chunks, which are written at the time of the garbage collection otherwise: in
+another order where threads of others run."""
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
@@ -62,15 +70,18 @@ def packed(parts: Sequence[dict[str, np.ndarray]], title: str) -> bytes:
         parts: of each run ``run``, ``time`` and the columns ``WAVES``.
         title: of the data set.
     """
-    ds, buffer = _described(parts, title), io.BytesIO()
-    with import_module("h5netcdf").File(buffer, "w") as f:
-        f.dimensions = dict(ds.sizes)
-        f.attrs.update(ds.attrs)
-        for name, v in ds.variables.items():
-            chunk = tuple(1 if d == GENERATOR else ds.sizes[d] for d in v.dims)
-            how = {"chunks": chunk, **_PACKED} if _SAMPLE in v.dims else {}
-            f.create_variable(name, v.dims, v.dtype, data=v.values, **how).attrs.update(v.attrs)
-    return buffer.getvalue()
+    ds = _described(parts, title)
+    h5py, h5netcdf = import_module("h5py"), import_module("h5netcdf")
+    with h5py.File(f"{id(ds)}", "w", **_IN_MEMORY) as image:
+        with h5netcdf.File(image, "w") as f:
+            f.dimensions = dict(ds.sizes)
+            f.attrs.update(ds.attrs)
+            for name, v in ds.variables.items():
+                chunk = tuple(1 if d == GENERATOR else ds.sizes[d] for d in v.dims)
+                how = {"chunks": chunk, **_PACKED} if _SAMPLE in v.dims else {}
+                f.create_variable(name, v.dims, v.dtype, data=v.values, **how).attrs.update(v.attrs)
+        image.flush()
+        return bytes(image.id.get_file_image())
 
 
 def frame(path: Path) -> Any:

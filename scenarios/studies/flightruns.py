@@ -3,7 +3,8 @@
 A unit runs at a steady load; at ``ONSET`` something fails.  The run is measured and estimated as a
 user does it.  Two statistics are followed: that of the test for jumps of the gas path's health
 (:class:`~estimators.apu.healthjumps.JumpTest`) and that of the severities, the largest (h/sigma)^2
-of the three phases.  Their thresholds are set afterwards, for any rate of false alarms.
+of the three phases, or that of a rise (:mod:`~estimators.apu.electrical.smallchanges`).  Their
+thresholds are set afterwards, for any rate of false alarms.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import FaultChange, HealthChange
 from apu_casadi.unit.multirate import simulate_joint
+from estimators.apu.electrical.smallchanges import PAIRS, change_statistic
 from estimators.apu.measuring import measure_run
 from estimators.apu.recorded_estimate import JUMPS, ROBUST, RecordedEstimate, estimate
 from estimators.apu.recordings.measured import read_recording
@@ -69,6 +71,10 @@ def statistics(e: RecordedEstimate) -> tuple[np.ndarray, np.ndarray]:
         z = np.max(np.maximum(h, 0.0) / s, axis=0) ** 2
         at = np.clip(np.searchsorted(side.t, r.t + 1e-9) - 1, 0, side.t.size - 1)
         electrical = np.maximum(electrical, z[at])
+        if side.beliefs is not None:
+            rises = [change_statistic(side.beliefs, *pair).max(0) for pair in PAIRS]
+            rose = np.append(0.0, np.maximum(np.max(rises, axis=0), 0.0)) ** 2
+            electrical = np.maximum(electrical, rose[at])
     return r.t, np.array([gas, electrical])
 
 

@@ -73,6 +73,12 @@ _PRELUDE = """
 #include <arm_neon.h>
 #endif
 #define L LANES
+/* after it code of other libraries, without AVX, is not slowed down by what registers still hold */
+#if defined(__AVX__)
+#define DONE _mm256_zeroupper();
+#else
+#define DONE
+#endif
 typedef double V __attribute__((vector_size(8*L)));
 typedef int64_t M __attribute__((vector_size(8*L)));
 #define IN static inline __attribute__((always_inline,unused))

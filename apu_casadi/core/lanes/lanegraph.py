@@ -113,7 +113,7 @@ class _Graph:
         for later in range(k + 1, self.n):
             if o in self.ins[later]:
                 g = self.nodes[later].which_function() if self.op[later] == ca.OP_CALL else None
-                if g is None or g.class_name() != "Map" or _columns(g)[1] != times:
+                if g is None or g.class_name() != "Map" or map_of(g)[1] != times:
                     return False
                 used = True
             if o in self.outs[later] and self.op[later] != ca.OP_OUTPUT:
@@ -434,7 +434,7 @@ def _own_code(fun: ca.Function) -> str:
     return text[text.index("static int casadi_f0(") :]
 
 
-def _columns(fun: ca.Function) -> tuple[ca.Function, int]:
+def map_of(fun: ca.Function) -> tuple[ca.Function, int]:
     """Return what a map evaluates, and for how many columns."""
     (inner,) = (fun.get_function(n) for n in fun.get_function())
     some = (j for j in range(fun.n_out()) if inner.nnz_out(j))
@@ -443,7 +443,7 @@ def _columns(fun: ca.Function) -> tuple[ca.Function, int]:
 
 def _mapped(writer: Writer, fun: ca.Function, name: str, fixed: Fixed) -> int:
     """Write a map, column by column."""
-    inner, count = _columns(fun)
+    inner, count = map_of(fun)
     done = writer.function(inner)
     steps = [0 if i in fixed else inner.nnz_in(i) for i in range(inner.n_in())]
     args = ",".join(f"a[{i}]+c*{n}" for i, n in enumerate(steps)) or "0"

@@ -42,7 +42,8 @@ from apu_casadi.core.lanes.lanecode import NoForm
 from apu_casadi.core.lanes.lanegraph import graph_writer
 from apu_casadi.core.sharing import BUILDING, keep, once
 
-__all__ = ["batch", "in_lanes", "lanes_in_use", "recalled", "source", "unsupported"]
+__all__ = ["batch", "digest", "flags_of", "framed", "in_lanes", "lanes_in_use", "recalled"]
+__all__ += ["source", "unsupported"]
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
@@ -81,7 +82,7 @@ def _widest() -> int:
 
 
 @once
-def _digest() -> str:
+def digest() -> str:
     """Tell one writer of code from another."""
     h = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -153,7 +154,7 @@ def recalled(
         return None
     fixed = tuple(sorted(common))
 
-    own = f"{recipe} {n} lanes {fixed} {_digest()}"
+    own = f"{recipe} {n} lanes {fixed} {digest()}"
     with suppress(NoForm):
         return load_library(
             own, build, lambda fun: _written(fun, n, fixed), compile_missing=compile_missing
@@ -181,9 +182,13 @@ def unsupported(fun: ca.Function) -> str:
 
 
 def _code(fun: ca.Function, n: int, common: tuple[int, ...]) -> Code:
-    content = f"{fun.name()} {n} {common} {_digest()}\n{fun.serialize()}"
-    flags = (*(FLAGS[n] if platform.machine() in _X86 else ()), *COMMON_FLAGS)
-    return Code(_name(fun, n), content, lambda: source(fun, n, common), flags)
+    content = f"{fun.name()} {n} {common} {digest()}\n{fun.serialize()}"
+    return Code(_name(fun, n), content, lambda: source(fun, n, common), flags_of(n))
+
+
+def flags_of(lanes: int) -> tuple[str, ...]:
+    """Return what the compiler is told for so many lanes."""
+    return (*(FLAGS[lanes] if platform.machine() in _X86 else ()), *COMMON_FLAGS)
 
 
 def _written(fun: ca.Function, n: int, common: tuple[int, ...]) -> Code:
@@ -218,6 +223,31 @@ EXPORT int NAME(const double**arg,double**res,I*iw,double*w,int mem){
 """
 
 
+def framed(
+    name: str,
+    names_in: Sequence[str],
+    names_out: Sequence[str],
+    inputs: Sequence[ca.Sparsity],
+    outputs: Sequence[ca.Sparsity],
+    work: int,
+) -> str:
+    """Return what CasADi asks a library for, up to the body of ``name(arg, res, iw, w, mem)``."""
+    words = {
+        "NAME": name,
+        "N_IN": str(len(names_in)),
+        "N_OUT": str(len(names_out)),
+        "NAMES_IN": ",".join(f'"{n}"' for n in names_in) or '""',
+        "NAMES_OUT": ",".join(f'"{n}"' for n in names_out) or '""',
+        "PATTERNS_IN": _patterns(inputs),
+        "PATTERNS_OUT": _patterns(outputs),
+        "WORK": str(work),
+    }
+    text = _FRAME
+    for key in sorted(words, key=len, reverse=True):  # NAMES_IN before NAME
+        text = text.replace(key, words[key])
+    return text
+
+
 def source(fun: ca.Function, lanes: int, common: Sequence[int] = ()) -> str:
     """Return the C code of a function for ``lanes`` points at once.
 
@@ -236,22 +266,11 @@ def source(fun: ca.Function, lanes: int, common: Sequence[int] = ()) -> str:
     outputs = [ca.repmat(fun.sparsity_out(j), 1, lanes) for j in range(n_out)]
     sizes_in, sizes_out = [*map(fun.nnz_in, range(n_in))], [*map(fun.nnz_out, range(n_out))]
     total = sum(sizes_in) + sum(sizes_out) + done.work
-    words = {
-        "NAME": _name(fun, lanes),
-        "N_IN": str(n_in),
-        "N_OUT": str(n_out),
-        "NAMES_IN": ",".join(f'"{n}"' for n in fun.name_in()) or '""',
-        "NAMES_OUT": ",".join(f'"{n}"' for n in fun.name_out()) or '""',
-        "PATTERNS_IN": _patterns(inputs),
-        "PATTERNS_OUT": _patterns(outputs),
-        "WORK": str((total + 1) * lanes),
-    }
-    text = _FRAME
-    for key in sorted(words, key=len, reverse=True):  # NAMES_IN before NAME
-        text = text.replace(key, words[key])
+    names = _name(fun, lanes), fun.name_in(), fun.name_out()
+    text = framed(*names, inputs, outputs, (total + 1) * lanes)
     before, after = _wide_call(sizes_in, sizes_out, wide)
     call = f"{done.name}(a,r,v);"
-    return "\n".join([writer.source(), text, *before, call, *after, "return 0;}", ""])
+    return "\n".join([writer.source(), text, *before, call, *after, "DONE return 0;}", ""])
 
 
 def _patterns(patterns: Sequence[ca.Sparsity]) -> str:

@@ -132,30 +132,37 @@ class _Piece:
     change: float
     backend: str | None
     failed: dict[str, dict[str, float]] = field(default_factory=dict)
+    # of these sensors and samples: another piece has its own
+    _made: dict[str, tuple[ElectricalFilter, Recording, Belief]] = field(
+        default_factory=dict, init=False
+    )
 
-    def filter(self, **how: Any) -> tuple[ElectricalFilter, Recording]:
-        """Return a filter and its recording."""
-        filt = electrical_filter(self.machine, sensors=self.sensors, gains="estimate", **how)
-        return filt, filt.recording(self.samples)
+    def filter(self, **how: Any) -> tuple[ElectricalFilter, Recording, Belief]:
+        """Return a filter, its recording and its prior: made once for all that it is run for."""
+        key = repr(sorted(how.items()))
+        if key not in self._made:
+            filt = electrical_filter(self.machine, sensors=self.sensors, gains="estimate", **how)
+            self._made[key] = filt, filt.recording(self.samples), filt.prior(self.samples)
+        return self._made[key]
 
     def run(
         self, change: Callable[[Recording, ElectricalFilter], Recording] | None = None, **how: Any
     ) -> tuple[FilterResult, Recording]:
         """Run a filter with a changed recording."""
-        filt, data = self.filter(**how)
+        filt, data, prior = self.filter(**how)
         data = data if change is None else change(data, filt)
-        prior = filt.prior(self.samples)
         return run(ekf_step(filt.model), prior, data, backend=self.backend), data
 
     def changed(
         self,
         filt: ElectricalFilter,
         data: Recording,
+        prior: Belief,
         cov: np.ndarray,
         shift: Mapping[str, float] | None = None,
     ) -> float:
         """Log-likelihood where the belief moves and opens at the change; from it on, if at once."""
-        prior, step, x = filt.prior(self.samples), ekf_step(filt.model), filt.model.x
+        step, x = ekf_step(filt.model), filt.model.x
         moved = np.array([(shift or {}).get(n, 0.0) for n in x.names])
         cut = int(np.searchsorted(data.t, self.change - 1e-9))
         if cut < 1:
@@ -170,9 +177,9 @@ class _Piece:
 
     def shorted(self, phase: str) -> float:
         """Log-likelihood of a short circuit that comes with the change, or was there before."""
-        filt, data = self.filter(phases=(phase,))
-        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in filt.model.x.names]
-        return self.changed(filt, data, np.diag(wide))
+        made = self.filter(phases=(phase,))
+        wide = [RESET_SIGMA.get(n, 0.0) ** 2 for n in made[0].model.x.names]
+        return self.changed(*made, np.diag(wide))
 
     def field(self, *, turns: bool) -> float:
         """Log-likelihood of shorted turns of the field, or of its current sensor that is off.
@@ -188,11 +195,11 @@ class _Piece:
         r_fd = self.machine.r_fd
         shift = {"gain_i_fd": ratio - 1}
         shift |= {"gain_V_fd": 1 / ratio - 1, "machine.r_fd": r_fd * (ratio - 1)} if turns else {}
-        filt, data = self.filter(phases=(), free={"machine.r_fd": Unknown()})
-        names = filt.model.x.names
+        made = self.filter(phases=(), free={"machine.r_fd": Unknown()})
+        names = made[0].model.x.names
         along = np.array([shift.get(n, 0.0) for n in names]) / (ratio - 1) * TURNS
         own = [LOOSE**2 * (n in shift and n.startswith("gain_")) for n in names]
-        found = self.changed(filt, data, np.outer(along, along) + np.diag(own), shift)
+        found = self.changed(*made, np.outer(along, along) + np.diag(own), shift)
         likely = math.log(2.0) if turns else 0.0  # turns only raise the current
         return found + likely - 0.5 * ((ratio - 1) / TURNS) ** 2
 

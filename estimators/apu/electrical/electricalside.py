@@ -31,6 +31,7 @@ from apu_casadi.machine.park import PHASES
 from apu_casadi.unit.apu import Apu
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, electrical_filter
 from estimators.apu.electrical.hypotheses import Hypotheses, SeverityPrior, loose_in_common
+from estimators.apu.electrical.smallchanges import following
 from estimators.apu.electrical.terminalsignals import DELAY, PHASES_I, PHASES_V
 from estimators.apu.electrical.tracking import track, window_power
 from estimators.apu.electrical.tuning import (
@@ -387,6 +388,9 @@ def electrical_side(
         said = slice(k - 1 - first, last - first)
         severities[0, i, k : last + 1] = one.mean[said, 0]
         severities[1, i, k : last + 1] = np.sqrt(one.cov[said, 0, 0])
+    # a phase that is found has a filter of its own, which began with the change
+    late = following(w.beliefs, severities[0]) * (phase != np.arange(1, 4)[:, None])
+    severities[1] = np.hypot(severities[1], late)
     severities[1] = np.hypot(
         severities[1], of_parameter(unknowns, "machine.r_s").sigma * severities[0]
     )

@@ -229,8 +229,9 @@ def _usual(share: np.ndarray, first: int) -> np.ndarray:
     out = np.full(share.size, math.inf)
     for k in range(max(first, 4), min(share.size, 21)):
         out[k] = np.median(share[1:k])
-    if share.size > 21:
-        out[21:] = np.median(sliding_window_view(share[1:-1], 20), axis=1)
+    begin = max(first, 21)
+    if share.size > begin:
+        out[begin:] = np.median(sliding_window_view(share[begin - 20 : -1], 20), axis=1)
     made: np.ndarray = np.fmax(out[first:], len(MEASURED))
     return made
 

@@ -38,9 +38,9 @@ STUDY = Study(
 A unit runs at 100 kW of each generator; after 0.8 s one thing fails, and 1 s is left to find it.
 The run is measured and estimated as a user does it, all gain errors included. Two statistics are
 followed: that of the test for jumps of the gas path's health, and the severities' largest
-(h/sigma)^2. A flight is an hour; each statistic has half of its one false alarm in a thousand. The
-thresholds are from healthy runs, of which the upper quarter of maxima is continued as an
-exponential tail (peaks over a threshold).
+(h/sigma)^2, of themselves or of what they rose by. A flight is an hour; each statistic has half of
+its one false alarm in a thousand. The thresholds are from healthy runs, of which the upper quarter
+of maxima is continued as an exponential tail (peaks over a threshold).
 
 @claim kappa
 joint | kappa of the pipeline's answers: nothing, gas path, short circuit, sensor
