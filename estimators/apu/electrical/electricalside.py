@@ -375,17 +375,20 @@ def electrical_side(
         said = slice(k - 1 - first, last - first)
         severities[0, i, k : last + 1] = one.mean[said, 0]
         severities[1, i, k : last + 1] = np.sqrt(one.cov[said, 0, 0])
-    # a phase that is found has a filter of its own, which began with the change
-    late = following(w.beliefs, severities[0]) * (phase != np.arange(1, 4)[:, None])
-    severities[1] = np.hypot(severities[1], late)
-    severities[1] = np.hypot(
-        severities[1], of_parameter(unknowns, "machine.r_s").sigma * severities[0]
-    )
+    _widen(severities, w.beliefs, phase, of_parameter(unknowns, "machine.r_s").sigma)
     # severities far from zero are not linear by a share of a few per cent
     misfit = np.append(0.0, may.misfit / (1 + 1e-3 * may.statistic.max(0)))
     result = filters.plain(base) if judged and gain_errors else w.result
     told = severities, probability, phase, misfit, tuple(w.resets), result, w.beliefs
     return ElectricalSide(t, tuple(courses), share, eta, *told)
+
+
+def _widen(severities: np.ndarray, beliefs: Beliefs, phase: np.ndarray, r_s: float) -> None:
+    """Let sigmas hold what the filter is behind a change, and the stator's resistance."""
+    # a phase that is found has a filter of its own, which began with the change
+    late = following(beliefs, severities[0]) * (phase != np.arange(1, 4)[:, None])
+    severities[1] = np.hypot(severities[1], late)
+    severities[1] = np.hypot(severities[1], r_s * severities[0])
 
 
 def _with_field(
