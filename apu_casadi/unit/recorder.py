@@ -350,7 +350,7 @@ class Recorder:
             more: signals of what stands in the run beside the own ones.
         """
         gg, y_sg, size = self.gg, apu.generator.state_space().y, len(self._by_number)
-        signals = [*RUN, *gg.Y, *phasor_signals(), *self.severities, *_powers(size), *more]
+        signals = [*RUN, *phasor_signals(), *self.severities, *_powers(size), *more]
 
         def measured(signal: Any, values: np.ndarray) -> dict[str, Any]:
             name = f"{signal.name}_meas"

@@ -24,7 +24,7 @@ import casadi as ca
 
 from apu_casadi.core.backend import Code
 from apu_casadi.core.lanes.lanecode import Writer, number
-from apu_casadi.core.lanes.lanelibrary import flags_of, framed
+from apu_casadi.core.lanes.lanelibrary import digest, flags_of, framed
 from apu_casadi.core.reciprocals import as_written, by_reciprocals
 from apu_casadi.core.sharing import derived, once
 
@@ -313,8 +313,9 @@ def _doubles(name: str, values: Sequence[float]) -> str:
 
 
 @once
-def _digest() -> str:
-    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+def _writer() -> str:
+    """Tell one writer of code from another: what is written here, and what lanes are written by."""
+    return digest() + hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
 
 
 def row_block(name: str, rows: Rows, length: int, lanes: int, *, padded: float) -> Code:
@@ -343,7 +344,7 @@ def row_block(name: str, rows: Rows, length: int, lanes: int, *, padded: float) 
     numbers |= {"NH": rows.gain.nnz_in(0), "NF": varying.shape[0], "HALF": half, "SOME": SOME}
     numbers |= {"NCONST": len(layout.entries) - len(layout.varying)}
     numbers |= {"WORK": 1 + max(f.sz_w() for f in functions.values())}
-    content = "\n".join([name, _digest(), *(f.serialize() for f in functions.values())])
+    content = "\n".join([name, _writer(), *(f.serialize() for f in functions.values())])
     content += f"{lanes} {padded} {numbers} {rows.walk} {rows.fixed}"
     each = [(n, length) for n in (nu, ny, ny, 1, 1)]
     ins = [(nx, 1), (nx, nx), (nx, nx), *each, (np_, 1)]
