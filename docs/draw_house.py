@@ -1,10 +1,13 @@
 """Draw the picture of docs/ARCHITECTURE.md again: ``python docs/draw_house.py`` (two seconds).
 
 Boxes are folders with their files and lines, counted now; an arrow says that a folder imports
-another one.  What is reached by way of others is left out.
+another one.  What is reached by way of others is left out.  ``--lines`` prints instead what lines
+are: the table below "Size".
 """
 
 import ast
+import sys
+from collections import Counter
 from pathlib import Path
 
 from scenarios.figures.figstyle import INK, LINE_INK, MUTED, STYLE, drawing, new_figure
@@ -76,6 +79,31 @@ def reduced(arrows: set[tuple[str, str]]) -> set[tuple[str, str]]:
     }
 
 
+def lines(path: Path) -> Counter[str]:
+    """Return how many lines of a file are of which kind."""
+    text = path.read_text(encoding="utf-8")
+    kinds = ["" if x.strip() else "blank" for x in text.splitlines()]
+    kinds = [
+        "comment" if x.strip().startswith("#") else kind
+        for x, kind in zip(text.splitlines(), kinds, strict=True)
+    ]
+    marks = []
+    for node in ast.walk(ast.parse(text)):
+        end = node.end_lineno if isinstance(node, ast.stmt) else 0
+        if isinstance(node, ast.FunctionDef):
+            marks.append(("signature", node.lineno, node.body[0].lineno - 1))
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            marks.append(("import", node.lineno, end))
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            marks.append(("import", node.lineno, end))
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            marks.append(("docstring", node.lineno, end))
+    for kind, first, last in marks:
+        for k in range(first - 1, last):
+            kinds[k] = kind if kind == "docstring" else kinds[k] or kind
+    return Counter(kind or "code" for kind in kinds)
+
+
 def main() -> None:
     """Write ``docs/images/house.png``."""
     sizes, arrows = measured()
@@ -123,4 +151,10 @@ def _rectangle(x: float, y: float, w: float, look: dict[str, object]) -> object:
 
 
 if __name__ == "__main__":
-    main()
+    if "--lines" in sys.argv:
+        for top in (*PACKAGES, "tests"):
+            files = sorted((ROOT / top).rglob("*.py"))
+            found = sum((lines(path) for path in files), Counter())
+            print(f"{top}: {len(files)} files, {found.total()} lines:", dict(found.most_common()))
+    else:
+        main()
