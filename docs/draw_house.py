@@ -36,6 +36,7 @@ scenarios.bench         0.70 7 0.28 times and targets
 scenarios.commands      0.00 8 0.98 the command line: parse, call, print
 """
 _TOP = ("schema", "campaigns", "campaign_records", "extensions", "reading", "fileschema")
+_IMPORTS = ("import ", "from ", "__all__")
 TOP = {f"scenarios.{n}" for n in _TOP}
 
 
@@ -82,26 +83,21 @@ def reduced(arrows: set[tuple[str, str]]) -> set[tuple[str, str]]:
 def lines(path: Path) -> Counter[str]:
     """Return how many lines of a file are of which kind."""
     text = path.read_text(encoding="utf-8")
-    kinds = ["" if x.strip() else "blank" for x in text.splitlines()]
-    kinds = [
-        "comment" if x.strip().startswith("#") else kind
-        for x, kind in zip(text.splitlines(), kinds, strict=True)
-    ]
-    marks = []
+    bare = [x.strip() for x in text.splitlines()]
+    kinds = ["blank" if not x else "comment" if x.startswith("#") else "code" for x in bare]
     for node in ast.walk(ast.parse(text)):
-        end = node.end_lineno if isinstance(node, ast.stmt) else 0
         if isinstance(node, ast.FunctionDef):
-            marks.append(("signature", node.lineno, node.body[0].lineno - 1))
-        elif isinstance(node, ast.Import | ast.ImportFrom):
-            marks.append(("import", node.lineno, end))
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            marks.append(("import", node.lineno, end))
+            kind, end = "signature", node.body[0].lineno - 1
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            marks.append(("docstring", node.lineno, end))
-    for kind, first, last in marks:
-        for k in range(first - 1, last):
-            kinds[k] = kind if kind == "docstring" else kinds[k] or kind
-    return Counter(kind or "code" for kind in kinds)
+            kind, end = "docstring", node.end_lineno
+        elif isinstance(node, ast.stmt) and bare[node.lineno - 1].startswith(_IMPORTS):
+            kind, end = "import", node.end_lineno
+        else:
+            continue
+        for k in range(node.lineno - 1, end):
+            if kind == "docstring" or kinds[k] == "code":
+                kinds[k] = kind
+    return Counter(kinds)
 
 
 def main() -> None:
