@@ -103,7 +103,7 @@ UNKNOWNS: dict[str, Knowledge] = {
     "machine.r_fd": Knowledge.temperature(20.0),
     EFFICIENCY: Knowledge("considered", ETA_SIGMA),
     DELAY.name: Knowledge("considered", DELAY_SIGMA),
-    INERTIA: Knowledge("estimated", 0.1),
+    INERTIA: Knowledge("considered", 0.1),
 }
 
 
