@@ -188,7 +188,7 @@ def _stepped(
     """The largest lasting change of the mean of windows, (W, per), beside the fundamental."""
     turned = basis.transpose(0, 2, 1)
     fit = np.linalg.solve(turned @ basis, turned @ y[:, :, None])
-    c, (W, per) = fit[:, 0, 0], y.shape
+    c, per = fit[:, 0, 0], y.shape[1]
     level = np.median(sliding_window_view(c, LASTING), axis=1)  # from each window on
     size = level[LASTING + 1 :] - level[: -LASTING - 1]  # after and before the windows between
     most = int(np.argmax(np.abs(size)))
