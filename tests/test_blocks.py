@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.unit.jointstep import BLOCK, JointBlock
+from apu_casadi.unit.jointstep import BLOCK, JointBlock, UnitState
 
 LIMIT = 1e-5
 
@@ -33,7 +33,7 @@ def block_that_counts(wrong_from):
 
 def followed(block, n):
     one = np.array([1.0])
-    return block.followed(one, one, (1.0,), [one], ([k] for k in range(n)))
+    return block.followed(UnitState(one, one, (1.0,)), [one], ([k] for k in range(n)))
 
 
 def test_a_row_of_blocks_ends_before_the_first_that_is_wrong():
@@ -41,8 +41,8 @@ def test_a_row_of_blocks_ends_before_the_first_that_is_wrong():
     done = followed(block, 5)
     assert calls == [0, 1, 2, 3]  # no more are tried
     assert done.y.shape == (3, 3 * BLOCK)
-    assert done.N == 4.0
-    assert done.governor == (4.0,)
+    assert done.state.N == 4.0
+    assert done.state.governor == (4.0,)
     assert done.machines[0].x == 4.0
     # what the first gave is not overwritten by those after it
     assert done.y[0, ::BLOCK].tolist() == [1.0, 2.0, 3.0]

@@ -207,7 +207,7 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
     dt = ca.MX.sym("dt")
     series = ca.MX.sym("series", len(PANELS) * 4 * n_P)
-    ranges = ca.MX.sym("range", 4)  # of the speed; and where the step lies in a longer one
+    ranges = ca.MX.sym("range", 2)  # of the speed
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
     s = (w - ranges[0]) / ranges[1]
     powers = ca.vertcat(1, s, s**2, s**3)
@@ -237,9 +237,8 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     rows = _constant_weights(d_, w_, t_, W.numel() // 2)
     weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
     means, before = hoisted("harmonics", [x, W, share], ca.vertcat(u, th), [terms])
-    shares = ranges[2] + ranges[3] * ca.DM(_shares()).T
     each = means.map("each", "serial", X.shape[1], [3], [])
-    sampled = each(X, weights(dt, w, X0[at]), shares, before(ca.vertcat(U, TH)))
+    sampled = each(X, weights(dt, w, X0[at]), ca.DM(_shares()).T, before(ca.vertcat(U, TH)))
     return ca.Function(
         f"means_{ss.name}",
         [X0, ca.vertcat(series, ranges), U, TH, dt],
@@ -278,7 +277,6 @@ class MeanStep(Rebuilt):
         u, theta: inputs and fault parameters; only w_r and V_ref may change afterwards.
         dt: length of every step, s.
         quad: what is averaged over the step, see :mod:`apu_casadi.core.means`.
-        within: where this step begins in a longer one, and which share of it it is; for weights.
         harmonics: of the rotor angle, at least so many; what has equal ones has equal layouts.
 
     Raises:
@@ -309,7 +307,6 @@ class MeanStep(Rebuilt):
         *,
         dt: float,
         quad: Sequence[str],
-        within: tuple[float, float] = (0.0, 1.0),
         harmonics: int = 0,
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
@@ -339,7 +336,7 @@ class MeanStep(Rebuilt):
             # terms, then powers, then entries
             series = [part.transpose(2, 0, 1).ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
-        self.parameters = np.concatenate([*series, self._range, within])
+        self.parameters = np.concatenate([*series, self._range])
         turn = None if self.constant else turn_of(dt, w_rated)  # panels are shares of the step
         self.layout = (ss.shared, self.quad, turn, self.harmonics)
         self.advance = _function(*self.layout)
@@ -372,7 +369,7 @@ class MeanStep(Rebuilt):
         else:
             terms = self.harmonics + 2, self.harmonics
             parts = [np.repeat(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
-        return np.concatenate([*parts, np.zeros(4)])
+        return np.concatenate([*parts, np.zeros(2)])
 
     def expect(self, jump: float) -> None:
         """Expect transition matrices that change by so much from step to step, nominal units."""

@@ -268,9 +268,9 @@ def periodic_step(
     trigs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
     sizes = 4 * 2 * trigs[0] * n_even, 4 * 2 * trigs[1] * n_odd
     X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
-    parameters, DT = ca.MX.sym("series", sum(sizes) + 4), ca.MX.sym("dt")
+    parameters, DT = ca.MX.sym("series", sum(sizes) + 2), ca.MX.sym("dt")
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
-    s = (w - parameters[-4]) / parameters[-3]
+    s = (w - parameters[-2]) / parameters[-1]
     theta0, stride = X0[at], 2 * math.pi / STRIDES
     # transition matrices of the strides in half a turn, the same for every half turn
     half_turn = STRIDES // 2
@@ -284,7 +284,7 @@ def periodic_step(
     length = DT / h_now
     weights = _end_weights(turn)(length)
     # beyond the end of the step the weight goes on as the polynomial that it is
-    shares = parameters[-2] + parameters[-1] * ca.DM(np.arange(turn.samples)).T / length
+    shares = ca.DM(np.arange(turn.samples)).T / length
     plain = weights[0, :] / length
     both = ca.vertcat(plain, plain * window(shares))
     angles = theta0 + stride * ca.DM(np.arange(half_turn + 1)).T

@@ -27,7 +27,7 @@ from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Event, FaultChange, Holding, Jump, LoadChange
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.integrators import Settings
-from apu_casadi.unit.jointstep import BLOCK, LONG, BlockResult
+from apu_casadi.unit.jointstep import BLOCK, LONG, BlockResult, UnitState
 from apu_casadi.unit.machines import Inputs, Machines
 from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
@@ -222,32 +222,32 @@ class JointRun:
     def _one_by_one(self, k: int, steps: int) -> tuple[int, Row]:
         """Go on by steps of one length, each a function of its own; by one right after a switch."""
         steps = steps if all(g.settled for g in self.machines.groups) else 1
-        grid, state = self.asked.grid[k : k + steps + 1], (self.x, self.z, self.governor)
-        done, made = self.machines.one_by_one(*state, self.u, self.theta, grid)
+        grid, state = self.asked.grid[k : k + steps + 1], UnitState(self.x, self.z, self.governor)
+        done, made = self.machines.one_by_one(state, self.u, self.theta, grid)
         return self._went_by(done, made, self.here.factors)
 
     def _blocks(self, k: int, steps: int) -> tuple[int, Row]:
         grid, factors = self.asked.grid[k : k + steps + 1], self.here.factors
-        state = self.x, self.z, self.governor
+        state = UnitState(self.x, self.z, self.governor)
         if self._changing:
             if self._columns is None:
                 self._columns = Columns(self.apu.gas_generator, self.now, self.here, self.shaft)
             middles = (grid[1:] + grid[:-1]) / 2
             unit, factors = self._columns(middles)
-            done, made = self.machines.follow(*state, unit, grid, self._middle)
+            done, made = self.machines.follow(state, unit, grid, self._middle)
             steps = done.y.shape[1]
             self._middle = float(middles[steps - 1])
             if steps < middles.size:
                 factors = {n: v[:steps] if np.ndim(v) else v for n, v in factors.items()}
         else:
-            done, made = self.machines.block(*state, self.u, self.theta, grid)
+            done, made = self.machines.block(state, self.u, self.theta, grid)
         return self._went_by(done, made, factors)
 
     def _went_by(
         self, done: BlockResult, made: list[MachineMade], factors: Mapping[str, Any]
     ) -> tuple[int, Row]:
         """Go on from the end of blocks."""
-        self.x, self.z, self.governor, self.slope = done.N, done.z, done.governor, 0.0
+        (self.x, self.z, self.governor), self.slope = done.state, 0.0
         self.y = done.y[:, -1].copy()
         return done.y.shape[1], self._row(done.y, made, factors)
 

@@ -59,19 +59,31 @@ class MachineBlock(NamedTuple):
     waves: np.ndarray
 
 
-class BlockResult(NamedTuple):
-    """What blocks of exchange steps gave.
+class UnitState(NamedTuple):
+    """States of the unit beside its generators' own.
 
     Args:
-        N, z, governor: states at the end: rotor speed (1,), cycle unknowns, governor.
-        y: gas generator's outputs after each step, shape (ny, steps); that of a single block is
-            overwritten by the thread's next one.
-        machines: the generators, each group of equal ones once.
+        N: rotor speed, rad/s, (1,).
+        z: unknowns of the cycle, where its solution starts.
+        governor: states of its law.
     """
 
     N: np.ndarray
     z: np.ndarray
     governor: tuple[float, ...]
+
+
+class BlockResult(NamedTuple):
+    """What blocks of exchange steps gave.
+
+    Args:
+        state: at the end.
+        y: gas generator's outputs after each step, shape (ny, steps); that of a single block is
+            overwritten by the thread's next one.
+        machines: the generators, each group of equal ones once.
+    """
+
+    state: UnitState
     y: np.ndarray
     machines: list[MachineBlock]
 
@@ -199,9 +211,7 @@ class JointBlock(Rebuilt):
 
     def __call__(
         self,
-        N: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
+        state: UnitState,
         u: np.ndarray,
         theta: np.ndarray,
         x_sg: Sequence[np.ndarray],
@@ -217,9 +227,9 @@ class JointBlock(Rebuilt):
         each = zip(u_sg, self.machines, self._links, strict=True)
         held = [a for u, m, link in each for a in (u, m.theta, link, m.parameters, m.dt)]
         if asking():
-            carry = np.concatenate([N, z, governor, *x_sg])
+            carry = np.concatenate([*state, *x_sg])
             return self._row(min(blocks, self._likely), carry, [u, full, *held])
-        return self.followed(N, z, governor, x_sg, repeat([u, full, *held], blocks))
+        return self.followed(state, x_sg, repeat([u, full, *held], blocks))
 
     def _row(self, blocks: int, carry: np.ndarray, held: Sequence[Any]) -> BlockResult:
         """Advance by a row of blocks, one question to the ensemble, up to the first not right."""
@@ -254,24 +264,19 @@ class JointBlock(Rebuilt):
         return self._parted(last[:, right - 1].copy(), part(0, right))
 
     def followed(
-        self,
-        N: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
-        x_sg: Sequence[np.ndarray],
-        held: Iterable[Sequence[Any]],
+        self, state: UnitState, x_sg: Sequence[np.ndarray], held: Iterable[Sequence[Any]]
     ) -> BlockResult:
         """Advance a block for each of ``held``, as far as they may go, and are right.
 
         Args:
-            N, z, governor: states of the unit.
+            state: at the start.
             x_sg: state of each group.
             held: all that :func:`block_function` takes beside the state.
 
         Raises:
             NotApplicable: the first is not; step by step it is decided why, and what to do.
         """
-        carry, most = np.concatenate([N, z, governor, *x_sg]), self._likely
+        carry, most = np.concatenate([*state, *x_sg]), self._likely
         lasts, made = list[np.ndarray](), list[tuple[np.ndarray, ...]]()
         for given in held:
             last, *out = self._call(carry, *given)
@@ -300,7 +305,7 @@ class JointBlock(Rebuilt):
             if sampled:
                 waves, *rest = rest
             groups.append(MachineBlock(x, means, w_r, waves))
-        return BlockResult(N, z, tuple(x_gov.tolist()), y, groups)
+        return BlockResult(UnitState(N, z, tuple(x_gov.tolist())), y, groups)
 
     def _seems_right(self, out: Sequence[np.ndarray]) -> bool:
         """Look at the largest error of a block only: all is checked for a row of them at once."""

@@ -27,7 +27,7 @@ from apu_casadi.unit.events import (
     who,
 )
 from apu_casadi.unit.integrators import WAVEFORMS, Settings
-from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock
+from apu_casadi.unit.jointstep import BLOCK, BlockResult, JointBlock, UnitState
 from apu_casadi.unit.machinestep import MachineMade, MachineStep
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
@@ -198,13 +198,7 @@ class Machines:
             group.accept(one, h)
 
     def block(
-        self,
-        x: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
-        u: np.ndarray,
-        theta: np.ndarray,
-        grid: np.ndarray,
+        self, state: UnitState, u: np.ndarray, theta: np.ndarray, grid: np.ndarray
     ) -> tuple[BlockResult, list[MachineMade]]:
         """Advance the whole unit over the exchange steps of blocks, as far as they go.
 
@@ -223,19 +217,13 @@ class Machines:
                 raise
         states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
         blocks = (grid.size - 1) // BLOCK
-        done = self._block(x, z, governor, u, theta, states, inputs, blocks)
+        done = self._block(state, u, theta, states, inputs, blocks)
         grid = grid[: done.y.shape[1] + 1]
         pairs = zip(self.groups, done.machines, strict=True)
         return done, [g.went_on(one, grid) for g, one in pairs]
 
     def one_by_one(
-        self,
-        x: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
-        u: np.ndarray,
-        theta: np.ndarray,
-        grid: np.ndarray,
+        self, state: UnitState, u: np.ndarray, theta: np.ndarray, grid: np.ndarray
     ) -> tuple[BlockResult, list[MachineMade]]:
         """Advance the whole unit over steps of one length, each a call of its own.
 
@@ -251,7 +239,7 @@ class Machines:
         block = self._one[1]
         block.machines = fast  # of the same layouts, for this length
         states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
-        done = block(x, z, governor, u, theta, states, inputs, grid.size - 1)
+        done = block(state, u, theta, states, inputs, grid.size - 1)
         grid = grid[: done.y.shape[1] + 1]
         each = zip(self.groups, fast, done.machines, strict=True)
         return done, [g.went_by_one(one, made, grid) for g, one, made in each]
@@ -263,13 +251,7 @@ class Machines:
             raise NotApplicable("the steps of a block are whole exchange steps")
 
     def follow(
-        self,
-        x: np.ndarray,
-        z: np.ndarray,
-        governor: tuple[float, ...],
-        unit: Inputs,
-        grid: np.ndarray,
-        before: float,
+        self, state: UnitState, unit: Inputs, grid: np.ndarray, before: float
     ) -> tuple[BlockResult, list[MachineMade]]:
         """Advance the whole unit over blocks whose inputs have a column for each step.
 
@@ -304,7 +286,7 @@ class Machines:
                     given += [now.u, now.theta, link, now.vector, one.dt]
                 yield given
 
-        done = self._wide[1].followed(x, z, governor, [g.x for g in self.groups], held())
+        done = self._wide[1].followed(state, [g.x for g in self.groups], held())
         n = done.y.shape[1]
         severe = [np.concatenate(kept, axis=1)[:, :n] for kept in severity]
         pairs = zip(self.groups, done.machines, severe, strict=True)
