@@ -30,6 +30,7 @@ from scipy.linalg import expm
 from apu_casadi.core.backend import backend_in_use
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.core.lanes.lanelibrary import lanes_in_use
 from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signals
@@ -551,7 +552,8 @@ class _Passes:
         steps = of_one_form([_with_roots(s) if self.rooted else s for s in self.steps])
         self.p = np.concatenate([step.full(self._p) for step in steps])
         first, *others = (step.shared for step in steps)
-        how = self.rooted, self.full, self.backend, backend_in_use()
+        in_use = f"{backend_in_use()} {lanes_in_use()}"
+        how = self.rooted, self.full, self.backend, in_use
         return Caller(_block(first, tuple(others), self.common, *how), copy=False)
 
     def block(self, *given: Any) -> list[np.ndarray]:
