@@ -17,11 +17,14 @@ import numpy as np
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import exciter_step, hoisted, leap
+from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import SPEED_RANGE, parity
 from apu_casadi.machine.weights import rippling, through
 
 STRIDES = 28  # strides in a turn, where coefficients are periodic: 14 in a period of what ripples
 PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
+#: Longest time, strides, in which the stator may settle behind the load and not be sampled.
+LAYER = 0.35
 _BACK = 8  # samples whose polynomial leads back to the start
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
 #: Samples before and after an end of the step that its share of the means is made of, and degrees
@@ -203,10 +206,16 @@ class _Pair:
         x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
         P = [ca.SX.sym("P", part.size, PACE) for part in (kinds.even, kinds.odd)]
         h, angle, weights = ca.SX.sym("h"), ca.SX.sym("angle"), ca.SX.sym("weights", 2, PACE)
+        #: (x, u, theta, length of a stride, weight of a first sample in it) -> (x as it settles,
+        #: what is averaged, terminal voltage), both with what passes by before
+        weight = ca.SX.sym("weight")
+        after, area = settled(ss, False)(x, u, th, LAYER * h)
+        first, _ = self._values(ss, after + area / (weight * h), u, th)
+        seen = V_of(after + area * (6 / (PACE * h)), u, th)[0]
+        given, made = [x, u, th, h, weight], [after, first, seen]
+        self.start = ca.Function("start", given, made, {"cse": True})
         x_now = ca.SX(x)
         x_now[ss.x.index("theta_e")] = angle
-        first = self._values(ss, x_now, u, th)
-        self.start = ca.Function("start", [x, u, th, angle], [*first, V_of(x_now, u, th)[0]])
         X, V_end = step(x_now, V, ca.vertcat(*map(ca.vec, P)), u, th, h)
         values = [self._values(ss, x_j, u, th) for x_j in ca.horzsplit(X)]
         terms = [self.weighted(v, weights[:, j]) for j, (v, _) in enumerate(values)]
@@ -288,8 +297,8 @@ def periodic_step(
     plain = weights[0, :] / length
     both = ca.vertcat(plain, plain * window(shares))
     angles = theta0 + stride * ca.DM(np.arange(half_turn + 1)).T
-    terms, V_first, V_now = pair.start(X0, U, TH, theta0)
-    x_k, V_k, samples, voltages = X0, ca.vertcat(V_now, 0, 0), [X0], [V_first]
+    x_k, terms, V_now = pair.start(X0, U, TH, h_now, weights[0, 0])
+    V_k, samples, voltages = ca.vertcat(V_now, 0, 0), [x_k], [V_now]
     first, *rest = ca.horzsplit(both, [0, *range(1, turn.samples + 1, PACE)])
     pairs = half_turn // PACE
     fixed = ca.vertcat(ca.repmat(ca.vertcat(U, TH, h_now), 1, pairs), angles[:-1:PACE])
