@@ -39,8 +39,8 @@ __all__ = [
 ]
 
 #: Windows between what is compared, and number of the later ones whose mean is.
-PAIRS = ((1, 1), (2, 1), (3, 2), (5, 2), (10, 5), (20, 10))
-BEFORE, FEWEST = 10, 3  # the earlier ones: at most, and at least
+PAIRS = ((1, 1), (2, 1), (3, 2), (6, 3), (10, 5), (20, 10))
+BEFORE, FEWEST = 20, 3  # the earlier ones: at most, and at least
 START = 5  # windows after which the filters have settled
 #: Statistic of a change that is followed, and of what it moves a severity by in a window, how many
 #: times that may still be missing: the filter that considers gains follows within some windows.
