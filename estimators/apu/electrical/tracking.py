@@ -25,6 +25,7 @@ from estimators.apu.electrical.tuning import (
     RESET_LEVEL,
     RESET_SIGMA,
     RESET_WINDOW,
+    RESETS_WITHIN,
     STEEP,
 )
 from estimators.filters.belief import Belief
@@ -83,7 +84,7 @@ def track(
 
     Args:
         filt, prior, data, step, backend: as of the filter; ``step`` makes its step.
-        max_resets: more than these, and the model is refused.
+        max_resets: more than these within ``RESETS_WITHIN``, and the model is refused.
         own_level: whether a window is compared with those before it (the first four are not judged)
             instead of with white innovations: where gain errors are considered (the default there),
             or taken as noise, each unit has a level of its own.
@@ -95,7 +96,7 @@ def track(
         three severities, and the final belief, hold what these have in common beside the claim.
 
     Raises:
-        EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
+        LostError: too many resets: the model does not fit the data at all.
     """
     own = filt.gains == "consider" if own_level is None else own_level
     pieces: list[FilterResult] = []
@@ -120,7 +121,7 @@ def track(
             pieces.append(turns.widened(now, r))
             prior, at = ahead, stop
             continue
-        if len(resets) == max_resets:
+        if sum(v > data.t[cut] - RESETS_WITHIN for v in resets) >= max_resets:
             raise LostError(resets, _lost(filt.model.name, resets, float(share[bad[0]])))
         if cut > at:
             r, prior = now.filtered(prior, at, cut)
