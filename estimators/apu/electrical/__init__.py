@@ -12,6 +12,7 @@ k_rf are then a ridge, mu = h (1 + k_rf)/(1 + h), and are reported as such.  A l
 - :mod:`estimators.apu.electrical.machinemodel`: errors of voltages, gains, leaky faults, jumps
 - :mod:`estimators.apu.electrical.electricalfilter`: the filter, its recordings and its start
 - :mod:`estimators.apu.electrical.tracking`: faults that come and go; mean power
+- :mod:`estimators.apu.electrical.growing`: faults that grow
 - :mod:`estimators.apu.electrical.faults`: which phase, how much, what cannot be told
 - :mod:`estimators.apu.electrical.hypotheses`: a short circuit that may be there
 - :mod:`estimators.apu.electrical.electricalside`: what is handed to the gas path

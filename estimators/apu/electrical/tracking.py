@@ -5,22 +5,27 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from apu_casadi.core.errors import EstimationError
+from apu_casadi.core.signals import Signals
 from apu_casadi.machine.terminals import SHUNTS
 from estimators.apu.electrical.electricalfilter import ElectricalFilter, considering
+from estimators.apu.electrical.growing import Moving, can_grow, growing, motion, opened, rested
 from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.terminalsignals import MEASURED
 from estimators.apu.electrical.tuning import (
     H_BALANCED,
     ONSET_LEVEL,
+    RATE_SIGMAS,
     RESET_LEVEL,
     RESET_SIGMA,
     RESET_WINDOW,
+    STEEP,
 )
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
@@ -62,12 +67,15 @@ def track(
     cov_at: np.ndarray | None = None,
     common: float = H_BALANCED,
 ) -> tuple[FilterResult, list[float]]:
-    """Filter a recording in which faults come and go: h follows steps at once.
+    """Filter a recording in which faults come, grow and go: h follows steps and rises at once.
 
     The random walk of h is for slow changes; a step of 1e-3 would take it 0.2 s.  So the
     innovations are watched: where their normalised square, averaged over ``RESET_WINDOW`` samples,
     exceeds ``RESET_LEVEL``, h and fluxes become uncertain again at the window's start
     (``RESET_SIGMA``).  The first two windows of a piece are not judged: a start needs them.
+
+    With exact sensors severities are watched as well: while they move, their rates are states, see
+    :mod:`.growing`.
 
     Where gains are estimated, they are considered from the first reset on, with what is known then:
     during the transient of a fault they are learnt falsely, by 18 to 48 claimed deviations, and h
@@ -90,42 +98,215 @@ def track(
         EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
     """
     own = filt.gains == "consider" if own_level is None else own_level
-    made, model = step(filt.model), filt.model
     pieces: list[FilterResult] = []
-    sweep = _sweep(made, prior, data, cov_at, backend)
+    base = now = _Stage.of(filt, step, prior, data, cov_at, backend)
+    turns = _Turns(base, step)
     resets: list[float] = []
     share = np.zeros(0)  # mean NIS of the windows since the last reset
     at = 0
     while at < data.size:
         stop = min(at + CHUNK, data.size)
-        r, ahead = _filtered(made, sweep, prior, data, at, stop, cov_at, backend)
+        r, ahead = now.filtered(prior, at, stop)
         judged, share = share.size, np.append(share, _window_means(r.nis))
         bad = _unusual(share, judged, own=own)
-        if not bad.size:
-            pieces.append(r)
+        cut = at + _onset(r.nis, (int(bad[0]) - judged) * RESET_WINDOW) if bad.size else None
+        turn = turns.turn(now, r, prior, at, cut)
+        if turn is not None:
+            pieces.append(turns.widened(now, now.filtered(prior, at, turn.at)[0]))
+            now, prior, at, share = turn.to, turn.prior, turn.at, np.zeros(0)
+            continue
+        if cut is None:
+            pieces.append(turns.widened(now, r))
             prior, at = ahead, stop
             continue
         if len(resets) == max_resets:
-            raise LostError(
-                resets,
-                f"{model.name}: {max_resets} resets up to t = {resets[-1]:.6g} s and still "
-                f"the innovations are {share[bad[0]]:.3g} times what they should be: the model "
-                "does not fit these data: a fault branch with leakage of its own, which "
-                "electrical_filter(kappa=..., phase=...) knows; other parameters; or sensor faults",
-            )
-        cut = at + _onset(r.nis, (int(bad[0]) - judged) * RESET_WINDOW)
+            raise LostError(resets, _lost(filt.model.name, resets, float(share[bad[0]])))
         if cut > at:
-            r, prior = _filtered(made, sweep, prior, data, at, cut, cov_at, backend)
-            pieces.append(r)
-        prior = Belief(model.x, prior.mean, prior.cov + _opened(filt, common))
+            r, prior = now.filtered(prior, at, cut)
+            pieces.append(turns.widened(now, r))
+        wider = prior.cov + _opened(now.filt, common)
+        prior = Belief(prior.x, prior.mean, wider)
         resets.append(float(data.t[cut]))
         if filt.gains == "estimate":
             filt = considering(filt)
-            made, model = step(filt.model), filt.model
-            sweep = _sweep(made, prior, data, cov_at, backend)
+            now = _Stage.of(filt, step, prior, data, cov_at, backend)
             own = own_level is None or own_level
         share, at = np.zeros(0), cut
-    return _loosened(filt, _joined(pieces)), resets
+        turns.begin(at)
+    return _loosened(filt, _joined([_narrowed(r, base.filt.model.x) for r in pieces])), resets
+
+
+def _lost(name: str, resets: Sequence[float], size: float) -> str:
+    """Say that more resets are wanted than are likely."""
+    return (
+        f"{name}: {len(resets)} resets up to t = {resets[-1]:.6g} s and still the innovations are "
+        f"{size:.3g} times what they should be: the model does not fit these data: a fault branch "
+        "with leakage of its own, which electrical_filter(kappa=..., phase=...) knows; other "
+        "parameters; or sensor faults"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """A filter over parts of a recording, each of which begins where one has ended.
+
+    Args:
+        filt: the filter.
+        made: its step.
+        sweep: carries covariances over the recording; None where they are not.
+        data, cov_at, backend: as of :func:`track`.
+    """
+
+    filt: ElectricalFilter
+    made: FilterStep
+    sweep: Sweep | None
+    data: Recording
+    cov_at: np.ndarray | None
+    backend: str | None
+
+    @classmethod
+    def of(
+        cls,
+        filt: ElectricalFilter,
+        step: StepMaker,
+        prior: Belief,
+        data: Recording,
+        cov_at: np.ndarray | None,
+        backend: str | None,
+    ) -> _Stage:
+        """Make it, with a sweep about a first belief."""
+        made = step(filt.model)
+        free = not (np.isfinite(filt.model.lower).any() or np.isfinite(filt.model.upper).any())
+        sweep = sweep_of(made, prior, data, cov_at, backend, remember=True) if free else None
+        return cls(filt, made, sweep, data, cov_at, backend)
+
+    def filtered(self, prior: Belief, start: int, stop: int) -> tuple[FilterResult, Belief]:
+        """Filter samples from start up to stop, and return the belief at stop before its sample."""
+        data, cov_at = self.data, self.cov_at
+        piece = None if self.sweep is None else self.sweep.piece(start, stop, prior)
+        if piece is not None:
+            r = result_of(self.made.model, data, start, piece, cov_at is not None)
+            return r, piece.ahead or r.final
+        more = stop < data.size
+        part = data.part(start, stop + more)
+        y = part.y.copy()
+        if more:
+            y[:, -1] = np.nan
+        here = None if cov_at is None else cov_at[(cov_at >= start) & (cov_at < stop)] - start
+        part = dataclasses.replace(part, y=y)
+        r = run(self.made, prior, part, cov_at=here, backend=self.backend)
+        return _piece(r, stop - start), r.final
+
+
+class _Turn(NamedTuple):
+    """From sample ``at`` on another filter, and the belief it begins with."""
+
+    at: int
+    to: _Stage
+    prior: Belief
+
+
+class _Turns:
+    """When the filter of constant severities gives way to that of growing ones, and back.
+
+    Where growth cannot be told, never.
+
+    Args:
+        base: the former.
+        step: makes a filter's step.
+    """
+
+    def __init__(self, base: _Stage, step: StepMaker) -> None:
+        self.base, self.step = base, step
+        self.able = can_grow(base.filt)
+        self.rows = base.filt.model.x.indices(SHUNTS.names) if self.able else []
+        self.begin(0)
+
+    def begin(self, at: int) -> None:
+        """Begin anew, at a sample from which on nothing is known of what was before."""
+        self.begun = at
+        self.last: tuple[int, Belief, Moving] | None = None
+
+    def widened(self, now: _Stage, r: FilterResult) -> FilterResult:
+        """Return what the filter that runs said, with what it may be behind."""
+        if not self.able or now is not self.base:
+            return r
+        variance = r.variance.copy()
+        variance[self.rows] += self.behind[:, : r.t.size] ** 2
+        return dataclasses.replace(r, variance=variance)
+
+    def turn(
+        self, now: _Stage, r: FilterResult, prior: Belief, at: int, cut: int | None
+    ) -> _Turn | None:
+        """Return whether, and where, the filter that runs gives way to the other one.
+
+        Args:
+            now: the filter that runs.
+            r: what it said from sample ``at`` on.
+            prior: its belief there.
+            cut: where it is reset; just before that nothing else is done.
+        """
+        if not self.able:
+            return None
+        here = Moving(r.t, r.mean[self.rows], r.variance[self.rows])
+        start, before, seen = self.last or (at, prior, here)
+        seen = seen if self.last is None else seen.then(here)
+        self.last = at, prior, here
+        # of its beginning a filter learns for two windows
+        first = max(at, self.begun + 2 * RESET_WINDOW) - start
+        end = self.base.data.size if cut is None else cut
+        if now is not self.base:
+            return self._left(
+                now, r, prior, at, start + rested(seen, max(self.begun - start, 0)), end
+            )
+        found = motion(seen, float(now.filt.model.walk[self.rows[0]]), first)
+        self.behind = found.behind[:, at - start :]
+        if found.at is None or start + found.at >= end:
+            return None
+        k, j = start + found.at, start + found.at - found.span
+        if j > start:
+            _, before = now.filtered(before, start, j)
+        return self._entered(before, j, k, found.rate)
+
+    def _entered(self, belief: Belief, start: int, at: int, rate: float) -> _Turn:
+        """Return the turn to growing severities, of which a rate began to show at a start."""
+        filt = growing(self.base.filt, rate)
+        belief = opened(belief, filt.model.x)
+        how = self.base.data, self.base.cov_at, self.base.backend
+        stage = _Stage.of(filt, self.step, belief, *how)
+        if at > start:
+            _, belief = stage.filtered(belief, start, at)
+        self.begin(at)
+        return _Turn(at, stage, belief)
+
+    def _left(
+        self, now: _Stage, r: FilterResult, prior: Belief, at: int, rest: int, end: int
+    ) -> _Turn | None:
+        """Return the turn from growing severities, to constant ones or to steeper growth."""
+        x = self.base.filt.model.x
+        rates = r.mean[len(x) :]
+        over = np.flatnonzero(np.abs(rates).max(0) > STEEP)
+        slow = now.filt.model.x[-1].nominal == RATE_SIGMAS[0]
+        steeper = at + int(over[0]) if over.size and slow else rest
+        k = min(steeper, rest)
+        if k >= end:
+            return None
+        belief = now.filtered(prior, at, k)[1].marginal(x.names)
+        if k < rest:
+            return self._entered(belief, k, k, math.inf)
+        self.begin(k)
+        return _Turn(k, self.base, belief)
+
+
+def _narrowed(r: FilterResult, x: Signals) -> FilterResult:
+    """Return a result without states beyond those of x."""
+    n = len(x)
+    if len(r.x) == n:
+        return r
+    final = Belief.found(x, r.final.mean[:n], r.final.cov[:n, :n])
+    some = None if r.some_cov is None else r.some_cov[:, :n, :n]
+    mean, variance = r.mean[:n], r.variance[:n]
+    return dataclasses.replace(r, x=x, mean=mean, variance=variance, final=final, some_cov=some)
 
 
 def _loosened(filt: ElectricalFilter, r: FilterResult) -> FilterResult:
@@ -164,44 +345,6 @@ def _opened(filt: ElectricalFilter, common: float) -> np.ndarray:
         rows = np.ix_(*[x.indices(SHUNTS.names)] * 2)
         out[rows] -= (RESET_SIGMA[SHUNTS.names[0]] ** 2 - common**2) / 3
     return out
-
-
-def _sweep(
-    made: FilterStep,
-    prior: Belief,
-    data: Recording,
-    cov_at: np.ndarray | None,
-    backend: str | None,
-) -> Sweep | None:
-    """Return the filter over parts of the recording, each of which begins where one has ended."""
-    m = made.model
-    free = not (np.isfinite(m.lower).any() or np.isfinite(m.upper).any())
-    return sweep_of(made, prior, data, cov_at, backend, remember=True) if free else None
-
-
-def _filtered(
-    made: FilterStep,
-    sweep: Sweep | None,
-    prior: Belief,
-    data: Recording,
-    start: int,
-    stop: int,
-    cov_at: np.ndarray | None,
-    backend: str | None,
-) -> tuple[FilterResult, Belief]:
-    """Filter samples from start up to stop, and return the belief at stop before its sample."""
-    piece = None if sweep is None else sweep.piece(start, stop, prior)
-    if piece is not None:
-        r = result_of(made.model, data, start, piece, cov_at is not None)
-        return r, piece.ahead or r.final
-    more = stop < data.size
-    part = data.part(start, stop + more)
-    y = part.y.copy()
-    if more:
-        y[:, -1] = np.nan
-    here = None if cov_at is None else cov_at[(cov_at >= start) & (cov_at < stop)] - start
-    r = run(made, prior, dataclasses.replace(part, y=y), cov_at=here, backend=backend)
-    return _piece(r, stop - start), r.final
 
 
 def _window_means(nis: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@ __all__ = [
     "DELAY_SIGMA",
     "FAULT_LEVEL",
     "FLUX_WALK",
+    "GROWTH_LEVEL",
+    "GROWTH_SPANS",
     "HARMONIC_PERIODS",
     "H_BALANCED",
     "H_BALANCED_CONSIDERED",
@@ -22,14 +24,20 @@ __all__ = [
     "LEAKY_START",
     "LEAKY_WALK",
     "LEAST_SUSCEPTANCE",
+    "MOTION_SEEN",
     "ONSET_LEVEL",
+    "RATE_MEMORY",
+    "RATE_SIGMAS",
     "RELEASE_LEVEL",
     "RESET_LEVEL",
     "RESET_SIGMA",
     "RESET_WINDOW",
+    "REST_LEVEL",
+    "REST_SPAN",
     "SMOOTH_LIMIT",
     "START_SIGMA",
     "START_SIGMA_SHUNT",
+    "STEEP",
 ]
 
 #: Random walk of each h, 1/sqrt(s).  A sample tells h to some 3e-5 (225 kW), so the filter averages
@@ -122,6 +130,23 @@ RESET_SIGMA = {
     **dict.fromkeys(("g_shunt", "b_shunt"), 1e-2),
     "i_shunt": 50.0,
 }
+#: A severity moves where what it moved by over one of these numbers of samples has a normalised
+#: square above this: of noise 25 is passed by none in 150 s of healthy operation, 20 once in 8 s.
+GROWTH_SPANS = (15, 30, 60, 120, 250, 500, 1000)
+GROWTH_LEVEL = 22.0
+#: It may be behind a motion from this on: in noise 0.5 % of the instants.  The growth by 0.016 a
+#: second is 14 claimed standard deviations ahead by then, which no earlier level of a filter as
+#: sharp avoids, and 25 where it is certain.
+MOTION_SEEN = 9.0
+#: It rests where over this many samples it has moved by less than this times its variances.
+REST_SPAN = 1000
+REST_LEVEL = 4.0
+#: Rates of severities that grow, 1/s: the standard deviation of slow and of steep ones, the least
+#: of the latter, and the time over which a rate lasts, s.  Slow ones leave a severity as well known
+#: as a constant one but for a quarter.
+RATE_SIGMAS = (0.002, 0.02)
+STEEP = 0.003
+RATE_MEMORY = 0.5
 #: Statistic (h/sigma)^2 of one phase above which a fault is reported: five standard deviations.
 #: The rule: by the tail of the tuning runs, continued as a Gaussian's, less than one false alarm an
 #: hour, and less than 1e-4 in a run of two load steps.  Noise passes it less than once in ten hours

@@ -103,7 +103,13 @@ STUDY = Study(
     seeds=20,
     seed0=80_000,
     tuned="looked at with seeds below 100",
-    modules={"changing": ("estimators.apu.believable", "estimators.apu.electrical.smallchanges")},
+    modules={
+        "changing": (
+            "estimators.apu.believable",
+            "estimators.apu.electrical.smallchanges",
+            "estimators.apu.electrical.tuning",
+        )
+    },
     filters=filters,
     text="""
 @intro
