@@ -1,10 +1,13 @@
 """Draw the picture of docs/ARCHITECTURE.md again: ``python docs/draw_house.py`` (two seconds).
 
 Boxes are folders with their files and lines, counted now; an arrow says that a folder imports
-another one.  What is reached by way of others is left out.
+another one.  What is reached by way of others is left out.  ``--lines`` prints instead what lines
+are: the table below "Size".
 """
 
 import ast
+import sys
+from collections import Counter
 from pathlib import Path
 
 from scenarios.figures.figstyle import INK, LINE_INK, MUTED, STYLE, drawing, new_figure
@@ -33,6 +36,7 @@ scenarios.bench         0.70 7 0.28 times and targets
 scenarios.commands      0.00 8 0.98 the command line: parse, call, print
 """
 _TOP = ("schema", "campaigns", "campaign_records", "extensions", "reading", "fileschema")
+_IMPORTS = ("import ", "from ", "__all__")
 TOP = {f"scenarios.{n}" for n in _TOP}
 
 
@@ -74,6 +78,26 @@ def reduced(arrows: set[tuple[str, str]]) -> set[tuple[str, str]]:
         for a, c in arrows
         if not any((a, b) in arrows and (b, c) in reach for b in {x for _, x in arrows} - {a, c})
     }
+
+
+def lines(path: Path) -> Counter[str]:
+    """Return how many lines of a file are of which kind."""
+    text = path.read_text(encoding="utf-8")
+    bare = [x.strip() for x in text.splitlines()]
+    kinds = ["blank" if not x else "comment" if x.startswith("#") else "code" for x in bare]
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            kind, end = "signature", node.body[0].lineno - 1
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            kind, end = "docstring", node.end_lineno
+        elif isinstance(node, ast.stmt) and bare[node.lineno - 1].startswith(_IMPORTS):
+            kind, end = "import", node.end_lineno
+        else:
+            continue
+        for k in range(node.lineno - 1, end):
+            if kind == "docstring" or kinds[k] == "code":
+                kinds[k] = kind
+    return Counter(kinds)
 
 
 def main() -> None:
@@ -123,4 +147,10 @@ def _rectangle(x: float, y: float, w: float, look: dict[str, object]) -> object:
 
 
 if __name__ == "__main__":
-    main()
+    if "--lines" in sys.argv:
+        for top in (*PACKAGES, "tests"):
+            files = sorted((ROOT / top).rglob("*.py"))
+            found = sum((lines(path) for path in files), Counter())
+            print(f"{top}: {len(files)} files, {found.total()} lines:", dict(found.most_common()))
+    else:
+        main()

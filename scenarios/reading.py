@@ -116,7 +116,7 @@ def load_parts(paths: Collection[str]) -> None:
         extensions.load(paths)
 
 
-def read_profile(value: Any, place: str, folder: str = "") -> Any:
+def read_profile(value: Any, place: str) -> Any:
     """Return the profile that a table describes; what is no table is returned as it is.
 
     Raises:
@@ -125,7 +125,7 @@ def read_profile(value: Any, place: str, folder: str = "") -> Any:
     if not isinstance(value, Mapping):
         return value
     with inside(place):
-        return profile_from_table(value, place, folder, _unit(place))
+        return profile_from_table(value, place, unit=_unit(place))
 
 
 def _unit(key: str) -> str:

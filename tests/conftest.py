@@ -1,8 +1,8 @@
 """What holds for all tests.
 
 Most run in CasADi's virtual machine: the C compiler would take longer than they do, and compiled
-code gives the same numbers.  Marked ``compiled`` are those about compiled code itself.
-``APU_BACKEND=auto pytest`` compiles in all of them; ``.ci/run`` does in a choice.
+code gives the same numbers.  Marked ``compiled`` are those about compiled code itself; those marked
+``ci`` take it as well.  ``APU_BACKEND=auto pytest`` compiles in all of them.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ GIVEN = os.environ.get("APU_BACKEND")
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Choose the backend before any fixture is made; processes that a test starts inherit it."""
-    marked = item.get_closest_marker("compiled") is not None
+    marked = any(item.get_closest_marker(name) for name in ("compiled", "ci"))
     os.environ["APU_BACKEND"] = GIVEN or ("auto" if marked else "vm")
 
 

@@ -65,6 +65,21 @@ def test_a_severity_that_grows_is_followed(monkeypatch):
     assert r.x.names == old.x.names == r.final.x.names
 
 
+@pytest.mark.parametrize("chunk", [50, 94])
+def test_it_does_not_matter_where_pieces_begin(chunk, monkeypatch):
+    """Growth may show, and end, at the first sample of a piece.
+
+    So short ones see the beginning of growth only, and take it for slower: 1.8 sigma of error.
+    """
+    course = np.minimum(grown(3500, 0.016), 5e-4)
+    monkeypatch.setattr(tracking, "CHUNK", chunk)
+    r = tracked(course, 1)
+    h, sigma = r["h_b"]
+    assert r.t.size == course.size
+    assert (np.diff(r.t) > 0).all()
+    assert np.sqrt(np.mean(((h - course) / sigma)[ONSET:] ** 2)) < 2.5
+
+
 def test_rest_is_found_again():
     """A tenth of a second after growth has ended, severities are taken for constant again."""
     course = np.minimum(grown(5000, 0.01), 5e-4)

@@ -326,8 +326,6 @@ def test_lookup_of_symbols_arrays_and_numbers_agree(compressor):
         numbers = compressor.lookup(ns[k], bs[k], 0.8)
         assert [float(v) for v in f(ns[k], bs[k])] == list(numbers)
         assert [a[k] for a in arrays] == list(numbers)
-    off = compressor.off_axes(1.2, 3.0)
-    assert (off.N, off.beta) == (pytest.approx(1 / 7), pytest.approx(0.25))
 
 
 def test_newton_finds_the_point_from_far_off_the_map(compressor):

@@ -373,7 +373,6 @@ def load_or_build(
     recipe: str,
     build: Callable[[], ca.Function],
     *,
-    backend: str | None = None,
     compile_missing: bool = True,
 ) -> ca.Function:
     """Return the compiled function of a recipe, without building its expressions when it is known.
@@ -386,13 +385,12 @@ def load_or_build(
         recipe: hash of what the function is made from.
         build: makes the function; called only if the recipe is not known here, or in the virtual
             machine.
-        backend: overrides the backend in use.
         compile_missing: compile if no library is found; False only loads.
 
     Raises:
         BackendError: as in :func:`compiled`.
     """
-    wanted = _wanted(backend)
+    wanted = _wanted(None)
     with BUILDING:
         fun: list[ca.Function] = []
 

@@ -234,13 +234,13 @@ class RowFile:
         return lazy(self.file, at, shape, np.dtype(float))
 
 
-def pieces(variable: xr.Variable, chunk: int = CHUNK) -> Iterator[np.ndarray]:
-    """Yield the values of a variable in C order, in pieces of about ``chunk`` numbers."""
+def pieces(variable: xr.Variable) -> Iterator[np.ndarray]:
+    """Yield the values of a variable in C order, in pieces of about :data:`CHUNK` numbers."""
     if variable.ndim == 0:
         yield variable.values.reshape(1)
         return
     row = max(1, int(np.prod(variable.shape[1:], dtype=np.int64)))
-    step = max(1, chunk // row)
+    step = max(1, CHUNK // row)
     for k in range(0, variable.shape[0], step):
         yield variable[k : k + step].values.reshape(-1)
 

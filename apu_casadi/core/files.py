@@ -94,13 +94,13 @@ def read_bytes(path: str | os.PathLike[str], what: str = "", limit: int = 1 << 4
         return f.read()
 
 
-def beginning(path: str | os.PathLike[str], n: int, what: str = "") -> tuple[bytes, int]:
+def beginning(path: str | os.PathLike[str], n: int) -> tuple[bytes, int]:
     """Return the first ``n`` bytes of a regular file, and its size in bytes.
 
     Raises:
         DataError: as :func:`read_bytes`.
     """
-    with _opened(path, what, 1 << 62) as f:
+    with _opened(path, "", 1 << 62) as f:
         return f.read(n), os.fstat(f.fileno()).st_size
 
 

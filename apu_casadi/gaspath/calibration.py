@@ -233,8 +233,6 @@ def calibrate(
     gg: GasGenerator,
     points: Sequence[CalibrationPoint],
     free: Sequence[str],
-    *,
-    max_evaluations: int = 40,
 ) -> CalibrationResult:
     """Fit map numbers to points, starting from the engine's own.
 
@@ -242,7 +240,6 @@ def calibrate(
         gg: engine with the map shapes; numbers that are not free keep its values.
         points: steady points with measurements.
         free: numbers to fit, such as ``"compressor_map.n_Re"``; see :func:`numbers`.
-        max_evaluations: engines tried at most.
 
     Raises:
         ParameterError: unknown or doubled numbers, fewer measurements than numbers, or points that
@@ -260,7 +257,7 @@ def calibrate(
     )
     # off the edge by a hundredth: some numbers are at their identity, and at their limit, when 0
     start = np.clip(_current(gg, names), lower + 0.01, upper - 0.01)
-    stop = {**dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13), "max_nfev": max_evaluations}
+    stop = {**dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13), "max_nfev": 40}
     fit = least_squares(trial.errors, start, trial.jacobian, bounds=(lower, upper), **stop)
     if fit.status <= 0:
         raise OperatingPointError(

@@ -40,6 +40,7 @@ R_UNIVERSAL = 8314.462618  # J/(kmol K), CODATA 2018
 T_REF = 298.15  # K, reference of sensible enthalpy and of the heating value
 P_STD = 101325.0  # Pa
 T_MID = 1000.0  # K, where the two polynomial ranges meet
+COEFFICIENTS = ("a1", "a2", "a3", "a4", "a5", "a6", "a7", "b1", "b2")  # NASA's, of a range
 
 # Dry air by mole; closes the flows and temperatures of the paper's tables (N2 78.084 %,
 # O2 20.9476 %, Ar 0.9365 %, CO2 0.0319 %; U.S. Standard Atmosphere 1976).
@@ -63,8 +64,7 @@ def species(data: str) -> dict[str, tuple[float, np.ndarray]]:
     for row in csv.DictReader(line for line in text.splitlines() if not line.startswith("#")):
         name = row["species"]
         masses[name] = float(row["M_kg_per_kmol"])
-        cols = ("a1", "a2", "a3", "a4", "a5", "a6", "a7", "b1", "b2")
-        rows.setdefault(name, []).append([float(row[k]) for k in cols])
+        rows.setdefault(name, []).append([float(row[k]) for k in COEFFICIENTS])
     for name, r in rows.items():
         if len(r) != 2:
             raise DataError(f"{data}.csv: species {name} has {len(r)} temperature ranges, not 2")

@@ -18,7 +18,7 @@ from apu_casadi.core.parameters import of_symbols
 from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.gaspath.design import DesignPoint, design_equations
 from apu_casadi.gaspath.designdata import GasGeneratorParameters
-from apu_casadi.gaspath.gas import Gas, fuel_burning, used
+from apu_casadi.gaspath.gas import COEFFICIENTS, Gas, fuel_burning, used
 from apu_casadi.gaspath.maps.maptable import MapTable
 from apu_casadi.gaspath.maps.scaledmaps import (
     MapCalibration,
@@ -51,8 +51,7 @@ _REFERENCES = tuple(
     f"per_{n}" for n in ("N", "T2", "T41", "P2", "Re_c", "Re_t", "flow_31", "flow_5")
 )
 _FACTORS = ("per_N_map", "per_W", "per_line")
-_LETTERS = ["a1", "a2", "a3", "a4", "a5", "a6", "a7", "b1", "b2"]
-_RANGES = tuple(f"{r}_{a}" for r in ("low", "high") for a in _LETTERS)
+_RANGES = tuple(f"{r}_{a}" for r in ("low", "high") for a in COEFFICIENTS)
 DERIVED = Signals(
     [
         Signal("design.A3", "m^2", "flow area at 3"),

@@ -28,6 +28,7 @@ from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import hoisted, leap
+from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import (
     NODES,
     cached_table,
@@ -40,6 +41,8 @@ from apu_casadi.machine.turnstep import STRIDES, Turn, periodic_step, turn_of
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
 #: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
 PANELS = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
+#: Longest time, first intervals, in which the stator may settle behind the load and not be sampled.
+LAYER = 0.5
 HARMONICS = (12, 20, 30)  # of the rotor angle that a function takes; the first that fits
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
@@ -222,8 +225,11 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
         states.append(xk)
     outputs = [ca.horzcat(*states), Vk]
     panel, before = hoisted("panel", [x, V, P], ca.vertcat(u, th, h), outputs)
-    x_k, V_k = X0, ca.vertcat(*V_of(X0, U, TH), 0)
-    samples = [X0]
+    # the first samples lie so far apart; so much of it is the first one's weight
+    h_first, weight = dt * PANELS[0][1] / 4, 14 / 45
+    x_k, area = settled(ss, True)(X0, U, TH, LAYER * h_first)
+    seen = V_of(x_k + area * (2 / h_first), U, TH)[0]
+    V_k, samples = ca.vertcat(seen, V_of(x_k, U, TH)[1], 0), [x_k + area / (weight * h_first)]
     for k, (number, share) in enumerate(PANELS):
         P_k = ca.mtimes(ca.reshape(series[k * 4 * n_P : (k + 1) * 4 * n_P], n_P, 4), powers)
         d = before(ca.vertcat(U, TH, dt * share / 4))

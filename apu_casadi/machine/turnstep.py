@@ -23,6 +23,7 @@ from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import exciter_step, hoisted
+from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through
 
@@ -30,6 +31,8 @@ STRIDES = 28  # strides in a turn, where coefficients are periodic: 14 in a peri
 HALF = STRIDES // 2
 PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
 PAIRS = HALF // PACE
+#: Longest time, strides, in which the stator may settle behind the load and not be sampled.
+LAYER = 0.35
 _BACK = 8  # samples whose polynomial leads back to the start
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
 _NEAR = _AROUND // 2
@@ -196,11 +199,19 @@ class _Seen:
         others = [i for i in at.slow if i != at.drive]
         if others and any(ca.which_depends(values, x[others], 1, True)):
             raise NotApplicable(f"{ss.name}: a mean of what the exciter's inner states decide")
-        self.start = ca.Function("start", [x, u, th, weights], [values, y[ss.y.index("V_t")]])
+        at_sample = ca.Function("terms", [x, u, th, weights], [values, y[ss.y.index("V_t")]])
+        #: (x, u, theta, length of a stride, weight of a first sample in it, weights as of others)
+        #: -> (x as it settles, terms, terminal voltage), both with what passes by before
+        h, weight = ca.SX.sym("h"), ca.SX.sym("weight")
+        after, area = settled(ss, False)(x, u, th, LAYER * h)
+        first, _ = at_sample(after + area / (weight * h), u, th, weights)
+        _, V_seen = at_sample(after + area * (6 / (PACE * h)), u, th, weights)
+        made = [after, first, V_seen]
+        self.start = ca.Function("start", [x, u, th, h, weight, weights], made, {"cse": True})
         sample, angle = ca.SX.sym("sample", n + 2), ca.SX.sym("angle")
         full = ca.SX(len(ss.x), 1)
         full[at.linear], full[at.drive], full[at.angle] = sample[:n], sample[n], angle
-        own = self.start(full, u, th, weights)[0]
+        own = at_sample(full, u, th, weights)[0]
         one, self.before = hoisted("seen", [sample, weights], ca.vertcat(u, th, angle), [own])
         d = ca.SX.sym("d", self.before.numel_out(0))
         samples = [ca.SX.sym("sample", n + 2) for _ in range(halves)]
@@ -510,10 +521,12 @@ def periodic_step(
     h, s = stride / w, (w - parameters[-2]) / parameters[-1]
     length, angles = DT / h, theta0 + stride * ca.DM(np.arange(HALF + 1)).T
     end, seen = _End(turn, length), _Seen(ss, quad, turn.halves)
-    plain = end.means() / length
+    relative = end.means()
+    plain = relative / length
     # beyond the end of the step the weight goes on as the polynomial that it is
     light = plain * window(ca.DM(np.arange(turn.samples)) / length)
-    terms, V_now = seen.start(X0, U, TH, ca.vertcat(plain[0], light[0]))
+    first = ca.vertcat(plain[0], light[0])
+    x_now, terms, V_now = seen.start(X0, U, TH, h, relative[0], first)
 
     exciter, voltage = _Exciter(ss), _Voltage(ss)
     between, before = _between(ss, exciter, voltage)
@@ -524,8 +537,8 @@ def periodic_step(
     P = _from_start(P, ca.horzsplit(rows, n + 2), h)
     given = [*P, *ca.horzsplit(before.map(PAIRS)(fixed))]
     half_turn = _half_turn(ss, between, before.numel_out(0))
-    rates, drive, e = exciter.started(X0[at.slow], V_now, V_ref, TH)
-    z, S = ca.vertcat(X0[at.linear], drive, 1), ca.vertcat(X0[at.slow], rates, e, 0)
+    rates, drive, e = exciter.started(x_now[at.slow], V_now, V_ref, TH)
+    z, S = ca.vertcat(x_now[at.linear], drive, 1), ca.vertcat(x_now[at.slow], rates, e, 0)
     samples, starts = [], []
     for _ in range(turn.halves):
         z, S, of_samples, of_starts = half_turn(z, S, *given)

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     #: Fault of all generators, a list of one for each, or a mapping by number from 1.
     Faults = Fault | Sequence[Fault | None] | Mapping[int, Fault | None] | None
 
-RESIDUAL_JOINT = 1e-9
 T = TypeVar("T")
 _NUMBERED = re.compile(r"generator(\d+)\.(.+)")
 

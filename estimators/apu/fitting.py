@@ -11,16 +11,13 @@ sample with its noise.  An input that was not measured is left open: its standar
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from apu_casadi.core import files
 from apu_casadi.core.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.core.sharing import keep, kept, once
 from apu_casadi.core.simulation import stepper
@@ -55,7 +52,6 @@ __all__ = [
     "coverage",
     "engine_model",
     "fit_engine",
-    "run_study",
     "words",
 ]
 
@@ -511,39 +507,3 @@ def coverage(
         "freedom": freedom,
         "seconds": time.perf_counter() - began,
     }
-
-
-def text(result: Mapping[str, Any]) -> str:
-    """Return a coverage result as lines of text."""
-    lines = [
-        f"{result['kind']}: {result['n']} fits, {result['samples']} samples of "
-        f"{', '.join(result['sensors'])}, {result['engines']} engines, seeds from "
-        f"{result['seed0']}, {result['seconds']:.0f} s, {result['failed']} failed; mean chi2 "
-        f"{result['mean_chi2']:.1f} with {result['freedom']} degrees of freedom"
-    ]
-    lines += [
-        f"  {r['name']:<8} {100 * r['covered']:5.1f} % of the {100 * result['level']:.0f} % "
-        f"intervals ({100 * r['low']:.1f} to {100 * r['high']:.1f}), rms error "
-        f"{r['rms_error']:.5f}, claimed {r['mean_sigma']:.5f}, bias "
-        f"{r['bias_over_its_error']:+.1f} of its own error"
-        for r in result["rows"]
-    ]
-    return "\n".join(lines)
-
-
-def run_study(
-    path: str | Path,
-    *,
-    n: int = 500,
-    seed0: int = 20_000,
-    kinds: Sequence[str] = KINDS,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> dict[str, Any]:
-    """Run the coverage studies and write them to ``path`` as JSON; returns what it wrote."""
-    results = []
-    for kind in kinds:
-        tell = None if progress is None else (lambda a, b, k=kind: progress(k, a, b))
-        results.append(coverage(n, seed0=seed0, kind=kind, progress=tell))
-    report = {"goal": "93 to 97 % of the 95 % intervals hold the truth", "coverage": results}
-    files.write_text(path, json.dumps(report, indent=2) + "\n")
-    return report

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from estimators.apu.gaspath import JUMP
 from estimators.apu.gaspathmodel import DT
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult, StepMaker
-from estimators.filters.resuming import Runs
+from estimators.filters.resuming import Runs, joined
 from estimators.information.consistency import exceeded
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
@@ -180,7 +180,8 @@ def track_jumps(
         u = data.u.copy()
         u[row, onset - 1] = JUMP  # acts in the step that ends at the onset
         data = Recording(data.t, u, data.y, data.variance, data.p)
-        result = _spliced(result, again(data), k)
+        late = again(data)
+        result = dataclasses.replace(late, **joined(result, late, k))
         start = k + test.hold
     return Tracked(result, tuple(alarms), tuple(onsets), data, prior)
 
@@ -191,23 +192,11 @@ def spliced(before: Tracked, after: Tracked, k: int) -> Tracked:
     Alarms that were raised before k stay; of ``after`` count those of jumps that no alarm has
     reported, at k at the earliest.
     """
-    result = _spliced(before.result, after.result, k)
+    parts = joined(before.result, after.result, k)
+    result = dataclasses.replace(after.result, **parts)
     pairs = [(a, o) for a, o in zip(before.alarms, before.onsets, strict=True) if a < k]
     for a, o in zip(after.alarms, after.onsets, strict=True):
         if a >= k or not any(abs(o - old) <= SAME_JUMP for _, old in pairs):
             pairs.append((max(a, k), o))
     alarms, onsets = (tuple(p[i] for p in pairs) for i in (0, 1))
     return dataclasses.replace(after, result=result, alarms=alarms, onsets=onsets)
-
-
-def _spliced(before: FilterResult, after: FilterResult, k: int) -> FilterResult:
-    """Take ``before`` up to sample k, ``after`` from there on."""
-
-    def joined(a: Any, b: Any, axis: int) -> Any:
-        return np.concatenate([np.split(a, [k], axis)[0], np.split(b, [k], axis)[1]], axis)
-
-    columns = {"mean", "variance", "innovation", "innovation_variance", "nis", "measured"}
-    rows = {"cov", "cov_pred", "cross", "innovation_cov"}
-    axes = dict.fromkeys(columns | {"mean_pred"}, -1) | dict.fromkeys(rows, 0)
-    parts = {n: joined(getattr(before, n), getattr(after, n), axis) for n, axis in axes.items()}
-    return dataclasses.replace(after, **parts)

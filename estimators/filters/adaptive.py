@@ -117,7 +117,6 @@ def adaptive_step(
     model: FilterModel,
     memory: float,
     step: StepMaker = ekf_step,
-    iterations: int = 2,
 ) -> FilterStep:
     """Build a filter's step that adapts the variances of its samples.
 
@@ -125,18 +124,15 @@ def adaptive_step(
         model: of :func:`adaptive_noise`.
         memory: time over which the noise is taken for constant, s.
         step: makes the filter of the states, which is run with the adapted variances.
-        iterations: of the update, states and factors in turn.
 
     Raises:
-        ParameterError: a model without factors, memory not positive, iterations not 1 to 10.
+        ParameterError: a model without factors, memory not positive.
     """
     outputs = _adapted(model)
     if not outputs:
         raise ParameterError(f"{model.name} has no factors of noise; adaptive_noise() makes them")
     if not 0 < memory < math.inf:
         raise ParameterError(f"memory must be finite and > 0 s, got {memory!r}")
-    if not (isinstance(iterations, int) and 1 <= iterations <= 10):
-        raise ParameterError(f"iterations must be a whole number from 1 to 10, got {iterations!r}")
     base = step(_without(model)).plain.function
     n, q, ny = len(model.x) - len(outputs), len(outputs), len(model.y)
     rows = model.y.indices(outputs)
@@ -147,7 +143,7 @@ def adaptive_step(
     a = before**2 / ca.fmax(ca.diag(P)[n:], 1e-9 * before**2)
     there = R[rows] >= 0
     new_a, factor, first, out = a + there / 2, before, None, []
-    for _ in range(iterations):
+    for _ in range(2):  # states and factors in turn
         noise = ca.MX(R)
         noise[rows] = ca.if_else(there, R[rows] * factor, R[rows])
         out = base(m[:n], P[:n, :n], u, p, y, noise, dt)

@@ -31,20 +31,22 @@ __all__ = [
 TINY = 1e-290  # below it a square counts as zero: its reciprocal would overflow
 
 
+def _rest(S: ca.SX, L: ca.SX, i: int, j: int) -> ca.SX:
+    """Return S[i, j] less what the columns of L before j make of it."""
+    rest = S[i, j]
+    for k in range(j):
+        rest = rest - L[i, k] * L[j, k]
+    return rest
+
+
 def cholesky(S: ca.SX) -> ca.SX:
     """Return lower triangular L with L L' = S; NaN where S is not positive definite."""
     n = S.shape[0]
     L = ca.SX(n, n)
     for j in range(n):
-        d = S[j, j]
-        for k in range(j):
-            d = d - L[j, k] ** 2
-        L[j, j] = ca.sqrt(d)
+        L[j, j] = ca.sqrt(_rest(S, L, j, j))
         for i in range(j + 1, n):
-            v = S[i, j]
-            for k in range(j):
-                v = v - L[i, k] * L[j, k]
-            L[i, j] = v / L[j, j]
+            L[i, j] = _rest(S, L, i, j) / L[j, j]
     return L
 
 
@@ -57,16 +59,11 @@ def cholesky_semidefinite(S: ca.SX) -> ca.SX:
     n = S.shape[0]
     L = ca.SX(n, n)
     for j in range(n):
-        d = S[j, j]
-        for k in range(j):
-            d = d - L[j, k] ** 2
+        d = _rest(S, L, j, j)
         there = d > 1e-14 * S[j, j]
         L[j, j] = ca.if_else(there, ca.sqrt(d), 0)
         for i in range(j + 1, n):
-            v = S[i, j]
-            for k in range(j):
-                v = v - L[i, k] * L[j, k]
-            L[i, j] = ca.if_else(there, v / L[j, j], 0)
+            L[i, j] = ca.if_else(there, _rest(S, L, i, j) / L[j, j], 0)
     return L
 
 
@@ -75,16 +72,10 @@ def root_and_inverse(S: ca.SX) -> tuple[ca.SX, ca.SX]:
     n = S.shape[0]
     L, inverse = ca.SX(n, n), ca.SX(n, 1)
     for j in range(n):
-        d = S[j, j]
-        for k in range(j):
-            d = d - L[j, k] ** 2
-        L[j, j] = ca.sqrt(d)
+        L[j, j] = ca.sqrt(_rest(S, L, j, j))
         inverse[j] = 1 / L[j, j]
         for i in range(j + 1, n):
-            v = S[i, j]
-            for k in range(j):
-                v = v - L[i, k] * L[j, k]
-            L[i, j] = v * inverse[j]
+            L[i, j] = _rest(S, L, i, j) * inverse[j]
     return L, inverse
 
 

@@ -17,7 +17,7 @@ from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult, FilterStep, rooted, run
 from estimators.models.recording import Recording
 
-__all__ = ["Runs"]
+__all__ = ["Runs", "joined"]
 
 _COLUMNS = ("mean", "variance", "innovation", "innovation_variance", "nis", "measured", "mean_pred")
 _ROWS = ("cov", "cov_pred", "cross", "innovation_cov")
@@ -60,15 +60,28 @@ class Runs:
         after = run(self.step, belief, part, full=True, backend=self.backend)
         if after.roots is not None:
             return self._whole(data)
-        joined: dict[str, Any] = {}
-        for names, axis in ((_COLUMNS, -1), (_ROWS, 0)):
-            for n in names:
-                first = np.split(getattr(before, n), [k], axis)[0]
-                joined[n] = np.concatenate([first, getattr(after, n)], axis)
-        joined["loglik"] = after.loglik + _likelihood(before, k)
+        parts = joined(before, after, k, start=k)
+        parts["loglik"] = after.loglik + _likelihood(before, k)
         if after.again is not None:
-            joined["again"] = partial(rooted, self.step, self.prior, data, self.backend)
-        return dataclasses.replace(after, t=data.t, **joined)
+            parts["again"] = partial(rooted, self.step, self.prior, data, self.backend)
+        return dataclasses.replace(after, t=data.t, **parts)
+
+
+def joined(before: FilterResult, after: FilterResult, k: int, *, start: int = 0) -> dict[str, Any]:
+    """Return the arrays of ``before`` up to sample k, and from there on those of ``after``.
+
+    Args:
+        before, after: of :func:`estimators.filters.filtering.run` with ``full``.
+        k: a sample of the whole recording.
+        start: first sample of ``after``.
+    """
+    parts: dict[str, Any] = {}
+    for names, axis in ((_COLUMNS, -1), (_ROWS, 0)):
+        for n in names:
+            first = np.split(getattr(before, n), [k], axis)[0]
+            rest = np.split(getattr(after, n), [k - start], axis)[1]
+            parts[n] = np.concatenate([first, rest], axis)
+    return parts
 
 
 def _likelihood(r: FilterResult, k: int) -> float:

@@ -235,12 +235,12 @@ def confusion(true: np.ndarray, said: np.ndarray) -> dict[str, dict[str, int]]:
     }
 
 
-def at_false_alarms(value: np.ndarray, ill: np.ndarray, share: float = FALSE_ALARMS) -> Any:
-    """Return the share of faulty runs above the threshold that ``share`` of healthy ones exceed."""
+def at_false_alarms(value: np.ndarray, ill: np.ndarray) -> Any:
+    """Return the share of faulty runs above what :data:`FALSE_ALARMS` of healthy ones exceed."""
     if not (~ill).any() or not ill.any() or not np.isfinite(value).all():
         return None
     healthy = np.sort(value[~ill])
-    k = math.floor(share * healthy.size)  # so many healthy runs may lie above
+    k = math.floor(FALSE_ALARMS * healthy.size)  # so many healthy runs may lie above
     return float((value[ill] > healthy[healthy.size - 1 - k]).mean())
 
 

@@ -241,12 +241,12 @@ def _sawn(e: Exported) -> str:
     return next((v.name for v in e.inputs if v.name == "u" and v.size), "")
 
 
-def expected(e: Exported, steps: int = STEPS) -> str:
+def expected(e: Exported) -> str:
     """Return what the example prints, by Python."""
     call, now = Caller(e.function), {v.name: np.array(v.start) for v in e.inputs}
     (slope, length), first, lines = SAW, _sawn(e), []
     names, shapes = [v.name for v in e.outputs], [e.function.size_in(i) for i in range(len(now))]
-    for k in range(steps):
+    for k in range(STEPS):
         if first:
             now[first][0] = next(v.start[0] for v in e.inputs if v.name == first) * (
                 1.0 + slope * float(k % length)

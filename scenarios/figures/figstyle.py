@@ -127,9 +127,9 @@ def margins(fig: Figure, *, top: float = 0.18, bottom: float = 0.98) -> dict[str
 # ------------------------------------------------------------------------------ on axes
 
 
-def title(ax: Axes, text: str, ink: str = INK) -> None:
+def title(ax: Axes, text: str) -> None:
     """Write a small bold title over the left end of the axes."""
-    ax.set_title(text, loc="left", fontsize=9.5, fontweight="bold", color=ink, pad=6)
+    ax.set_title(text, loc="left", fontsize=9.5, fontweight="bold", color=INK, pad=6)
 
 
 def remark(ax: Axes, text: str, at: Any, shift: tuple[float, float], **more: Any) -> None:

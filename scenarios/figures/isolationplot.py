@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+TARGET = 0.8  # of kappa, drawn as a line
+
 
 def _matrix(ax: Axes, head: str, scores: Mapping[str, Any], labelled: bool) -> None:
     """One confusion matrix: per cent of the true class, by row."""
@@ -67,8 +69,6 @@ def plot_confusion(panels: Sequence[tuple[str, Mapping[str, Any]]], note: str) -
 def plot_kappa(
     panels: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]],
     note: str,
-    *,
-    target: float = 0.8,
 ) -> Figure:
     """Draw Cohen's kappa against what was changed, with 95 % intervals.
 
@@ -76,7 +76,6 @@ def plot_kappa(
         panels: (title, label of x, rows with ``value``, ``kappa``, ``kappa_95``), one to four;
             values must be positive, their axis is logarithmic.
         note: the caption.
-        target: drawn as a line.
 
     Raises:
         SignalError: no panels or more than four, fewer than two rows, a value <= 0.
@@ -94,7 +93,7 @@ def plot_kappa(
                 raise SignalError(f"{head}: two or more positive values expected, got {x}")
             k = np.array([r["kappa"] for r in rows])
             low, high = np.array([r["kappa_95"] for r in rows]).T
-            ax.axhline(target, color=MUTED, lw=1.0, ls="--", zorder=1)
+            ax.axhline(TARGET, color=MUTED, lw=1.0, ls="--", zorder=1)
             ax.fill_between(x, low, high, color=LINE_INK[0], alpha=0.18, lw=0)
             ax.plot(x, k, "o-", color=LINE_INK[0], ms=4, lw=1.4)
             ax.set_xscale("log")

@@ -220,18 +220,18 @@ def estimate(
     return found
 
 
-def joint_seconds(scenario: str = "joint", repeat: int = 3, seed: int = 1) -> dict[str, Any]:
-    """Time the joint estimation of a scenario on one core; compiled before, fastest of some.
+def joint_seconds(repeat: int = 3) -> dict[str, Any]:
+    """Time the joint estimation of ``joint`` on one core; compiled before, fastest of some.
 
     Returns:
         ``seconds`` of measuring and estimating, and ``simulated`` seconds.
     """
-    ds = truth(scenario)
+    ds = truth("joint")
     best = math.inf
-    estimate(ds, seed)  # compiles
+    estimate(ds, 1)  # compiles
     for _ in range(repeat):
         began = time.perf_counter()
-        estimate(ds, seed)
+        estimate(ds, 1)
         best = min(best, time.perf_counter() - began)
     return {"seconds": best, "simulated": float(ds["time"].values[-1])}
 

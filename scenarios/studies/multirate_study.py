@@ -149,11 +149,9 @@ def errors(ds: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
 SPLIT = ("predicted speed", "predicted fuel")
 
 
-def simulated(
-    steps: Sequence[float] = STEPS, *, cases: int = len(CASES), exchanges: int = len(COMPARED)
-) -> float:
-    """Return the simulated time, s, of all runs of :func:`measure` with its other defaults."""
-    runs = exchanges * len(steps) + len(SPLIT) + 2  # two: the truth, and the one model
+def simulated(steps: Sequence[float] = STEPS, *, cases: int = len(CASES)) -> float:
+    """Return the simulated time, s, of all runs of :func:`measure`."""
+    runs = len(COMPARED) * len(steps) + len(SPLIT) + 2  # two: the truth, and the one model
     return cases * runs * DURATION
 
 
@@ -161,28 +159,22 @@ def measure(
     *,
     steps: Sequence[float] = STEPS,
     cases: Sequence[str] = tuple(CASES),
-    exchanges: Sequence[str] = COMPARED,
-    contributions: float | None = PAPER_STEP,
-    apu: Apu | None = None,
     progress: Callable[[float, float], None] | None = None,
 ) -> list[Measured]:
-    """Run the study.
+    """Run the study: exchanges at all steps, speed and fuel predicted one without the other.
+
+    The latter at the paper's step, so that the two parts of its error stand apart.
 
     Args:
         steps: exchange steps, s; divisors of 80 ms.
         cases: names in :data:`CASES` or :data:`OF_ONE`.
-        exchanges: of ``simulate_joint``.
-        contributions: exchange step, s, with which speed and fuel are predicted one without the
-            other as well, so that the two parts of the paper's error stand apart; None: not.
         progress: called with (done, total), both in simulated seconds over all runs.
 
     Returns:
         Every run, case by case; the first of each case is the one model at the same tolerance.
     """
-    apu = apu or Apu()
-    plan = [(ex, dt) for ex in exchanges for dt in steps]
-    if contributions is not None:
-        plan += [(ex, contributions) for ex in SPLIT]
+    apu = Apu()
+    plan = [(ex, dt) for ex in COMPARED for dt in steps] + [(ex, PAPER_STEP) for ex in SPLIT]
     total, done = len(cases) * (len(plan) + 2) * DURATION, 0.0  # two: truth and one model
 
     def tick(t: float, _: float) -> None:

@@ -71,16 +71,6 @@ class MapPoint(NamedTuple):
     off: Any
 
 
-class OffMap(NamedTuple):
-    """Signed distance outside the table along each axis, in table spans; 0 inside.
-
-    Negative below the lowest line, positive above the highest.
-    """
-
-    N: Any
-    beta: Any
-
-
 def spline_operator(x: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
     """Return knots and the matrix from data to B-spline coefficients of a natural cubic spline.
 
@@ -475,11 +465,6 @@ class ScaledMap(Parametric):
         """
         W, PR, eta, *SM, off = _call(self.function, n, beta, RNI)
         return MapPoint(W=W, PR=PR, eta=eta, SM=SM[0] if SM else None, off=off)
-
-    def off_axes(self, n: Any, beta: Any) -> OffMap:
-        """Return the signed distance outside the table per axis, for messages; as in `lookup`."""
-        _, off_N, off_beta = _call(off_function(self.table), n * self.N_map_des, beta)
-        return OffMap(off_N, off_beta)
 
 
 def scale_factors(m: Any) -> tuple[Any, Any, Any]:

@@ -112,7 +112,8 @@ def track(
         cut = at + _onset(r.nis, (int(bad[0]) - judged) * RESET_WINDOW) if bad.size else None
         turn = turns.turn(now, r, prior, at, cut)
         if turn is not None:
-            pieces.append(turns.widened(now, now.filtered(prior, at, turn.at)[0]))
+            if turn.at > at:
+                pieces.append(turns.widened(now, now.filtered(prior, at, turn.at)[0]))
             now, prior, at, share = turn.to, turn.prior, turn.at, np.zeros(0)
             continue
         if cut is None:
@@ -291,7 +292,8 @@ class _Turns:
         k = min(steeper, rest)
         if k >= end:
             return None
-        belief = now.filtered(prior, at, k)[1].marginal(x.names)
+        ahead = now.filtered(prior, at, k)[1] if k > at else prior
+        belief = ahead.marginal(x.names)
         if k < rest:
             return self._entered(belief, k, k, math.inf)
         self.begin(k)

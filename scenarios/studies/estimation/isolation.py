@@ -90,7 +90,6 @@ def isolation_study(
     seed0: int = 1000,
     protocol: Protocol = DEFAULT,
     *,
-    methods: Sequence[str] = METHODS,
     limit_draws: int = 200,
     limit_points: int = 8,
     gg: GasGenerator | None = None,
@@ -105,7 +104,6 @@ def isolation_study(
         protocol, gg: what is measured, and of what.
         truth: engines that are simulated instead of ``gg``, by turns of the seeds: the classifiers'
             model is then wrong.
-        methods: see :func:`isolate`.
         limit_draws, limit_points: of :func:`information_limit`.
         progress: called with (done, total) windows.
 
@@ -120,12 +118,12 @@ def isolation_study(
     seeds = seed0 + np.tile(np.arange(n), len(CLASSES))
     windows = windows_of_engines(labels, seeds, protocol, truth or [gg])
     model = model_of(gg, protocol.N_walk)
-    confusion = {m: np.zeros((len(CLASSES), len(CLASSES)), int) for m in methods}
+    confusion = {m: np.zeros((len(CLASSES), len(CLASSES)), int) for m in METHODS}
     nis, onset_error, size_error, wrong = [], [], [], []
-    last = methods[-1]
+    last = METHODS[-1]
     for i in range(labels.size):
-        v = isolate(recording_of(model, windows, i, protocol), protocol, gg, methods=methods)
-        for m in methods:
+        v = isolate(recording_of(model, windows, i, protocol), protocol, gg)
+        for m in METHODS:
             confusion[m][labels[i], int(np.argmax(v.log_probability[m]))] += 1
         nis.append(v.nis)
         given = int(np.argmax(v.log_probability[last]))
@@ -155,25 +153,20 @@ def isolation_study(
 
 
 def sweep(
-    changes: Mapping[str, Sequence[Any]],
-    draws: int = 100,
-    seed: int = 0,
-    protocol: Protocol = DEFAULT,
-    gg: GasGenerator | None = None,
-    *,
-    points: int = 4,
+    changes: Mapping[str, Sequence[Any]], seed: int, protocol: Protocol
 ) -> list[dict[str, Any]]:
     """Return the information limit as one thing of the protocol is changed at a time.
 
     Args:
         changes: values by field of :class:`Protocol`, such as ``{"after": [0.5, 1, 2, 4]}``.
-        draws, seed, points, gg: see :func:`information_limit`.
+        seed: see :func:`information_limit`.
+        protocol: what is changed.
     """
     rows = []
     for name, values in changes.items():
         for value in values:
             p = dataclasses.replace(protocol, **{name: value})
-            r = information_limit(draws, seed, p, gg, points=points)
+            r = information_limit(100, seed, p, points=4)
             scored = {k: r[k] for k in ("kappa", "kappa_95", "n")}
             rows.append({"change": name, "value": value, **scored})
     return rows
@@ -236,9 +229,7 @@ for _name in STUDIES:
 
 @STUDY.part("sweeps", start=120, share=None)
 def _sweeps(n: int, seed0: int, tell: Tell) -> Any:
-    return {
-        name: sweep(changes, seed=seed0, protocol=protocol) for name, protocol, changes in SWEEPS
-    }
+    return {name: sweep(changes, seed0, protocol) for name, protocol, changes in SWEEPS}
 
 
 @STUDY.claims

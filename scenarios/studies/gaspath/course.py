@@ -83,15 +83,15 @@ def filters() -> list[ca.Function]:
 
 
 @once
-def power_profile(drop: float = LOAD_DROP) -> np.ndarray:
-    """Shaft power, W, in steps of 5 ms: 2 x 225 kW, then 2 x 100 kW from ``drop`` on.
+def power_profile() -> np.ndarray:
+    """Shaft power, W, in steps of 5 ms: 2 x 225 kW, then 2 x 100 kW from LOAD_DROP on.
 
     Of a joint run with a healthy gas path, voltage regulator and all; held when it has settled.
     """
     load, less = (SeriesLoad.from_power(P) for P in (225e3, 100e3))
     fast: dict[str, Any] = {"dt": DT / FINE, "waveform_dt": None, "solver": "propagator"}
-    events = [LoadChange(drop, less)]
-    ds = simulate_joint(Apu(), duration=drop + 3.0, load=load, events=events, **fast)
+    events = [LoadChange(LOAD_DROP, less)]
+    ds = simulate_joint(Apu(), duration=LOAD_DROP + 3.0, load=load, events=events, **fast)
     PW = np.asarray(ds["PW"].values[1:], float)
     n = round(DURATION / DT) * FINE
     return np.concatenate([PW, np.full(n - PW.size, PW[-1])])

@@ -25,7 +25,6 @@ from scenarios.studies.gaspath.course import (
     DURATION,
     ETA_SIGMA,
     FAULT,
-    FRESH,
     JUMP_TEST,
     SETTLED,
     VARIANTS,
@@ -159,9 +158,7 @@ class Alarms:
         return {**counts, "delay_samples": delays}
 
 
-def efficiency(
-    seeds: Sequence[int] = FRESH, *, matched: bool, filt: GasPathFilter | None = None
-) -> dict[str, Any]:
+def efficiency(seeds: Sequence[int], *, matched: bool) -> dict[str, Any]:
     """Monte Carlo of the filter on a load drop at 2 s and a jump of health at 6 s.
 
     Matched: the bound's conditions, the jump told.  Mismatched: other engines, faults to be found.
@@ -171,7 +168,7 @@ def efficiency(
         gives (:class:`LinearReference`) and the mean excess over it with its standard error, for
         the mismatched one alarms and delays.
     """
-    filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False) if filt is None else filt
+    filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)
     power = power_profile()
     engines: dict[str, dict[str, Any]] = {"same engine": {}} if matched else VARIANTS
     kind: Any = MatchedTruth if matched else EngineTruth

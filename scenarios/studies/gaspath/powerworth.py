@@ -24,7 +24,6 @@ from estimators.filters.filtering import FilterResult
 from scenarios.studies.gaspath.course import (
     FAULT,
     FINE,
-    FRESH,
     LOAD_DROP,
     Case,
     draw,
@@ -109,21 +108,15 @@ def shaft_power() -> dict[str, Any]:
     return {"null_direction": null.tolist(), "table": table}
 
 
-def shaft_power_seeds(
-    seeds: Sequence[int] = FRESH,
-    *,
-    gains: bool,
-    eta: float | None,
-    prior: float = HEALTH_SIGMA,
-    noise: float = 0.01,
-) -> dict[str, Any]:
+def shaft_power_seeds(seeds: Sequence[int], *, gains: bool, eta: float | None) -> dict[str, Any]:
     """Monte Carlo of one choice of :func:`shaft_power`: actual errors with and without the power.
 
     Returns:
         Reduction at both instants with its 95 % interval (bootstrap over seeds), RMSE of each
         factor, and along the null direction actual and claimed errors of both filters.
     """
-    pair = _pair(gains, eta, prior, noise)
+    noise = 0.01  # of the power
+    pair = _pair(gains, eta, HEALTH_SIGMA, noise)
     power = power_profile()[: round(TRANSIENT / DT) * FINE]
     source = MatchedTruth(pair[0].gg)
     fuel = source.gg.design.values["Wf"]
@@ -133,10 +126,7 @@ def shaft_power_seeds(
     claimed: list[list[list[float]]] = []
     for seed in seeds:
         rng_case, rng_process, rng_noise = generators(seed)
-        case = draw(rng_case, pair[0], matched=True)
-        case = dataclasses.replace(
-            case, health=1 + (case.health - 1) * prior / HEALTH_SIGMA, jump=np.zeros(4)
-        )
+        case = dataclasses.replace(draw(rng_case, pair[0], matched=True), jump=np.zeros(4))
         truth = source(case, power, rng_process)
         noise_seed = int(rng_noise.integers(2**31))
         e, c = [], []
@@ -152,8 +142,8 @@ def shaft_power_seeds(
     square = (E**2).sum(3)
     rng = np.random.default_rng(0)
     pick = rng.integers(0, len(E), (2000, len(E)))
-    out: dict[str, Any] = {"gains": gains, "eta": eta, "prior": prior, "noise": noise}
-    out["seeds"] = len(E)
+    out: dict[str, Any] = {"gains": gains, "eta": eta, "prior": HEALTH_SIGMA}
+    out |= {"noise": noise, "seeds": len(E)}
     for j, when in enumerate(points):
         ratio = square[pick, 0, j].mean(1) / square[pick, 1, j].mean(1)
         out[when] = {

@@ -137,8 +137,6 @@ def mismatch(
     n: int,
     seed0: int,
     tell: Callable[[int, int], None] = lambda *_: None,
-    *,
-    backend: str | None = None,
 ) -> dict[str, Any]:
     """Run the pipeline over seeds with one imperfection and count.
 
@@ -159,7 +157,7 @@ def mismatch(
         tell(k + 1, n)
         try:
             given = (r.gaspath,) if entry.only == "gaspath" else (r.gaspath, r.electrical)
-            e = estimate(read_recording(*given), Apu(), backend=backend)
+            e = estimate(read_recording(*given), Apu())
         except ApuError:
             count["refused"] += 1
             continue
