@@ -15,8 +15,8 @@ n and w being speed and fuel from their start, the stored speeds and fuels give 
 same rotor under the continuous governor; the difference of the two speeds is the error.  It needs
 nothing but the run itself, holds for every exchange, and was measured against runs with an exchange
 step of 1 ms: right within 15 % from 5 to 160 ms (docs/MULTIRATE.md has the errors of the study).
-It does not see the ripple of a short circuit that a governor sampled at whole multiples of 1.25 ms
-takes for a speed error, some 0.25 % of the excursion.
+It is no bound: it does not see the ripple of a short circuit that a governor sampled at whole
+multiples of 1.25 ms takes for a speed error, some 0.25 % of the excursion.
 """
 
 from __future__ import annotations

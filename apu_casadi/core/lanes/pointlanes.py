@@ -16,7 +16,7 @@ import casadi as ca
 from apu_casadi.core.backend import READY, Code, backend_in_use, compiled, library
 from apu_casadi.core.lanes.lanecode import NoForm, Writer
 from apu_casadi.core.lanes.lanegraph import map_of
-from apu_casadi.core.lanes.lanelibrary import digest, flags_of, lanes_in_use
+from apu_casadi.core.lanes.lanelibrary import digest, flags_of, lanes_for
 from apu_casadi.core.sharing import BUILDING
 
 __all__ = ["points_in_lanes"]
@@ -86,7 +86,8 @@ def points_in_lanes(
     :func:`apu_casadi.core.backend.compiled`, which this is where there are no such maps, or no
     lanes.
     """
-    lanes, maps = lanes_in_use(), {f.name(): f for f in _maps(fun)}
+    maps = {f.name(): f for f in _maps(fun)}
+    lanes = lanes_for(max((_count(f) for f in maps.values()), default=1))
     usual = backend not in (None, READY)
     if usual or backend_in_use() != "c" or lanes == 1 or not maps:
         return compiled(fun, backend=backend, build=build, level=level)
@@ -128,6 +129,11 @@ def _mapped(fun: ca.Function) -> tuple[ca.Function, int] | None:
     if made is None or fun.name_in() != called[0].name_in() or fun.n_out() != called[0].n_out():
         return None
     return made
+
+
+def _count(mapped: ca.Function) -> int:
+    found = _mapped(mapped)
+    return 1 if found is None else found[1]
 
 
 def _source(fun: ca.Function, maps: dict[str, ca.Function], lanes: int) -> str:

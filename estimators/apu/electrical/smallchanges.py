@@ -23,6 +23,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.terminalsignals import PHASES_I, PHASES_V
@@ -187,11 +188,11 @@ def _stepped(
     """The largest lasting change of the mean of windows, (W, per), beside the fundamental."""
     turned = basis.transpose(0, 2, 1)
     fit = np.linalg.solve(turned @ basis, turned @ y[:, :, None])
-    c, (W, per) = fit[:, 0, 0], y.shape
-    inside = range(LASTING, W - LASTING)
-    size = [np.median(c[k + 1 : k + 1 + LASTING]) - np.median(c[k - LASTING : k]) for k in inside]
+    c, per = fit[:, 0, 0], y.shape[1]
+    level = np.median(sliding_window_view(c, LASTING), axis=1)  # from each window on
+    size = level[LASTING + 1 :] - level[: -LASTING - 1]  # after and before the windows between
     most = int(np.argmax(np.abs(size)))
-    k, by = inside[most], float(size[most])
+    k, by = most + LASTING, float(size[most])
     if abs(by) < OFFSET * max(sigma, float(np.median(np.abs(np.diff(c))))):
         return []
     # within the windows about it: where the sum of what is left turns

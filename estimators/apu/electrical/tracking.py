@@ -134,7 +134,8 @@ def track(
             own = own_level is None or own_level
         share, at = np.zeros(0), cut
         turns.begin(at)
-    return _loosened(filt, _joined([_narrowed(r, base.filt.model.x) for r in pieces])), resets
+    pieces = [_narrowed(r, base.filt.model.x) for r in pieces]
+    return _loosened(filt, _joined(pieces, now.sweep)), resets
 
 
 def _lost(name: str, resets: Sequence[float], size: float) -> str:
@@ -321,8 +322,8 @@ def _loosened(filt: ElectricalFilter, r: FilterResult) -> FilterResult:
     if filt.gains == "none" or not set(SHUNTS.names) <= set(r.x.names):
         return r
     rows = r.x.indices(SHUNTS.names)
-    variance, cov = r.variance.copy(), r.final.cov
-    variance[rows] += COMMON**2
+    variance, cov = r.variance, r.final.cov
+    variance[rows] += COMMON**2  # the result is nobody else's
     along = cov[:, rows].sum(1)
     along = along / along[rows].mean()
     final = Belief(r.x, r.final.mean, cov + COMMON**2 * np.outer(along, along))
@@ -389,10 +390,19 @@ def _piece(r: FilterResult, n: int) -> FilterResult:
     return dataclasses.replace(r, **{name: getattr(r, name)[..., :n] for name in _COURSES})
 
 
-def _joined(pieces: list[FilterResult]) -> FilterResult:
-    joined: dict[str, Any] = {
-        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES
-    }
+def _joined(pieces: list[FilterResult], sweep: Sweep | None) -> FilterResult:
+    """Join pieces, which are views of one memory where a single sweep made them all."""
+    joined: dict[str, Any]
+    if sweep is not None and all(
+        a.base is b
+        for p in pieces
+        for a, b in zip((p.mean, p.variance), sweep.courses, strict=False)
+    ):
+        stats = sweep.courses[-1]
+        whole = sweep.data.t, *sweep.courses[:-1], stats[1], stats[3]
+        joined = dict(zip(_COURSES, whole, strict=True))
+    else:
+        joined = {n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES}
     joined["loglik"] = sum(p.loglik for p in pieces)
     if pieces[-1].some_cov is not None:
         joined["some_cov"] = np.concatenate([p.some_cov for p in pieces])
