@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from estimation_models import gappy, pendulum, pendulum_data, random_belief, random_linear
+from numpy.testing import assert_array_equal
 
 from apu_casadi.core.backend import compiled, find_compiler, library
 from apu_casadi.core.calling import Caller
@@ -115,3 +116,26 @@ def test_a_function_without_points_is_compiled_as_it_is():
     f = ca.Function("f", [x], [x + 1])
     assert points_in_lanes(f) is compiled(f)
     assert points_in_lanes(f, backend="vm") is f
+
+
+@pytest.mark.compiled
+def test_products_of_matrices_and_limits_have_the_bits_of_the_loop():
+    """Rows that fill lanes, and rows that do not; fmin and fmax with and without a number."""
+    sizes = ((6, 11, 1), (8, 8, 3), (17, 5, 6), (1, 4, 2))
+    x = ca.SX.sym("x")
+    mapped = ca.Function("square", [x], [x * x]).map(9)
+    given, made = [ca.MX.sym("a"), ca.MX.sym("b"), ca.MX.sym("v", 1, 9)], []
+    for n, m, q in sizes:
+        A, B, C = ca.MX.sym("A", n, m), ca.MX.sym("B", m, q), ca.MX.sym("C", n, q)
+        given += [A, B, C]
+        made.append(ca.mac(A, B, C))
+    f = ca.Function(
+        "products", given, [*made, mapped(given[2]), ca.fmin(*given[:2]), ca.fmax(*given[:2])]
+    )
+    rng = np.random.default_rng(3)
+    usual, fast = Caller(compiled(f)), Caller(points_in_lanes(f))
+    assert fast.fun.class_name() == "External" and fast.fun is not usual.fun
+    for a, b in ((1.0, 2.0), (2.0, 1.0), (np.nan, 1.0), (1.0, np.nan), (-0.0, 0.0)):
+        values = [a, b, *(rng.normal(size=f.size_in(i)) for i in range(2, f.n_in()))]
+        for own, other in zip(usual(*values), fast(*values), strict=True):
+            assert_array_equal(own, other)

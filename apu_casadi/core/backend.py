@@ -265,14 +265,23 @@ class Gradual:
     Args:
         fun, level: as for :func:`compiled`.
         copy: as for :class:`Caller`.
+        by: what compiles, called as :func:`compiled`, which it is by default.
     """
 
-    def __init__(self, fun: ca.Function, *, level: int = 1, copy: bool = True) -> None:
+    def __init__(
+        self,
+        fun: ca.Function,
+        *,
+        level: int = 1,
+        copy: bool = True,
+        by: Callable[..., ca.Function] | None = None,
+    ) -> None:
         self._fun, self._level, self._copy, self._calls = fun, level, copy, 0
+        self._by: Callable[..., ca.Function] = by or compiled
         self._call = self._made(build=False)
 
     def _made(self, *, build: bool) -> Caller:
-        return Caller(compiled(self._fun, build=build, level=self._level), copy=self._copy)
+        return Caller(self._by(self._fun, build=build, level=self._level), copy=self._copy)
 
     @property
     def inputs(self) -> list[np.ndarray]:

@@ -22,6 +22,7 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
@@ -272,7 +273,7 @@ def _caller(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int, _in_use: str
 ) -> Gradual:
     """The same in the backend in use, one for each layout."""
-    return Gradual(_function(ss, quad, turn, harmonics), level=3)
+    return Gradual(_function(ss, quad, turn, harmonics), level=3, by=points_in_lanes)
 
 
 class MeanStep(Rebuilt):
@@ -339,8 +340,8 @@ class MeanStep(Rebuilt):
                     f"{HARMONICS[-1]} fit"
                 )
             table = tables[0].filled(self.harmonics)
-            # terms, then powers, then entries
-            series = [part.transpose(2, 0, 1).ravel() for part in (table.even, table.odd)]
+            # entries, then terms, then powers
+            series = [part.ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
         self.parameters = np.concatenate([*series, self._range])
         turn = None if self.constant else turn_of(dt, w_rated)  # panels are shares of the step
@@ -374,7 +375,7 @@ class MeanStep(Rebuilt):
             parts = [np.tile(even, len(PANELS) * NODES)]
         else:
             terms = self.harmonics + 2, self.harmonics
-            parts = [np.repeat(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
+            parts = [np.tile(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
         return np.concatenate([*parts, np.zeros(2)])
 
     def expect(self, jump: float) -> None:

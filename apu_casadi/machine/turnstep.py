@@ -3,6 +3,11 @@
 The samples are a fixed *angle* apart, so that after half a turn the same few transition matrices
 come again (:class:`~apu_casadi.machine.transition.Parity`).  The step ends between two samples;
 state and means there come from polynomials through the ten around it.
+
+Only the exciter makes one sample wait for another.  So what must follow in turn is short: two
+products of a matrix and a vector, two terminal voltages, a step of the exciter.  All else is made
+for many samples at once, and the matrices of a half turn before it.  Products of matrices, and
+what is made of each sample, have forms in vector lanes (:mod:`apu_casadi.core.lanes.pointlanes`).
 """
 
 from __future__ import annotations
@@ -14,19 +19,23 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import exciter_step, hoisted, leap
+from apu_casadi.machine.propagation import exciter_step, hoisted
 from apu_casadi.machine.settling import settled
-from apu_casadi.machine.transition import SPEED_RANGE, parity
+from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through
 
 STRIDES = 28  # strides in a turn, where coefficients are periodic: 14 in a period of what ripples
+HALF = STRIDES // 2
 PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
+PAIRS = HALF // PACE
 #: Longest time, strides, in which the stator may settle behind the load and not be sampled.
 LAYER = 0.35
 _BACK = 8  # samples whose polynomial leads back to the start
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
+_NEAR = _AROUND // 2
 #: Samples before and after an end of the step that its share of the means is made of, and degrees
 #: in time of the harmonics of half a turn in them.  The power of a severe fault has ten in a turn:
 #: with polynomials through ten samples means err by 4e-4, so by 2e-5 and less.
@@ -34,77 +43,61 @@ _RIPPLE = (30, 5)
 _DEGREES = {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}
 
 
-def _powers(polynomials: np.ndarray, s: Any) -> list[Any]:
-    """Values at s, by Horner's rule."""
-    values = []
-    for row in polynomials:
-        v: Any = float(row[-1])
-        for c in row[-2::-1]:
-            v = v * s + float(c)
-        values.append(v)
-    return values
+def _powers(s: Any, count: int) -> Any:
+    """Return 1, s, s^2, ..."""
+    return ca.vertcat(1, *(s**k for k in range(1, count)))
 
 
-def _sums(cosines: dict[int, Any], sines: dict[int, Any], n: int) -> tuple[list[Any], list[Any]]:
-    """Sums of c_q cos x and of s_q sin x, x = q pi m/n, at m = 0, ..., n.
+def _turned(pairs: int, *, odd: bool) -> ca.Function:
+    """Function theta -> cos and sin, in turn, of q times each of the angles of half a turn.
 
-    Those at m and n - m differ in the signs of terms only: each is added up once.
+    q = 0, 2, ... or 1, 3, ...; shape (2 pairs, HALF), angles a stride apart from theta on.
     """
-    parts = []
-    for series, function in ((cosines, math.cos), (sines, math.sin)):
-        rows = []
-        for m in range(n // 2 + 1):
-            even, odd = ca.SX(0), ca.SX(0)
-            for q, c in series.items():
-                by = function(math.pi * q * m / n)
-                term = c * by if abs(by) > 1e-15 else 0  # exactly zero but for rounding
-                even, odd = (even, odd + term) if q % 2 else (even + term, odd)
-            rows.append((even, odd))
-        mirror = 1 if function is math.cos else -1
-        mirrored = [mirror * (even - odd) for even, odd in rows[(n - 1) // 2 :: -1]]
-        parts.append([even + odd for even, odd in rows] + mirrored)
-    return parts[0], parts[1]
-
-
-def _matrices(pairs: int, *, odd: bool) -> ca.Function:
-    """Function (coefficients of an entry, relative speed, cos q theta, sin q theta in turn) -> it.
-
-    One entry of a :class:`Table`, shape (2 pairs, 4), at the ``STRIDES / 2`` angles from theta on
-    that lie a stride apart.  There, q and ``STRIDES`` - q are the same harmonic, which leaves a
-    discrete Fourier transform whose sums mirror each other.
-    """
-    n = STRIDES // 2
-    c, s, trig = ca.SX.sym("c", 2 * pairs, 4), ca.SX.sym("s"), ca.SX.sym("trig", 2 * pairs)
-    now = ca.vertsplit(((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0])
-    cosines, sines = dict[int, Any](), dict[int, Any]()
-    for k in range(pairs):
-        (a, b), (cos, sin) = now[2 * k : 2 * k + 2], ca.vertsplit(trig[2 * k : 2 * k + 2])
-        q, sign = (2 * k + odd) % STRIDES, 1
-        if q > n:
-            q, sign = STRIDES - q, -1
-        cosines[q] = cosines.get(q, 0) + (a * cos + b * sin)
-        sines[q] = sines.get(q, 0) + sign * (b * cos - a * sin)
-    if odd:
-        even_part, odd_part = (part[: n // 2 + 1] for part in _sums(cosines, sines, n))
-    else:  # harmonics of half a turn
-        halved = [{q // 2: v for q, v in part.items()} for part in (cosines, sines)]
-        even_part, odd_part = _sums(halved[0], halved[1], n // 2)
-    mirror = -1 if odd else 1
-    values = [a + b for a, b in zip(even_part, odd_part, strict=True)]
-    values += [mirror * (even_part[m] - odd_part[m]) for m in range((n - 1) // 2, 0, -1)]
-    return ca.Function(f"entry_{odd}", [ca.vec(c), s, trig], [ca.vertcat(*values)], {"cse": True})
-
-
-def _trig(pairs: int, *, odd: bool) -> ca.Function:
-    """Function theta -> cos q theta, sin q theta in turn, q = 0, 2, ... or 1, 3, ..."""
-    theta, column = ca.SX.sym("theta"), []
+    theta, rows = ca.SX.sym("theta"), []
     cos, sin = ca.cos(theta), ca.sin(theta)
     cos2, sin2 = cos * cos - sin * sin, 2 * cos * sin
     p, q = (cos, sin) if odd else (ca.SX(1), ca.SX(0))
-    for _ in range(pairs):
-        column += [p, q]
+    for k in range(pairs):
+        by = 2 * math.pi * (2 * k + odd) / STRIDES * np.arange(HALF)
+        C, S = ca.DM(np.cos(by)).T, ca.DM(np.sin(by)).T
+        rows += [p * C - q * S, q * C + p * S]
         p, q = p * cos2 - q * sin2, q * cos2 + p * sin2
-    return ca.Function("trig", [theta], [ca.vertcat(*column)], {"cse": True})
+    return ca.Function("turned", [theta], [ca.densify(ca.vertcat(*rows))], {"cse": True})
+
+
+def _matrices(kinds: Parity, series: Any, s: Any, theta0: Any, harmonics: int) -> list[ca.MX]:
+    """Transition matrices over the strides of half a turn, each of shape (n, n + EXTRA).
+
+    Args:
+        kinds: which entries have even harmonics, and which odd ones.
+        series: a :class:`Table` with its numbers in their order.
+        s: relative speed.
+        theta0: rotor angle at the start.
+        harmonics: that the table has.
+    """
+    values, first, n = [], 0, kinds.sign.size - EXTRA
+    for odd, entries in enumerate((kinds.even.size, kinds.odd.size)):
+        terms = 2 * (harmonics // 2 + (not odd))
+        size = terms * entries
+        own = ca.reshape(series[first : first + NODES * size], size, NODES)
+        now = ca.mtimes(own, _powers(s, NODES))
+        turned = _turned(terms // 2, odd=bool(odd))(theta0)
+        values.append(ca.mtimes(ca.reshape(now, entries, terms), turned))
+        first += NODES * size
+    order = np.argsort(np.append(kinds.even, kinds.odd)).tolist()
+    made = []
+    for even, odd in zip(*(ca.horzsplit(v) for v in values), strict=True):
+        made.append(ca.reshape(ca.vertcat(even, odd)[order], n, n + EXTRA))
+    return made
+
+
+def _later(h: Any) -> ca.Function:
+    """Matrix that leads E and its derivatives, and one, on by h."""
+    shift = ca.SX.eye(EXTRA)
+    for i in range(EXTRA - 1):
+        for j in range(i + 1, EXTRA - 1):
+            shift[i, j] = h ** (j - i) / math.factorial(j - i)
+    return ca.densify(shift)
 
 
 class Turn(NamedTuple):
@@ -116,7 +109,7 @@ class Turn(NamedTuple):
     @property
     def samples(self) -> int:
         """Samples of a step, the start included."""
-        return 1 + self.halves * STRIDES // 2
+        return 1 + self.halves * HALF
 
 
 def turn_of(dt: float, w_rated: float) -> Turn:
@@ -125,116 +118,120 @@ def turn_of(dt: float, w_rated: float) -> Turn:
     Half of the samples that its polynomial goes through lie beyond the end.
     """
     strides = dt * w_rated * STRIDES / (2 * math.pi)
-    halves = math.ceil(((1 + SPEED_RANGE) * strides + _AROUND // 2) / (STRIDES // 2))
+    halves = math.ceil(((1 + SPEED_RANGE) * strides + _NEAR) / HALF)
     return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND)
 
 
-def _delayed(values: list[Any], by: Any, most: int) -> list[Any]:
-    """Return values that begin ``by`` places later, a symbol up to ``most``, with zeros before."""
-    for n in (1 << k for k in reversed(range(most.bit_length()))):
-        so = ca.ge(by, n)
-        by = by - n * so
-        later = [*[ca.SX(0)] * n, *values[:-n]]
-        values = [ca.if_else(so, b, a) for a, b in zip(values, later, strict=True)]
-    return values
+def _slice(values: Any, count: int, at: Any) -> ca.MX:
+    """Return two or more of a vector's numbers from a place on that is computed."""
+    return values.get_nz(False, ca.Slice(0, count), at)
 
 
-def _end_weights(turn: Turn) -> ca.Function:
-    """Function (length in strides) -> weights of the samples, shape (5, samples).
+class _End:
+    """Weights of the samples where a step of some length ends.
 
-    Rows: the mean, relative to a stride; the polynomial at the end of the step, through the
-    ``_AROUND`` samples around it; one through two fewer; the polynomial in the middle of the
-    exciter's last, shorter step; and what picks the sample where that step starts.
-    """
-    r = ca.SX.sym("r")
-    n = turn.samples
-    J = ca.floor(r)
-    s = r - J
-    near = _AROUND // 2
-    poly = through(1 - near, _AROUND)
-    first, partial = rippling(*_RIPPLE, STRIDES // 2, _DEGREES)
-    count, whole = first.size, np.array([np.polyval(row[::-1], 0.5) for row in partial])
-    start = first + np.cumsum(whole)  # of a step that goes on
-    # less what the intervals from J on would give to a sample near it, and what the last one does
-    last = [v - 1 for v in _powers(partial, s - 0.5)]
-    last = [v + float(whole[i + 1 :].sum()) for i, v in enumerate(last)]
-    mean = [ca.SX(float(start[j])) if j < count else ca.SX(1) for j in range(n)]
-    earliest = turn.first + _AROUND
-    begin = earliest + 1 - _RIPPLE[0]
-    beyond = n - begin - count
-    ends = _delayed([*last, *[ca.SX(-1)] * beyond], J - earliest, beyond)
-    mean[begin:] = [a + b for a, b in zip(mean[begin:], ends, strict=True)]
-    full, fewer, middle, pick = ([ca.SX(0)] * n for _ in range(4))
-    at_full = _powers(poly, s)
-    at_fewer = _powers(through(2 - near, _AROUND - 2), s)
-    from_ = PACE * ca.floor(r / PACE)
-    r_middle = (from_ + r) / 2
-    at_middle = _powers(poly, r_middle - ca.floor(r_middle))
-    for j in range(turn.first, n):
-        here = [ca.eq(J, j - 1 + near - i) for i in range(_AROUND)]
-        full[j] = sum(a * b for a, b in zip(here, at_full, strict=True))
-        fewer[j] = sum(a * b for a, b in zip(here[1:-1], at_fewer, strict=True))
-        there = [ca.eq(ca.floor(r_middle), j - 1 + near - i) for i in range(_AROUND)]
-        middle[j] = sum(a * b for a, b in zip(there, at_middle, strict=True))
-        pick[j] = ca.eq(from_, j) if j % PACE == 0 else ca.SX(0)
-    rows = [ca.horzcat(*row) for row in (mean, full, fewer, middle, pick)]
-    return ca.Function("end_weights", [r], [ca.densify(ca.vertcat(*rows))], {"cse": True})
+    Args:
+        turn: the samples.
+        r: length of the step in strides.
 
-
-def _signs(ss: GeneratorModel) -> np.ndarray:
-    """-1 for the states that half a turn reverses, 1 for the others, shape (nx, 1)."""
-    sign = np.ones((len(ss.x), 1))
-    sign[ss.x.indices(ss.reversing), 0] = -1.0
-    return sign
-
-
-class _Pair:
-    """Two strides and what is averaged over them: one step of the exciter.
-
-    All pairs of a step are one small function: seven unrolled to half a turn would not stay in the
-    processor's cache of instructions, and compile longer.  The angles of the samples are the same
-    in every half turn: what follows from them is computed once for each, and harmonics are taken
-    out of the sums over the half turns.
+    Attributes:
+        J: last sample before the end; ``_AROUND`` samples go from ``J + 1 - _NEAR`` on.
+        full, fewer: polynomial through these at the end, and through two fewer.
+        start: where the exciter's last, shorter step starts.
+        middle: polynomial in its middle, of the samples around ``J_middle``.
     """
 
-    def __init__(self, ss: GeneratorModel, quad: Sequence[str]) -> None:
-        nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
+    def __init__(self, turn: Turn, r: Any) -> None:
+        self.turn = turn
+        self.J, s = self._placed(r)
+        poly = through(1 - _NEAR, _AROUND)
+        self.full = ca.mtimes(ca.DM(poly), _powers(s, _AROUND))
+        fewer = np.pad(through(2 - _NEAR, _AROUND - 2), ((1, 1), (0, 0)))
+        self.fewer = ca.mtimes(ca.DM(fewer), _powers(s, _AROUND - 2))
+        self.start = PACE * ca.floor(self.J / PACE)
+        self.J_middle, s_middle = self._placed((self.start + r) / 2)
+        self.middle = ca.mtimes(ca.DM(poly), _powers(s_middle, _AROUND))
+        self._s = s
+
+    def _placed(self, r: Any) -> tuple[Any, Any]:
+        """Sample before an instant, one that there is also at speeds without a table; the rest."""
+        J = ca.fmin(ca.fmax(ca.floor(r), self.turn.first + _NEAR), self.turn.samples - 1 - _NEAR)
+        return J, r - J
+
+    def means(self) -> Any:
+        """Weights of the samples in a mean, relative to a stride, (samples,)."""
+        first, partial = rippling(*_RIPPLE, HALF, _DEGREES)
+        count, whole = first.size, np.array([np.polyval(row[::-1], 0.5) for row in partial])
+        # less what the intervals from J on would give to a sample near it, and what the last does
+        after = np.append(np.cumsum(whole[:0:-1])[::-1], 0.0) - 1.0
+        last = ca.mtimes(ca.DM(partial), _powers(self._s - 0.5, partial.shape[1])) + ca.DM(after)
+        n, earliest = self.turn.samples, self.turn.first + _AROUND
+        begin = earliest + 1 - _RIPPLE[0]
+        beyond = n - begin - count
+        ends = ca.vertcat(ca.DM.zeros(beyond), last, -ca.DM.ones(beyond))
+        later = ca.fmin(ca.fmax(self.J - earliest, 0), beyond)
+        mean = np.ones(n)
+        mean[:count] = first + np.cumsum(whole)  # of a step that goes on
+        more = _slice(ends, n - begin, beyond - later)
+        return ca.vertcat(ca.DM(mean[:begin]), ca.DM(mean[begin:]) + more)
+
+
+class _Seen:
+    """What is averaged, at each sample.
+
+    The angles of the samples are the same in every half turn: what follows from them is computed
+    once for each, and harmonics are taken out of the sums over the half turns.
+    """
+
+    def __init__(self, ss: GeneratorModel, quad: Sequence[str], halves: int) -> None:
         self._asked = [Term.of(q) for q in quad]
         #: values and whether they are weighted; harmonics apart
         self._own = list(dict.fromkeys((q.base, q.power, q.weighted) for q in self._asked))
-        step, V_of = leap(ss, PACE, False, chained=True)
-        x, V, u, th = (ca.SX.sym(k, n) for k, n in zip("xVut", (nx, 3, nu, nt), strict=True))
-        P = [ca.SX.sym("P", part.size, PACE) for part in (kinds.even, kinds.odd)]
-        h, angle, weights = ca.SX.sym("h"), ca.SX.sym("angle"), ca.SX.sym("weights", 2, PACE)
-        #: (x, u, theta, length of a stride, weight of a first sample in it) -> (x as it settles,
-        #: what is averaged, terminal voltage), both with what passes by before
-        weight = ca.SX.sym("weight")
+        at, n = split(ss), len(ss.linear)
+        x, u, th = (
+            ca.SX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True)
+        )
+        y, weights = ss.g(x, u, th), ca.SX.sym("weights", 2)
+        terms = [Term(b, k, "", 0, w).value(ss, x, y) for b, k, w in self._own]
+        values = ca.vertcat(
+            *(v * weights[int(w)] for v, (*_, w) in zip(terms, self._own, strict=True))
+        )
+        others = [i for i in at.slow if i != at.drive]
+        if others and any(ca.which_depends(values, x[others], 1, True)):
+            raise NotApplicable(f"{ss.name}: a mean of what the exciter's inner states decide")
+        at_sample = ca.Function("terms", [x, u, th, weights], [values, y[ss.y.index("V_t")]])
+        #: (x, u, theta, length of a stride, weight of a first sample in it, weights as of others)
+        #: -> (x as it settles, terms, terminal voltage), both with what passes by before
+        h, weight = ca.SX.sym("h"), ca.SX.sym("weight")
         after, area = settled(ss, False)(x, u, th, LAYER * h)
-        first, _ = self._values(ss, after + area / (weight * h), u, th)
-        seen = V_of(after + area * (6 / (PACE * h)), u, th)[0]
-        given, made = [x, u, th, h, weight], [after, first, seen]
-        self.start = ca.Function("start", given, made, {"cse": True})
-        x_now = ca.SX(x)
-        x_now[ss.x.index("theta_e")] = angle
-        X, V_end = step(x_now, V, ca.vertcat(*map(ca.vec, P)), u, th, h)
-        values = [self._values(ss, x_j, u, th) for x_j in ca.horzsplit(X)]
-        terms = [self.weighted(v, weights[:, j]) for j, (v, _) in enumerate(values)]
-        outputs = [X, V_end, ca.horzcat(*terms), ca.horzcat(*(v for _, v in values))]
-        #: (x, V, even and odd entries, weights plain and of weighted means (2, PACE), d) ->
-        #: (x at the strides, V, terms by their weights, terminal voltages); and (u, theta, length
-        #: of a stride, angle at the start) -> d, the same in every half turn
-        fixed = ca.vertcat(u, th, h, angle)
-        self.over, self.before = hoisted("pair", [x, V, *P, weights], fixed, outputs)
+        first, _ = at_sample(after + area / (weight * h), u, th, weights)
+        _, V_seen = at_sample(after + area * (6 / (PACE * h)), u, th, weights)
+        made = [after, first, V_seen]
+        self.start = ca.Function("start", [x, u, th, h, weight, weights], made, {"cse": True})
+        sample, angle = ca.SX.sym("sample", n + 2), ca.SX.sym("angle")
+        full = ca.SX(len(ss.x), 1)
+        full[at.linear], full[at.drive], full[at.angle] = sample[:n], sample[n], angle
+        own = at_sample(full, u, th, weights)[0]
+        one, self.before = hoisted("seen", [sample, weights], ca.vertcat(u, th, angle), [own])
+        d = ca.SX.sym("d", self.before.numel_out(0))
+        samples = [ca.SX.sym("sample", n + 2) for _ in range(halves)]
+        plain, light = ca.SX.sym("plain", halves), ca.SX.sym("light", halves)
+        each = zip(samples, ca.vertsplit(plain), ca.vertsplit(light), strict=True)
+        total = sum(one(v, ca.vertcat(*w), d) for v, *w in each)
+        #: (sample of each half turn, weights plain and of weighted means in each, d) -> sums of
+        #: terms by their weights, at one angle; and (u, theta, angle) -> d
+        self.over = ca.Function("over", [*samples, plain, light, d], [total], {"cse": True})
 
-    def _values(self, ss: GeneratorModel, x: Any, u: Any, th: Any) -> tuple[Any, Any]:
-        """Return what is averaged, and the terminal voltage, at a sample."""
-        y = ss.g(x, u, th)
-        terms = [Term(b, n, "", 0, w).value(ss, x, y) for b, n, w in self._own]
-        return ca.vertcat(*terms), y[ss.y.index("V_t")]
+    def sums(self, samples: Sequence[Any], weights: tuple[Any, Any], fixed: Any) -> Any:
+        """Sums over the half turns at each angle of one, (terms, HALF).
 
-    def weighted(self, terms: Any, weights: Any) -> Any:
-        """Return terms of a sample by their weights, plain and of weighted means, (2,)."""
-        return terms * ca.vertcat(*(weights[int(w)] for *_, w in self._own))
+        Args:
+            samples: of each half turn, (n + 2, HALF).
+            weights: plain and of weighted means, (HALF, halves).
+            fixed: u, theta and angle, (..., HALF).
+        """
+        d = self.before.map(HALF)(fixed)
+        return self.over.map(HALF)(*samples, *(w.T for w in weights), d)
 
     def means(self, sums: Any, angles: Any) -> Any:
         """Return the means asked for from sums over the half turns at angles, (terms, angles)."""
@@ -248,7 +245,209 @@ class _Pair:
         return ca.Function("means", given, [ca.vertcat(*found)], {"cse": True})(sums, angles)
 
 
-def _seen_of_a_jump(V_now: Any, voltages: list[Any], pairs: int, length: Any) -> Any:
+_NEARBY = 0.02  # argument with which six terms of the exponential's series err by 1e-13
+
+
+def _given_exps(f: ca.Function) -> tuple[ca.Function, ca.Function]:
+    """Write an SX function of (slow, V_t, ...) with the values of its exponentials as an input.
+
+    Those of other inputs alone stay as they are.
+
+    Returns:
+        Function(*inputs, exponentials) -> outputs, and Function(*inputs, exponentials) -> their
+        arguments.
+    """
+    inputs = f.sx_in()
+    results = [ca.SX(f.sparsity_out(i)) for i in range(f.n_out())]
+    values, moves = [ca.SX(0)] * f.sz_w(), [False] * f.sz_w()
+    exps, arguments = [ca.SX(0, 1)], [ca.SX(0, 1)]
+    for k in range(f.n_instructions()):
+        op, at, to = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
+        if op == ca.OP_OUTPUT:
+            results[to[0]].nz[to[1]] = values[at[0]]
+            continue
+        if op == ca.OP_INPUT:
+            made, moving = inputs[at[0]].nz[at[1]], at[0] < 2
+        elif op == ca.OP_CONST:
+            made, moving = ca.SX(f.instruction_constant(k)), False
+        else:
+            parts, moving = [values[i] for i in at], any(moves[i] for i in at)
+            if op == ca.OP_EXP and moving:
+                made = ca.SX.sym("e")
+                exps.append(made)
+                arguments += parts
+            else:
+                made = (ca.SX.unary if len(at) == 1 else ca.SX.binary)(op, *parts)
+        values[to[0]], moves[to[0]] = made, moving
+    e = ca.vertcat(*exps)
+    given = [*inputs, e]
+    return ca.Function("given", given, results), ca.Function("of", given, [ca.vertcat(*arguments)])
+
+
+class _Exciter:
+    """The exciter between the samples, without an exponential in its chain of steps.
+
+    Its saturation moves by little from one step to the next, so that a few terms of a series are
+    as good, and do not keep the next step waiting.
+
+    Attributes:
+        exps: exponentials in it.
+        started: Function (states, V_t, V_ref, theta) -> rates, E with its derivatives, and
+            exponentials.
+
+    Raises:
+        NotApplicable: an exponential is of something that is not linear in the states.
+    """
+
+    def __init__(self, ss: GeneratorModel) -> None:
+        at = split(ss)
+        slow, V, V_ref = ca.SX.sym("slow", len(at.slow)), ca.SX.sym("V"), ca.SX.sym("V_ref")
+        th, full = ca.SX.sym("t", len(ss.theta)), ca.SX.zeros(len(ss.x))
+        full[at.slow] = slow
+        given = [slow, V, V_ref, th]
+        both = [ss.exciter(full, V, V_ref, th), exciter_step(ss)[0](*given)]
+        self._of, arguments = _given_exps(ca.Function("both", given, both, {"cse": True}))
+        self.exps: int = self._of.numel_in(len(given))
+        e = ca.SX.sym("e", self.exps)
+        own = arguments(*given, e)
+        slopes = ca.jacobian(own, slow)
+        others = any(ca.which_depends(own, ca.vertcat(V, e), 1, True))
+        if others or any(ca.which_depends(ca.vec(ca.densify(slopes)), slow, 1, True)):
+            raise NotApplicable(f"{ss.name}: the exciter's exponential is not of its states alone")
+        self._slopes = ca.Function("slopes", [V_ref, th], [slopes])
+        made = [*self._of(*given, ca.exp(own)), ca.exp(own)]
+        self.started = ca.Function("started", given, made, {"cse": True})
+
+    def near(self, moved: Any, e: Any, V_ref: Any, th: Any) -> tuple[Any, Any]:
+        """Exponentials where the states have moved by so much, and whether that is near enough."""
+        if not self.exps:
+            return e, 1.0
+        by = self._slopes(V_ref, th) @ moved
+        square = by * by  # in this order few terms wait for others
+        high = (0.5 + by * (1 / 6)) + square * (1 / 24 + by * (1 / 120))
+        return e * ((1.0 + by) + square * high), ca.mmax(ca.fabs(by)) <= _NEARBY
+
+    def at(self, now: Sequence[Any], e: Any) -> tuple[Any, Any]:
+        """Rates of the states, and E with its derivatives, at (states, V_t, V_ref, theta)."""
+        made: tuple[Any, Any] = self._of(*now, e)
+        return made
+
+
+class _Voltage:
+    """The terminal voltage as the rms of a space vector that is linear in x and E.
+
+    Raises:
+        NotApplicable: it is not.
+    """
+
+    def __init__(self, ss: GeneratorModel) -> None:
+        at, n = split(ss), len(ss.linear)
+        w, angle = ca.SX.sym("w", n + 1), ca.SX.sym("angle")
+        u, th = ca.SX.sym("u", len(ss.u)), ca.SX.sym("t", len(ss.theta))
+        full = ca.SX(len(ss.x), 1)
+        full[at.linear], full[at.drive], full[at.angle] = w[:n], w[n], angle
+        y = ss.g(full, u, th)
+        a, b, c = (y[ss.y.index(f"v_{k}")] for k in "abc")
+        vector = ca.vertcat((2.0 * a - b - c) / 3.0, (b - c) / math.sqrt(3.0)) / math.sqrt(2.0)
+        rows = ca.jacobian(vector, w)
+        offset, V0 = ca.substitute([vector, y[ss.y.index("V_t")]], [w], [ca.SX.zeros(n + 1)])
+        given = [u, th, angle]
+        if any(ca.which_depends(ca.vec(ca.densify(rows)), w, 1, True)):
+            raise NotApplicable(f"{ss.name}: the terminal voltage is not linear in the windings")
+        whole = ca.vertcat(ca.horzcat(ca.SX.eye(n), ca.SX.zeros(n, 2)), ca.horzcat(rows, offset))
+        #: (u, theta, angle) -> matrix that makes (x, vector) of (x, E, 1)
+        self.rows = ca.Function("rows", given, [ca.densify(whole)], {"cse": True})
+        #: (u, theta, angle) -> square of the voltage without that of the vector
+        self.rest = ca.Function("rest", given, [V0**2 - ca.sumsqr(offset)], {"cse": True})
+
+
+def _between(
+    ss: GeneratorModel, exciter: _Exciter, voltage: _Voltage
+) -> tuple[ca.Function, ca.Function]:
+    """What stands between the products of two steps of the exciter.
+
+    First: (x and space vector at the strides of a pair, one each; z, S, d) -> (z, S, samples), with
+    z = (x, E, E', E'', E''', 1) and S = (exciter's states, their rates, exponentials, largest error
+    of the drive so far) where a pair starts, and x, E and terminal voltage at its samples.  Second:
+    (u, theta, length of a stride, angle at the start) -> d.
+    """
+    at, n = split(ss), len(ss.linear)
+    slow, k1 = (ca.SX.sym(k, len(at.slow)) for k in ("slow", "k1"))
+    e, miss = ca.SX.sym("e", exciter.exps), ca.SX.sym("miss")
+    u, th = ca.SX.sym("u", len(ss.u)), ca.SX.sym("t", len(ss.theta))
+    z, h, angle = ca.SX.sym("z", n + EXTRA), ca.SX.sym("h"), ca.SX.sym("angle")
+    rows = [ca.SX.sym("x", n + 2) for _ in range(PACE)]
+    x, V_ref, rest = [r[:n] for r in rows], u[ss.u.index("V_ref")], voltage.rest(u, th, angle)
+    # only the drive enters outputs between the exciter's steps
+    E = [(_later(ca.SX((j + 1) * h)) @ z[n:])[0] for j in range(PACE)]
+    V = [ca.sqrt(ca.sumsqr(r[n:]) + rest) for r in rows]
+
+    # the classical Runge-Kutta method.  Under a fault the terminal voltage ripples with twice the
+    # frequency: in the middle a straight line would cut that by 1 %
+    H, middle, rates = PACE * h, V[PACE // 2 - 1], [k1]
+    for share, V_now in ((0.5, middle), (0.5, middle), (1.0, V[-1])):
+        moved = (share * H) * rates[-1]
+        e_now, _ = exciter.near(moved, e, V_ref, th)
+        rates.append(exciter.at((slow + moved, V_now, V_ref, th), e_now)[0])
+    _, k2, k3, k4 = rates
+    moved = (H / 6) * (k1 + 2 * (k2 + k3)) + (H / 6) * k4
+    after, (e_after, near) = slow + moved, exciter.near(moved, e, V_ref, th)
+    k_after, drive = exciter.at((after, V[-1], V_ref, th), e_after)
+    end = after[at.slow.index(at.drive)]
+    miss_after = ca.fmax(miss, ca.fabs(end - E[-1])) + (1 - near)
+    samples = [ca.vertcat(*own) for own in zip(x, [*E[:-1], end], V, strict=True)]
+    outputs = [
+        ca.vertcat(x[-1], drive, 1),
+        ca.vertcat(after, k_after, e_after, miss_after),
+        ca.vertcat(*samples),
+    ]
+    given = [*rows, z, ca.vertcat(slow, k1, e, miss)]
+    return hoisted("between", given, ca.vertcat(u, th, h, angle), outputs)
+
+
+def _half_turn(ss: GeneratorModel, between: ca.Function, n_d: int) -> ca.Function:
+    """Function (z, S, matrices of each pair, d of each) -> (z, S, samples, S of each pair).
+
+    It is called again and again: unrolled to a step, it would not stay in the processor's cache of
+    instructions.
+    """
+    n = len(ss.linear)
+    z, S = z_k, S_k = ca.MX.sym("z", n + EXTRA), ca.MX.sym("S", between.numel_in(PACE + 1))
+    P = [ca.MX.sym("P", n + 2, n + EXTRA) for _ in range(HALF)]
+    d = [ca.MX.sym("d", n_d) for _ in range(PAIRS)]
+    samples, starts = [], []
+    for k in range(PAIRS):
+        starts.append(S_k)
+        x = [ca.mtimes(own, z_k) for own in P[PACE * k : PACE * (k + 1)]]
+        z_k, S_k, its = between(*x, z_k, S_k, d[k])
+        samples.append(its)
+    z_k = z_k * parity(ss, 1).sign
+    outputs = [z_k, S_k, ca.vertcat(*samples), ca.vertcat(*starts)]
+    return ca.Function("half_turn", [z, S, *P, *d], outputs)
+
+
+def _from_start(P: Sequence[Any], rows: Sequence[Any], h: Any) -> list[Any]:
+    """Return matrices that lead from the start of each pair to (x, space vector) at its samples.
+
+    Args:
+        P: transition matrices of the strides.
+        rows: what makes (x, space vector) of (x, E, 1) at the end of each.
+        h: length of a stride, s.
+    """
+    n, made, by = P[0].shape[0], [], ca.SX.sym("h")
+    later = ca.Function("later", [by], [_later(by), _later(2 * by)])(h)
+    for k in range(0, len(P), PACE):
+        first, second = P[k : k + PACE]
+        of_drive = ca.horzcat(ca.MX.zeros(n, n), ca.mtimes(second[:, n:], later[0]))
+        for own, leads, shift in zip(
+            rows[k : k + PACE], (first, ca.mac(second[:, :n], first, of_drive)), later, strict=True
+        ):
+            E_and_one = ca.horzcat(ca.MX.zeros(2, n), shift[[0, -1], :])
+            made.append(ca.mac(own[:, :n], leads, ca.mtimes(own[:, n:], E_and_one)))
+    return made
+
+
+def _seen_of_a_jump(V_now: Any, V: Sequence[Any], length: Any) -> Any:
     """Relative error of the mean voltage that a jump at the start makes the regulator see.
 
     It takes the voltage of the first instant for true over a sixth of its first step; a jump of the
@@ -258,89 +457,109 @@ def _seen_of_a_jump(V_now: Any, voltages: list[Any], pairs: int, length: Any) ->
 
     Args:
         V_now: at the first instant.
-        voltages: those at its start, and of the pairs that follow.
-        pairs: in half a turn.
+        V: those at the samples of the first half turns, (1, HALF) each.
         length: of the step, in strides.
     """
-    near = ca.mtimes(ca.horzcat(*voltages[1 : 1 + _BACK // PACE]), ca.DM(through(1, _BACK)[:, 0]))
-    a, b, c = (voltages[pairs * k][-1] for k in (1, 2, 3))
-    off = (ca.fabs(1 - V / V_now) for V in (near, 3 * a - 3 * b + c))
+    near = ca.mtimes(V[0][:_BACK], ca.DM(through(1, _BACK)[:, 0]))
+    a, b, c = (v[-1] for v in V[:3])
+    off = (ca.fabs(1 - v / V_now) for v in (near, 3 * a - 3 * b + c))
     return ca.fmin(*off) * PACE / (6 * length)
+
+
+class _Chain(NamedTuple):
+    """What followed in turn: samples of each half turn, (n + 2, HALF), and S of each pair."""
+
+    samples: list[Any]
+    starts: list[Any]
+    miss: Any
+
+
+def _at_end(ss: GeneratorModel, chain: _Chain, end: _End) -> tuple[Any, Any, list[Any]]:
+    """Return the windings at the end, by all samples around it and by fewer, and the exciter there.
+
+    The latter by its states where its last step starts, and the terminal voltages there, in the
+    middle and at the end.
+    """
+    n, first = len(ss.linear), (end.turn.first - 1) // HALF
+    rows, n_S = n + 2, chain.starts[0].numel() // PAIRS
+    tail = ca.vertcat(*(ca.vec(v) for v in chain.samples[first:]))
+    begin = 1 + HALF * first  # number of the first sample of the tail
+
+    def around(J: Any) -> Any:
+        place = (J + 1 - _NEAR - begin) * rows
+        return ca.reshape(_slice(tail, rows * _AROUND, place), rows, _AROUND)
+
+    # the phases as they are after so many half turns
+    count = HALF * (end.turn.halves - first)
+    signs = ca.DM((-1.0) ** (first + np.arange(count) // HALF))
+    turned = _slice(ca.MX(signs), _AROUND, end.J + 1 - _NEAR - begin)
+    weights = ca.horzcat(end.full, end.fewer)
+    keep = np.append(parity(ss, 1).sign[:n], [1.0, 1.0]) > 0
+    samples = around(end.J)
+    found = ca.mtimes(samples, weights) * keep[:, None]
+    if not keep.all():
+        found += ca.mtimes(samples, weights * ca.repmat(turned, 1, 2)) * ~keep[:, None]
+    V_middle = ca.mtimes(around(end.J_middle)[n + 1, :], end.middle)
+    starts = ca.vertcat(*chain.starts[first:])
+    slow = _slice(starts, len(split(ss).slow), (end.start / PACE - PAIRS * first) * n_S)
+    V_start = _slice(tail, 2, (end.start - begin) * rows + n)[1]  # of E and V_t
+    return found[:n, 0], found[:n, 1], [slow, ca.vertcat(V_start, V_middle, found[n + 1, 0])]
 
 
 def periodic_step(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn, harmonics: int
 ) -> ca.Function:
     """Function (x0, series, u, theta, dt) -> (x, mean, miss) for periodic coefficients."""
-    nx, nu, nt, kinds = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1)
-    n_even, n_odd = kinds.even.size, kinds.odd.size
+    at, kinds = split(ss), parity(ss, 1)
+    n = len(at.linear)
     trigs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
-    sizes = 4 * 2 * trigs[0] * n_even, 4 * 2 * trigs[1] * n_odd
-    X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
-    parameters, DT = ca.MX.sym("series", sum(sizes) + 2), ca.MX.sym("dt")
-    w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
-    s = (w - parameters[-2]) / parameters[-1]
-    theta0, stride = X0[at], 2 * math.pi / STRIDES
-    # transition matrices of the strides in half a turn, the same for every half turn
-    half_turn = STRIDES // 2
-    P = []
-    for i, (first, rows) in enumerate(((0, n_even), (sizes[0], n_odd))):
-        series = ca.reshape(parameters[first : first + sizes[i]], -1, rows)
-        entry = _matrices(trigs[i], odd=bool(i)).map("all", "serial", rows, [1, 2], [])
-        trig = _trig(trigs[i], odd=bool(i))(theta0)
-        P.append(entry(series, s, trig).T)
-    pair, h_now = _Pair(ss, quad), stride / w
-    length = DT / h_now
-    weights = _end_weights(turn)(length)
+    size = NODES * 2 * (trigs[0] * kinds.even.size + trigs[1] * kinds.odd.size)
+    X0, U, TH = (ca.MX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True))
+    parameters, DT = ca.MX.sym("series", size + 2), ca.MX.sym("dt")
+    w, V_ref = U[ss.u.index("w_r")], U[ss.u.index("V_ref")]
+    theta0, stride = X0[at.angle], 2 * math.pi / STRIDES
+    h, s = stride / w, (w - parameters[-2]) / parameters[-1]
+    length, angles = DT / h, theta0 + stride * ca.DM(np.arange(HALF + 1)).T
+    end, seen = _End(turn, length), _Seen(ss, quad, turn.halves)
+    relative = end.means()
+    plain = relative / length
     # beyond the end of the step the weight goes on as the polynomial that it is
-    shares = ca.DM(np.arange(turn.samples)).T / length
-    plain = weights[0, :] / length
-    both = ca.vertcat(plain, plain * window(shares))
-    angles = theta0 + stride * ca.DM(np.arange(half_turn + 1)).T
-    x_k, terms, V_now = pair.start(X0, U, TH, h_now, weights[0, 0])
-    V_k, samples, voltages = ca.vertcat(V_now, 0, 0), [x_k], [V_now]
-    first, *rest = ca.horzsplit(both, [0, *range(1, turn.samples + 1, PACE)])
-    pairs = half_turn // PACE
-    fixed = ca.vertcat(ca.repmat(ca.vertcat(U, TH, h_now), 1, pairs), angles[:-1:PACE])
-    held = list(zip(*(ca.horzsplit(p, PACE) for p in P), strict=True))
-    d = ca.horzsplit(pair.before.map(pairs)(fixed))
-    sums = [ca.MX(0)] * pairs
-    for k, own in enumerate(rest):
-        at_pair = k % pairs
-        X, V_k, its, V = pair.over(x_k, V_k, *held[at_pair], own, d[at_pair])
-        x_k = X[:, -1]
-        if at_pair == pairs - 1:
-            x_k = x_k * _signs(ss)
-        sums[at_pair] = sums[at_pair] + its
-        samples.append(X)
-        voltages.append(V)
-    jump = _seen_of_a_jump(V_now, voltages, pairs, length)
-    mean = pair.means(ca.horzcat(pair.weighted(terms, first), *sums), angles)
-    V_all = ca.horzcat(*voltages)
-    # the end of the step, with the phases as they are after so many half turns
-    tail = np.arange(turn.first, turn.samples)
-    turned = np.maximum(0, (tail - 1) // (STRIDES // 2)) % 2 == 1
-    reversed_ = np.where(turned, _signs(ss), 1.0)
-    X_tail = ca.horzcat(*samples)[:, turn.first :] * reversed_
-    ends = ca.mtimes(X_tail, weights[1:, turn.first :].T)
-    linear = np.zeros((nx, 1))
-    linear[ss.x.indices(ss.linear), 0] = 1
+    light = plain * window(ca.DM(np.arange(turn.samples)) / length)
+    first = ca.vertcat(plain[0], light[0])
+    x_now, terms, V_now = seen.start(X0, U, TH, h, relative[0], first)
+
+    exciter, voltage = _Exciter(ss), _Voltage(ss)
+    between, before = _between(ss, exciter, voltage)
+    held = ca.repmat(ca.vertcat(U, TH), 1, HALF)
+    fixed = ca.vertcat(held[:, :PAIRS], ca.repmat(h, 1, PAIRS), angles[:-1:PACE])
+    rows = voltage.rows.map(HALF)(held[: len(ss.u), :], held[len(ss.u) :, :], angles[1:])
+    P = _matrices(kinds, parameters, s, theta0, harmonics)
+    P = _from_start(P, ca.horzsplit(rows, n + 2), h)
+    given = [*P, *ca.horzsplit(before.map(PAIRS)(fixed))]
+    half_turn = _half_turn(ss, between, before.numel_out(0))
+    rates, drive, e = exciter.started(x_now[at.slow], V_now, V_ref, TH)
+    z, S = ca.vertcat(x_now[at.linear], drive, 1), ca.vertcat(x_now[at.slow], rates, e, 0)
+    samples, starts = [], []
+    for _ in range(turn.halves):
+        z, S, of_samples, of_starts = half_turn(z, S, *given)
+        samples.append(ca.reshape(of_samples, n + 2, HALF))
+        starts.append(of_starts)
+    chain = _Chain(samples, starts, S[-1])
+    weights = tuple(ca.reshape(v[1:], HALF, turn.halves) for v in (plain, light))
+    sums = seen.sums(samples, (weights[0], weights[1]), ca.vertcat(held, angles[1:]))
+    mean = seen.means(ca.horzcat(terms, sums), angles)
+
+    windings, by_fewer, (slow, voltages) = _at_end(ss, chain, end)
     # the exciter's last step is as long as it must be
-    V_tail = V_all[turn.first :]
-    V_end, V_middle, V_start = (ca.mtimes(V_tail, weights[k, turn.first :].T) for k in (1, 3, 4))
-    rest = DT - h_now * PACE * ca.floor(length / PACE)
-    _, exciter = exciter_step(ss)
-    slow = [i for i in range(nx) if i != at and not linear[i, 0]]
-    x_end = ca.MX(ends[:, 0])
-    V_ref = U[ss.u.index("V_ref")]
-    drives = ca.vertcat(V_start, V_middle, V_end)
-    x_end[slow] = exciter(ends[:, 3][slow], drives, V_ref, TH, rest)
-    x_end[at] = theta0 + w * DT
-    doubt = ca.mmax(ca.fabs(ends[:, 0] - ends[:, 1]) * linear / ss.x.nominals)
+    x_end = ca.MX(len(ss.x), 1)
+    x_end[at.slow] = exciter_step(ss)[1](slow, voltages, V_ref, TH, DT - h * end.start)
+    x_end[at.linear], x_end[at.angle] = windings, theta0 + w * DT
+    doubt = ca.mmax(ca.fabs(windings - by_fewer) / ss.x.nominals[at.linear])
+    jump = _seen_of_a_jump(V_now, [v[n + 1, :] for v in samples[:3]], length)
     return ca.Function(
         f"means_{ss.name}",
         [X0, parameters, U, TH, DT],
-        [x_end, mean, ca.vertcat(V_k[2], doubt, jump)],
+        [ca.densify(x_end), mean, ca.vertcat(chain.miss, doubt, jump)],
         ["x0", "series", "u", "theta", "dt"],
         ["x", "mean", "miss"],
     )

@@ -24,6 +24,7 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.lanes.together import Together, asking
 from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
@@ -347,7 +348,8 @@ def _caller(
         function = block_function(machines, family.step, link, name, steps=steps, wide=wide)
         # single steps by tables are a tenth of a block
         small = 1 if any(isinstance(m, Collocated) for m in machines) else BLOCK // steps
-        return Together(function, function, Gradual(function, level=3, copy=False), small=small)
+        one = Gradual(function, level=3, copy=False, by=points_in_lanes)
+        return Together(function, function, one, small=small)
 
     key = (link.structure, steps, wide, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

@@ -14,8 +14,9 @@ often of a single factor as of all four.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -137,21 +138,19 @@ def _weighed(
     jumps, of = jumps_of(filt)
     r = filt.run(data, prior=prior, backend=backend)
     g = glr(linearised(filt.model, r, data, jumps, backend=backend), onsets := _onsets(*about))
-    after = _After(filt, data, r, backend)
-
-    def likely(name: str, parts: list[str], size: list[float]) -> float:
+    by_signature: list[tuple[str, _Supposed, float, float]] = []
+    for name, (parts, size) in [*of.items(), *((n, ([n], [JUMP])) for n in HEALTH)]:
         v = g.log_marginal(parts, np.zeros(len(parts)), np.diag(np.square(size)))
         top = int(v.argmax())
-        best, onset = float(v[top]), int(onsets[top])
-        if set(parts) <= set(filt.model.x.names) and not set(parts) & set(filt.model.consider):
-            best = after.opened(onset, parts, size)
-        if (sensor := name.removeprefix("sensor ")) in filt.model.y:
-            best = float(np.logaddexp(best, after.blind(onset, sensor))) - math.log(2.0)
-        return best + math.log(np.mean(np.exp(v - v[top])))
-
-    found = {"none": 0.0} | {name: likely(name, *own) for name, own in of.items()}
-    each = {n: likely(GAS, [n], [JUMP]) for n in HEALTH}
-    each = {n: v + math.log((1 - ALL) / len(HEALTH)) for n, v in each.items()}
+        states = set(parts) <= set(filt.model.x.names) and not set(parts) & set(filt.model.consider)
+        opened = (tuple(parts), tuple(size)) if states else None
+        sensor = name.removeprefix("sensor ")
+        at = _Supposed(int(onsets[top]), opened, sensor if sensor in filt.model.y else "")
+        by_signature.append((name, at, float(v[top]), math.log(np.mean(np.exp(v - v[top])))))
+    after = _After.of(filt, data, r, [at for _, at, _, _ in by_signature], backend)
+    likely = {n: after.likely(at, best) + spread for n, at, best, spread in by_signature}
+    each = {n: likely.pop(n) + math.log((1 - ALL) / len(HEALTH)) for n in HEALTH}
+    found = {"none": 0.0} | likely
     each |= {SEVERAL: found[GAS] + math.log(ALL)}
     found[GAS] = float(np.logaddexp.reduce([*each.values()]))
     return probabilities(found, PRIOR), named_posterior(each)
@@ -161,9 +160,33 @@ def _onsets(onset: int, k: int) -> np.ndarray:
     return np.arange(max(min(k - BACK, onset - BEFORE), 1), k + 1)
 
 
+class _Supposed(NamedTuple):
+    """A hypothesis as the filter takes it.
+
+    Args:
+        onset: the sample from which on it holds.
+        opened: states that may have jumped, and by how much; None where they are none.
+        sensor: which may be off what the others predict; "" for none.
+    """
+
+    onset: int
+    opened: tuple[tuple[str, ...], tuple[float, ...]] | None
+    sensor: str
+
+    @property
+    def runs(self) -> Iterator[_Supposed]:
+        """What the filter is run with: nothing, opened states, the sensor."""
+        if self.opened or self.sensor:
+            yield _Supposed(self.onset, None, "")
+        if self.opened:
+            yield _Supposed(self.onset, self.opened, "")
+        if self.sensor:
+            yield _Supposed(self.onset, None, self.sensor)
+
+
 @dataclass(frozen=True, eq=False)
 class _After:
-    """The filter from an onset on, as it would run if a change were known to have come then.
+    """The filter from onsets on, as it would run if a change were known to have come then.
 
     A signature is linear about estimates that a change has spoilt: one of P3 by 4 % is 20 of its
     standard deviations, and what the linear terms lack would be told as a change of health.
@@ -171,51 +194,60 @@ class _After:
 
     filt: GasPathFilter
     data: Recording
-    r: FilterResult
-    backend: str | None
-    unchanged: dict[int, float] = field(default_factory=dict)  # log-likelihoods by onset
+    results: Mapping[_Supposed, FilterResult]
 
-    def opened(self, onset: int, names: Sequence[str], size: Sequence[float]) -> float:
-        """Log-likelihood gained if states may have jumped by so much."""
-        return self._loglik(onset, names, size) - self._without(onset)
+    @classmethod
+    def of(
+        cls,
+        filt: GasPathFilter,
+        data: Recording,
+        r: FilterResult,
+        supposed: Sequence[_Supposed],
+        backend: str | None,
+    ) -> _After:
+        """Run the filter for all hypotheses together, from what ``r`` knew before their onsets."""
+        assert r.mean_pred is not None and r.cov_pred is not None
+        runs = [*dict.fromkeys(run for at in supposed for run in at.runs)]
+        priors, parts = [], []
+        for onset, opened, sensor in runs:
+            cov = r.cov_pred[onset].copy()
+            if opened:
+                at = r.x.indices(opened[0])
+                cov[at, at] += np.square(opened[1])
+            priors.append(Belief(r.x, r.mean_pred[:, onset], cov))
+            of = _blinded(data, filt.model.y.index(sensor), onset) if sensor else data
+            parts.append(of.part(onset, data.size))
+        results = filt.run_each(priors, parts, backend=backend)
+        return cls(filt, data, dict(zip(runs, results, strict=True)))
 
-    def blind(self, onset: int, sensor: str) -> float:
+    def likely(self, at: _Supposed, best: float) -> float:
+        """Log-likelihood gained by a hypothesis; ``best``: the same by its signature alone."""
+        if at.opened:
+            best = self._gained(self.results[_Supposed(at.onset, at.opened, "")].loglik, at.onset)
+        if at.sensor:
+            best = float(np.logaddexp(best, self._blind(at.onset, at.sensor))) - math.log(2.0)
+        return best
+
+    def _gained(self, loglik: float, onset: int) -> float:
+        return float(loglik - self.results[_Supposed(onset, None, "")].loglik)
+
+    def _blind(self, onset: int, sensor: str) -> float:
         """The same if a sensor is off what the others predict: noise of any size, bias, drift."""
         row = self.filt.model.y.index(sensor)
-        data = _blinded(self.data, row, onset)
-        r = self._run(data, onset, self._before(onset))
+        variance = self.data.variance[row, onset:]
+        r = self.results[_Supposed(onset, None, sensor)]
         there = np.isfinite(r.innovation[row])
         nu, S = r.innovation[row, there], r.innovation_variance[row, there]
         if nu.size < FEWEST:
             return -math.inf
         own = -0.5 * float((nu**2 / S + np.log(2 * math.pi * S)).sum())
         # its noise is found: half the logarithm of the number of readings for that
-        white = max(float(np.mean(nu**2)), float(np.min(self.data.variance[row, onset:])))
+        white = max(float(np.mean(nu**2)), float(np.min(variance)))
         instead = -0.5 * nu.size * (1 + math.log(2 * math.pi * white)) - 0.5 * math.log(nu.size)
         # its own noise again, and a line through what it is off
-        more = (data.variance - self.data.variance)[row, onset:]
-        s = np.sqrt(S - more[there])
+        s = np.sqrt(S - (variance * WIDE - variance)[there])
         line = np.column_stack([np.ones(nu.size), np.arange(nu.size)]) / s[:, None]
         rest = nu / s - line @ np.linalg.lstsq(line, nu / s, rcond=None)[0]
         drift = -0.5 * float(rest @ rest + np.log(2 * math.pi * s**2).sum()) - math.log(nu.size)
         instead = float(np.logaddexp(instead, drift)) - math.log(2.0)
-        return float(r.loglik - own + instead) - self._without(onset)
-
-    def _without(self, onset: int) -> float:
-        if onset not in self.unchanged:
-            self.unchanged[onset] = self._loglik(onset, (), ())
-        return self.unchanged[onset]
-
-    def _before(self, onset: int) -> Belief:
-        assert self.r.mean_pred is not None and self.r.cov_pred is not None
-        return Belief(self.r.x, self.r.mean_pred[:, onset], self.r.cov_pred[onset])
-
-    def _run(self, data: Recording, onset: int, belief: Belief) -> FilterResult:
-        part = data.part(onset, data.size)
-        return self.filt.run(part, prior=belief, backend=self.backend)
-
-    def _loglik(self, onset: int, names: Sequence[str], size: Sequence[float]) -> float:
-        b = self._before(onset)
-        cov, at = b.cov.copy(), b.x.indices(names)
-        cov[at, at] += np.square(size)
-        return float(self._run(self.data, onset, Belief(b.x, b.mean, cov)).loglik)
+        return self._gained(float(r.loglik - own + instead), onset)

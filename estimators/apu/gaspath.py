@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apu_casadi.core.backend import READY
 from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.gaspath.conditions import DEFAULT_DAY
@@ -46,6 +47,7 @@ from estimators.apu.sensorchain import Draws, sampled, spread
 from estimators.apu.sensors import GAS_PATH, Sensor, SensorSet
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
+from estimators.filters.filterensemble import lanes_there, run_many
 from estimators.filters.filtering import FilterResult, StepMaker, run
 from estimators.filters.resuming import Runs
 from estimators.models.filtermodel import FilterModel, Unknown
@@ -298,6 +300,26 @@ class GasPathFilter(Parametric):
         """
         of = ekf_step(self.model, iterations, iterated) if step is None else step(self.model)
         return run(of, self.prior() if prior is None else prior, data, full=full, backend=backend)
+
+    def run_each(
+        self,
+        priors: Sequence[Belief],
+        data: Sequence[Recording],
+        *,
+        backend: str | None = None,
+    ) -> list[FilterResult]:
+        """Run the iterated filter from several beliefs over a recording each, in lanes if it pays.
+
+        Of results only what a run without ``full`` gives is to be relied on.
+
+        Args:
+            priors, data: beliefs before the first samples, and recordings.
+            backend: see :meth:`run`; ``"ready"`` takes lanes only if they were compiled before.
+        """
+        of = ekf_step(self.model, ITERATIONS, ITERATED)
+        # the filter itself runs with ``full``: that form is there
+        full = backend == READY and not lanes_there(of, len(data))
+        return run_many(of, priors, data, full=full, backend=backend)
 
     def runs(
         self,

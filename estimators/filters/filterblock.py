@@ -20,7 +20,7 @@ from estimators.models.recording import Recording
 
 __all__ = ["BLOCK", "CHAIN", "NARROW", "PADDED", "ROOT_OUT", "ROWS", "WIDE"]
 __all__ += ["block_function", "block_length", "block_of", "in_halves", "narrow", "packed_diagonal"]
-__all__ += ["padded", "row_function", "unpacked"]
+__all__ += ["padded", "plain_block", "row_function", "unpacked"]
 
 CHAIN = 10  # a block is this many chains of this many steps
 BLOCK = CHAIN**2  # samples in one call
@@ -178,6 +178,17 @@ def block_function(
 ) -> tuple[ca.Function, ca.Function]:
     """A block of steps, compiled and as they are; ``_in_use`` keeps the backends' forms apart.
 
+    See :func:`plain_block`.
+    """
+    block = plain_block(step, full, short)
+    make = compiled if in_halves(step) else points_in_lanes
+    return make(block, backend=backend), block
+
+
+@kept
+def plain_block(step: Step, full: bool, short: bool) -> ca.Function:
+    """A block of steps, which nothing has compiled.
+
     (m, P, u, y, R, dt, p) -> (m1, P1, m_f, P_f, nu, diag S, stats) and, if ``full``, also m and P
     before each sample and C, S; matrices as columns.  Without ``full``, P_f of :func:`in_halves` is
     its lower half.
@@ -214,16 +225,14 @@ def block_function(
     out = [*now, *(ca.densify(k) for k in kept)]
     if not half:
         one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, p], out)
-        block = block_of(one, name, len(carried), short=block_length(step.model) < BLOCK)
-        return points_in_lanes(block, backend=backend), block
+        return block_of(one, name, len(carried), short=block_length(step.model) < BLOCK)
     # what hangs on the parameters alone is evaluated once in a block
     out, symbols, constant = ca.extract_parametric(ca.cse(out), p)
     c, of_p = ca.vertcat(*symbols), ca.Function(f"{name}_constants", [p], [ca.vertcat(*constant)])
     one = ca.Function(f"{name}_one", [*carried, u, y, R, dt, ca.vertcat(p, c)], out)
     one = by_reciprocals(one)
     of_halves = block_of(one, f"{name}_half", len(carried), short=block_length(step.model) < BLOCK)
-    block = _whole(of_halves, of_p, name, len(carried), pattern)
-    return compiled(block, backend=backend), block
+    return _whole(of_halves, of_p, name, len(carried), pattern)
 
 
 @kept

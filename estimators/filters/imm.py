@@ -27,16 +27,20 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from apu_casadi.core.backend import backend_in_use, compiled
+from apu_casadi.core.backend import backend_in_use
 from apu_casadi.core.calling import Caller
 from apu_casadi.core.errors import EstimationError, ParameterError, SignalError, nearest
+from apu_casadi.core.lanes.lanelibrary import lanes_in_use
+from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.sharing import kept
 from apu_casadi.core.signals import Signals
 from estimators.filters.algebra import root_of
+from estimators.filters.alike import of_one_form
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filterblock import BLOCK, NARROW, WIDE, block_of, narrow, padded
-from estimators.filters.filtering import FilterResult, FilterStep, run
+from estimators.filters.filterensemble import run_many
+from estimators.filters.filtering import FilterResult, FilterStep
 from estimators.filters.mixing import log_sum, plain_mixer, root_mixer, squared, stacks
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
@@ -110,6 +114,8 @@ def multiple_models(
 ) -> ModelProbabilities:
     """Run one filter for each model, and compare their likelihoods by Bayes' rule.
 
+    Filters of one form are evaluated together (:mod:`estimators.filters.filterensemble`).
+
     A model with an unknown size is penalised for it by the spread of its own prior: the likelihood
     is that of the samples with the size integrated out.
 
@@ -125,16 +131,9 @@ def multiple_models(
     """
     steps = _steps(models)
     logp = _log_prior(tuple(steps), prior_probability)
-    results = [
-        run(
-            step,
-            prior if isinstance(prior, Belief) else prior[name],
-            data if isinstance(data, Recording) else data[name],
-            full=full,
-            backend=backend,
-        )
-        for name, step in steps.items()
-    ]
+    priors = [prior if isinstance(prior, Belief) else prior[n] for n in steps]
+    all_data = [data if isinstance(data, Recording) else data[n] for n in steps]
+    results = run_many([*steps.values()], priors, all_data, full=full, backend=backend)
     loglik = np.array([r.loglik for r in results])
     return ModelProbabilities(tuple(steps), loglik, log_normalised(loglik + logp), tuple(results))
 
@@ -298,12 +297,9 @@ def _block(
     Ps = ca.vertsplit(P, [0, *np.cumsum([k * k for k in n]).tolist()])
     ps = ca.vertsplit(s["p"], at_p)
     # covariances are mixed, so filters that carry square roots hand them over as such
-    outs = [
-        (_with_roots(step) if roots else step.plain).function(
-            ms[i], ca.reshape(Ps[i], n[i], n[i]), s["u"], ps[i], s["y"], s["R"], s["dt"]
-        )
-        for i, step in enumerate(steps)
-    ]
+    functions = [(step if roots else step.plain).function for step in steps]
+    given = [(ms[i], ca.reshape(Ps[i], k, k), ps[i]) for i, k in enumerate(n)]
+    outs = _filtered(functions, given, (s["u"], s["y"], s["R"], s["dt"]))
     m_f = ca.vertcat(*(o[2] for o in outs))
     P_f = ca.vertcat(*(ca.vec(o[3]) for o in outs))
     ll = ca.vertcat(*(o[7][2] for o in outs))
@@ -315,7 +311,33 @@ def _block(
     kept += [ca.vertcat(*(ca.vec(o[4]) for o in outs))] if full else []
     name = f"imm{'_roots' if roots else ''}{'_full' if full else ''}"
     one = ca.Function(f"{name}_one", list(s.values()), [*carried, *kept])
-    return compiled(block_of(one, name, len(carried)), backend=backend)
+    return points_in_lanes(block_of(one, name, len(carried)), backend=backend)
+
+
+def _filtered(
+    functions: Sequence[ca.Function], given: Sequence[Any], common: Sequence[Any]
+) -> list[list[Any]]:
+    """Call each mode's filter; those of one function as a map, whose points go in lanes.
+
+    Args:
+        functions: of the modes, as of :class:`~estimators.filters.filtering.FilterStep`.
+        given: (m, P, p) of each mode.
+        common: (u, y, R, dt).
+    """
+    outs: list[Any] = [None] * len(functions)
+    u, y, R, dt = common
+    alike: dict[ca.Function, list[int]] = {}
+    for i, f in enumerate(functions):
+        alike.setdefault(f, []).append(i)
+    for f, modes in alike.items():
+        M, all_of = len(modes), f
+        if M > 1:
+            all_of = f.map(f"{f.name()}_x{M}", "serial", M, [2, 4, 5, 6], [])
+        m, P, p = (ca.horzcat(*(given[i][k] for i in modes)) for k in range(3))
+        found = [ca.horzsplit_n(o, M) for o in all_of(m, P, u, p, y, R, dt)]
+        for k, i in enumerate(modes):
+            outs[i] = [parts[k] for parts in found]
+    return outs
 
 
 def _with_roots(step: FilterStep) -> FilterStep:
@@ -433,13 +455,12 @@ def interacting_multiple_models(
     # a padded sample changes no mode
     logT = np.concatenate([logT, np.repeat(logT[:, :1], pad, axis=1)], axis=1)
     logs = _log_prior(names, prior_probability)
-    passes = _Passes([*steps.values()], priors, logs, common, full, backend)
-    p = np.concatenate([step.full(data.p) for step in steps.values()])
+    passes = _Passes([*steps.values()], priors, logs, common, data.p, full, backend)
     columns = (0, 3, 5, 6, 7, 1, 2, 4, 9) if full else (0, 3, 5, 6, 7)
     kept: list[list[np.ndarray]] = [[] for _ in columns]
     for start in range(0, K + pad, BLOCK):
         s = slice(start, start + BLOCK)
-        out = passes.block(logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], p, K - start)
+        out = passes.block(logT[:, s], u[:, s], y[:, s], R[:, s], dt[:, s], K - start)
         for target, i in zip(kept, columns, strict=True):
             root = i == 2 and passes.rooted
             target.append(squared(out[i], n) if root else out[i].copy())
@@ -499,6 +520,7 @@ class _Passes:
     Args:
         steps, priors: of the modes.
         logs: logarithms of the modes' probabilities at the first sample.
+        p: known parameters of the models.
         common, full, backend: as of :func:`_block`.
     """
 
@@ -508,11 +530,11 @@ class _Passes:
         priors: list[Belief],
         logs: np.ndarray,
         common: Signals,
+        p: np.ndarray,
         full: bool,
         backend: str | None,
     ) -> None:
-        # the modes' families: another unit's modes have other numbers in p, and the same functions
-        self.steps = [step.shared for step in steps]
+        self.steps, self._p = steps, p
         self.common, self.full, self.backend = common, full, backend
         self.n = [len(b.x) for b in priors]
         # what a filter without square-root form lacks, mixing cannot give back
@@ -526,14 +548,18 @@ class _Passes:
 
     def _caller(self) -> Caller:
         # the buffers are this run's own, as in estimators.filters.filtering
-        first, *others = self.steps
-        how = self.rooted, self.full, self.backend, backend_in_use()
+        # the modes' families: another unit's modes have other numbers in p, and the same functions
+        steps = of_one_form([_with_roots(s) if self.rooted else s for s in self.steps])
+        self.p = np.concatenate([step.full(self._p) for step in steps])
+        first, *others = (step.shared for step in steps)
+        in_use = f"{backend_in_use()} {lanes_in_use()}"
+        how = self.rooted, self.full, self.backend, in_use
         return Caller(_block(first, tuple(others), self.common, *how), copy=False)
 
     def block(self, *given: Any) -> list[np.ndarray]:
         """Return what is kept of one block, its last argument the samples in it; go on."""
         *data, K = given
-        out = self._call(self.logs, self.m, self.P, *data)
+        out = self._call(self.logs, self.m, self.P, *data, self.p)
         if self.able and not self.rooted:
             R, P1 = data[3][:, :K], out[2].ravel()
             if _needs_roots(self.n, P1, out[7][:, :K], out[11][:, :K], R):
@@ -541,7 +567,7 @@ class _Passes:
                 self.P = np.concatenate([L.ravel(order="F") for L in roots])
                 self.rooted = True
                 self._call = self._caller()
-                out = self._call(self.logs, self.m, self.P, *data)
+                out = self._call(self.logs, self.m, self.P, *data, self.p)
         self.logs, self.m, self.P = (o.ravel().copy() for o in out[:3])
         return [o[:, :K] for o in out[3:]]
 

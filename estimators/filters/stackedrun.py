@@ -1,4 +1,4 @@
-"""Filters of one step and length as arrays: nothing is done for each filter and block in Python.
+"""Filters of one step and number of blocks as arrays: no Python for each filter and block.
 
 What needs more than its block, a covariance that loses digits or a belief that is lost, is left
 to :func:`estimators.filters.filtering.run`, which goes on in square-root form or tells what is
@@ -11,26 +11,28 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import backend_in_use
+from apu_casadi.core.backend import READY, backend_in_use
 from apu_casadi.core.calling import Caller, available_threads
 from apu_casadi.core.errors import DataError
-from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_in_use
+from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_for
+from apu_casadi.core.sharing import kept
 from estimators.filters.belief import Belief
 from estimators.filters.filterblock import (
     BLOCK,
     WIDE,
-    block_function,
     block_length,
     narrow_ones,
     padded,
+    plain_block,
 )
 from estimators.filters.filtering import STATS, FilterResult, FilterStep, narrow
 from estimators.models.filtermodel import CHECK_TOL, FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["run_stacked", "stackable"]
+__all__ = ["blocks_of", "lanes_of", "run_stacked", "stackable"]
 
 One = tuple[FilterStep, Belief, Recording]
 
@@ -49,6 +51,28 @@ def stackable(step: FilterStep, prior: Belief, data: Recording) -> bool:
     return True
 
 
+def blocks_of(one: One) -> int:
+    """Return how many blocks a filter takes for its recording."""
+    return -(-one[2].size // block_length(one[0].shared.model))
+
+
+def lanes_of(step: FilterStep, n: int, *, build: bool) -> ca.Function | None:
+    """Return a block of a step for n filters at once, or as many as go; None if not compiled."""
+    lanes = lanes_for(n)
+    there = _there(step, lanes, backend_in_use())
+    if there is None and build:
+        made = in_lanes(plain_block(step, False, True), lanes=lanes)
+        there = made if made.class_name() == "External" else None
+    return there
+
+
+@kept
+def _there(step: FilterStep, lanes: int, _in_use: str) -> ca.Function | None:
+    """Return the same from the cache folder, in which it is looked for once."""
+    made = in_lanes(plain_block(step, False, True), lanes=lanes, build=False)
+    return made if made.class_name() == "External" else None
+
+
 @dataclass
 class _Stack:
     """Arguments and results of filters: (filter, sample, signal), as a block's columns stand."""
@@ -64,9 +88,8 @@ class _Stack:
     @classmethod
     def of(cls, filters: Sequence[One]) -> _Stack:
         nx, _, _, _, ny = filters[0][0].model.sizes
-        K = filters[0][2].size
-        pad = -K % block_length(filters[0][0].shared.model)
-        ready = [padded(data, pad) for _, _, data in filters]
+        K = blocks_of(filters[0]) * block_length(filters[0][0].shared.model)
+        ready = [padded(data, K - data.size) for _, _, data in filters]
         y, R, u, dt = (np.stack([r[i].T for r in ready]) for i in range(4))
         n = len(filters)
         return cls(
@@ -75,27 +98,30 @@ class _Stack:
             np.zeros((n, nx, nx)),
             (u, y, R, dt),
             np.stack([np.asarray(s.full(d.p), float).ravel() for s, _, d in filters]),
-            tuple(np.empty((n, K + pad, k)) for k in (nx, nx, ny, ny, len(STATS))),
+            tuple(np.empty((n, K, k)) for k in (nx, nx, ny, ny, len(STATS))),
             np.ones(n, dtype=bool),
         )
 
 
 def run_stacked(
-    filters: Sequence[One], n_threads: int | None
+    filters: Sequence[One], n_threads: int | None, backend: str | None = None
 ) -> tuple[list[FilterResult | None], int]:
-    """Run filters of one step and length in packs of lanes.
+    """Run filters of one step and number of blocks in packs of lanes.
 
     Args:
         filters: steps of one family, priors, recordings, all :func:`stackable`.
         n_threads: threads that run packs; None takes all cores.
+        backend: ``"ready"`` compiles nothing.
 
     Returns:
         Results, None for filters that need more than this, and the number of results.
     """
     step = filters[0][0]
-    block = block_function(step.shared, False, True, None, backend_in_use())[1]
-    call = Caller(in_lanes(block), copy=False)
-    lanes = lanes_in_use()
+    lanes = lanes_for(len(filters))
+    wide = lanes_of(step.shared, len(filters), build=backend != READY)
+    if wide is None:
+        return [None] * len(filters), 0
+    call = Caller(wide, copy=False)
     stack = _Stack.of(filters)
     packs = [slice(i, min(i + lanes, len(filters))) for i in range(0, len(filters), lanes)]
     threads = min(available_threads() if n_threads is None else n_threads, len(packs))

@@ -64,6 +64,10 @@ def _copy(of: Sequence[np.ndarray], to: Sequence[np.ndarray]) -> None:
 class Sweep:
     """A filter over parts of one recording.
 
+    Attributes:
+        courses: mean, variance, innovation, its variance and ``STATS`` of all samples, as far as
+            they were filtered last: pieces are views of them, so that nobody has to join any.
+
     Args:
         model: the step's.
         block: of a step that carries halves of covariances, compiled, see
@@ -79,6 +83,7 @@ class Sweep:
     model: FilterModel
     data: Recording
     wide: bool
+    courses: tuple[np.ndarray, ...]
 
     def __init__(
         self,
@@ -101,6 +106,8 @@ class Sweep:
         missing = np.isnan(data.y)
         self._y = np.where(missing, 0.0, data.y)
         self._R, self._dt = np.where(missing, -1.0, data.variance), data.dt
+        (ny, K), nx = data.y.shape, len(model.x)
+        self.courses = tuple(np.empty((n, K)) for n in (nx, nx, ny, ny, _STATS))
         self._last: tuple[Belief, int, list[tuple[np.ndarray, ...]], Piece] | None = None
 
     def piece(
@@ -119,10 +126,8 @@ class Sweep:
             belief: at the first of them, before it.
             progress: called with what is done and all after each block.
         """
-        K, n = self.data.size, stop - start
-        nx, ny = belief.mean.size, self._y.shape[0]
-        mean, var = np.empty((nx, n)), np.empty((nx, n))
-        nu, S, stats = np.empty((ny, n)), np.empty((ny, n)), np.empty((_STATS, n))
+        K, n, nx = self.data.size, stop - start, belief.mean.size
+        mean, var, nu, S, stats = (a[:, start:stop] for a in self.courses)
         here = self._wanted[(self._wanted >= start) & (self._wanted < stop)] - start
         some, ends = np.empty((here.size, nx, nx)), []
         edges = self._edges(n, here)
@@ -137,12 +142,10 @@ class Sweep:
         block = judged = 0
         if self._last is not None and self._last[0] is belief and self._last[1] == start:
             # the same beginning: at the last block that is the same
-            _, _, before, known = self._last
+            _, _, before, known = self._last  # of whose samples the courses are
             block = min(len(edges) - 2, len(before) - 1)
             judged = edges[block]
             starts = before[:block]
-            for target, source in zip((mean, var, nu, S, stats), known[:5], strict=True):
-                target[:, :judged] = source[:, :judged]
             some[here < judged] = known.some[: int((here < judged).sum())]
             _copy(before[block], given)
         every = 1 if self._rows else 4 * BLOCK // self._length

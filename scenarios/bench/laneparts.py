@@ -19,9 +19,13 @@ from apu_casadi.core.lanes.lanelibrary import in_lanes, lanes_in_use
 from apu_casadi.gaspath.steady.trimbatch import performance_deck, trim_batch
 from apu_casadi.unit.ensemble import simulate_ensemble
 from estimators.apu.electrical.electricalfilter import electrical_filter
+from estimators.filters.belief import Belief
 from estimators.filters.ekf import ekf_step
 from estimators.filters.filterensemble import run_many
 from estimators.filters.filtering import run
+from estimators.filters.imm import interacting_multiple_models
+from estimators.models.filtermodel import FilterModel
+from estimators.models.recording import Recording
 from scenarios.bench.gasparts import deck_axes
 from scenarios.bench.measuring import Row, Size, apu, part
 from scenarios.bench.runparts import simulate
@@ -34,6 +38,7 @@ from scenarios.studies.electrical.truth import generator_truth, samples_of
 FLOPS = (ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_SQ, ca.OP_TWICE, ca.OP_INV, ca.OP_SQRT)
 CHAINS, LENGTH = 10, 400  # of the function that tells the peak: independent sums and products
 OFTEN, MANY = 5, 32  # calls, and packs in a call, of the roofline
+MODES = 8  # of the bank
 SAME = "largest difference from scalar C, relative"
 
 
@@ -110,8 +115,28 @@ def lanes(size: Size) -> list[Row]:
     what = f"step of the electrical EKF, a filter, ensemble of {some}, {n} lanes"
     error = off(many()[-1].mean, run(step, prior, data).mean)
     rows.append(_row(what, took, some * data.size, 1.2, error))
+    rows.append(_bank(filt.model, prior, data, repeats))
     rows.append(_runs(size, repeats))
     return [*rows, _roofline(step.shared.function.expand(), repeats)]
+
+
+def _bank(model: FilterModel, prior: Belief, data: Recording, repeats: int) -> Row:
+    """A bank of filters that differ in the noise of their states, by interacting models."""
+    sizes = dict(zip(model.x.names, model.walk.tolist(), strict=True))
+    modes = {
+        f"walk {k}": model.with_walk({n: v * (1 + 0.1 * k) for n, v in sizes.items() if v})
+        for k in range(MODES)
+    }
+    rates = np.ones((MODES, MODES)) - MODES * np.eye(MODES)
+    bank = partial(interacting_multiple_models, modes, prior, data, rates=rates)
+
+    def by_one() -> Any:
+        with scalar():
+            return bank()
+
+    took = in_turn({"lanes": bank, "scalar": by_one}, repeats)
+    what = f"sample of {MODES} interacting electrical EKFs, a mode"
+    return _row(what, took, MODES * data.size, None, off(bank().mean, by_one().mean))
 
 
 def _deck(size: Size, repeats: int) -> Row:

@@ -42,8 +42,8 @@ from apu_casadi.core.lanes.lanecode import NoForm
 from apu_casadi.core.lanes.lanegraph import graph_writer
 from apu_casadi.core.sharing import BUILDING, keep, once
 
-__all__ = ["batch", "digest", "flags_of", "framed", "in_lanes", "lanes_in_use", "recalled"]
-__all__ += ["source", "unsupported"]
+__all__ = ["batch", "digest", "flags_of", "framed", "in_lanes", "lanes_for", "lanes_in_use"]
+__all__ += ["recalled", "source", "unsupported"]
 
 WIDTHS = (1, 2, 4, 8)
 #: Of the compiler by number of lanes on x86-64; elsewhere two lanes are what every processor has.
@@ -67,6 +67,12 @@ def lanes_in_use() -> int:
     if text not in map(str, WIDTHS):
         raise BackendError(f"$APU_LANES = {text!r}: one of {WIDTHS} is expected")
     return min(int(text), _widest()) if backend_in_use() == "c" else 1
+
+
+def lanes_for(points: int) -> int:
+    """Return how many lanes so many points take: no more than hold them all."""
+    most = lanes_in_use()
+    return min(most, next((n for n in WIDTHS if n >= points), most))
 
 
 @once

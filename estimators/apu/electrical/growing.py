@@ -49,9 +49,11 @@ __all__ = ["Motion", "Moving", "can_grow", "growing", "motion", "opened", "reste
 
 
 def can_grow(filt: ElectricalFilter) -> bool:
-    """Whether growth is looked for: of three severities, by exact sensors.
+    """Whether growth is looked for: of three severities, without gain errors among the states.
 
-    Gain errors leave a severity less well known than growth would show in.
+    Those leave a severity less well known than growth would show in.  A filter that takes gain
+    errors for noise, by whose innovations an estimate is judged, follows a small short circuit so,
+    which else would be in them for some windows.
     """
     return filt.gains == "none" and set(SHUNTS.names) <= set(filt.model.x.names)
 

@@ -23,6 +23,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from estimators.apu.electrical.hypotheses import COMMON
 from estimators.apu.electrical.terminalsignals import PHASES_I, PHASES_V
@@ -38,9 +39,13 @@ __all__ = [
     "severity_changes",
 ]
 
-#: Windows between what is compared, and number of the later ones whose mean is.
-PAIRS = ((1, 1), (2, 1), (3, 2), (5, 2), (10, 5), (20, 10))
-BEFORE, FEWEST = 10, 3  # the earlier ones: at most, and at least
+BEFORE, FEWEST = 10, 3  # the earlier windows: at most, and at least
+#: Windows between what is compared, number of the later ones whose mean is, and most of the earlier
+#: ones: more of them tell more of a slow rise, and less for as long after a step of load.
+PAIRS = (
+    *((1, 1, BEFORE), (2, 1, BEFORE), (3, 2, BEFORE), (5, 2, BEFORE)),
+    *((6, 3, 2 * BEFORE), (10, 5, BEFORE), (20, 10, BEFORE)),
+)
 START = 5  # windows after which the filters have settled
 #: Statistic of a change that is followed, and of what it moves a severity by in a window, how many
 #: times that may still be missing: the filter that considers gains follows within some windows.
@@ -64,15 +69,17 @@ class Beliefs(NamedTuple):
     cov: np.ndarray
 
 
-def change_statistic(of: Beliefs, lag: int, width: int, first: int = START) -> np.ndarray:
+def change_statistic(
+    of: Beliefs, lag: int, width: int, before: int = BEFORE, first: int = START
+) -> np.ndarray:
     """Return what each severity rose by over the standard deviation of that, (3, n).
 
-    The mean of ``width`` windows is compared with that of up to ``BEFORE``, ``FEWEST`` at least,
+    The mean of ``width`` windows is compared with that of up to ``before``, ``FEWEST`` at least,
     of which the last is ``lag`` before the last of the others.  0 where there are not so many.
 
     Args:
         of: beliefs at the ends of n windows.
-        lag, width: numbers of windows.
+        lag, width, before: numbers of windows.
         first: window from which on they are looked at.
     """
     n = len(of.mean)
@@ -83,7 +90,7 @@ def change_statistic(of: Beliefs, lag: int, width: int, first: int = START) -> n
         return out
     S = of.cov[:, :3, 4:] @ np.linalg.pinv(known, hermitian=True)
     N = of.cov[:, :3, :3] - S @ of.cov[:, 4:, :3]
-    ends = (k - width, k), (np.maximum(k - lag - BEFORE, first - 1), k - lag)
+    ends = (k - width, k), (np.maximum(k - lag - before, first - 1), k - lag)
 
     def changed(x: np.ndarray) -> np.ndarray:
         late, early = (_mean(x, a, b) for a, b in ends)
@@ -187,11 +194,11 @@ def _stepped(
     """The largest lasting change of the mean of windows, (W, per), beside the fundamental."""
     turned = basis.transpose(0, 2, 1)
     fit = np.linalg.solve(turned @ basis, turned @ y[:, :, None])
-    c, (W, per) = fit[:, 0, 0], y.shape
-    inside = range(LASTING, W - LASTING)
-    size = [np.median(c[k + 1 : k + 1 + LASTING]) - np.median(c[k - LASTING : k]) for k in inside]
+    c, per = fit[:, 0, 0], y.shape[1]
+    level = np.median(sliding_window_view(c, LASTING), axis=1)  # from each window on
+    size = level[LASTING + 1 :] - level[: -LASTING - 1]  # after and before the windows between
     most = int(np.argmax(np.abs(size)))
-    k, by = inside[most], float(size[most])
+    k, by = most + LASTING, float(size[most])
     if abs(by) < OFFSET * max(sigma, float(np.median(np.abs(np.diff(c))))):
         return []
     # within the windows about it: where the sum of what is left turns

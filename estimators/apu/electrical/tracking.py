@@ -25,6 +25,7 @@ from estimators.apu.electrical.tuning import (
     RESET_LEVEL,
     RESET_SIGMA,
     RESET_WINDOW,
+    RESETS_WITHIN,
     STEEP,
 )
 from estimators.filters.belief import Belief
@@ -83,7 +84,7 @@ def track(
 
     Args:
         filt, prior, data, step, backend: as of the filter; ``step`` makes its step.
-        max_resets: more than these, and the model is refused.
+        max_resets: more than these within ``RESETS_WITHIN``, and the model is refused.
         own_level: whether a window is compared with those before it (the first four are not judged)
             instead of with white innovations: where gain errors are considered (the default there),
             or taken as noise, each unit has a level of its own.
@@ -95,7 +96,7 @@ def track(
         three severities, and the final belief, hold what these have in common beside the claim.
 
     Raises:
-        EstimationError: more than ``max_resets`` resets: the model does not fit the data at all.
+        LostError: too many resets: the model does not fit the data at all.
     """
     own = filt.gains == "consider" if own_level is None else own_level
     pieces: list[FilterResult] = []
@@ -120,7 +121,7 @@ def track(
             pieces.append(turns.widened(now, r))
             prior, at = ahead, stop
             continue
-        if len(resets) == max_resets:
+        if sum(v > data.t[cut] - RESETS_WITHIN for v in resets) >= max_resets:
             raise LostError(resets, _lost(filt.model.name, resets, float(share[bad[0]])))
         if cut > at:
             r, prior = now.filtered(prior, at, cut)
@@ -134,7 +135,8 @@ def track(
             own = own_level is None or own_level
         share, at = np.zeros(0), cut
         turns.begin(at)
-    return _loosened(filt, _joined([_narrowed(r, base.filt.model.x) for r in pieces])), resets
+    pieces = [_narrowed(r, base.filt.model.x) for r in pieces]
+    return _loosened(filt, _joined(pieces, now.sweep)), resets
 
 
 def _lost(name: str, resets: Sequence[float], size: float) -> str:
@@ -321,8 +323,8 @@ def _loosened(filt: ElectricalFilter, r: FilterResult) -> FilterResult:
     if filt.gains == "none" or not set(SHUNTS.names) <= set(r.x.names):
         return r
     rows = r.x.indices(SHUNTS.names)
-    variance, cov = r.variance.copy(), r.final.cov
-    variance[rows] += COMMON**2
+    variance, cov = r.variance, r.final.cov
+    variance[rows] += COMMON**2  # the result is nobody else's
     along = cov[:, rows].sum(1)
     along = along / along[rows].mean()
     final = Belief(r.x, r.final.mean, cov + COMMON**2 * np.outer(along, along))
@@ -389,10 +391,19 @@ def _piece(r: FilterResult, n: int) -> FilterResult:
     return dataclasses.replace(r, **{name: getattr(r, name)[..., :n] for name in _COURSES})
 
 
-def _joined(pieces: list[FilterResult]) -> FilterResult:
-    joined: dict[str, Any] = {
-        n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES
-    }
+def _joined(pieces: list[FilterResult], sweep: Sweep | None) -> FilterResult:
+    """Join pieces, which are views of one memory where a single sweep made them all."""
+    joined: dict[str, Any]
+    if sweep is not None and all(
+        a.base is b
+        for p in pieces
+        for a, b in zip((p.mean, p.variance), sweep.courses, strict=False)
+    ):
+        stats = sweep.courses[-1]
+        whole = sweep.data.t, *sweep.courses[:-1], stats[1], stats[3]
+        joined = dict(zip(_COURSES, whole, strict=True))
+    else:
+        joined = {n: np.concatenate([getattr(p, n) for p in pieces], axis=-1) for n in _COURSES}
     joined["loglik"] = sum(p.loglik for p in pieces)
     if pieces[-1].some_cov is not None:
         joined["some_cov"] = np.concatenate([p.some_cov for p in pieces])

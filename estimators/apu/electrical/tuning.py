@@ -30,6 +30,7 @@ __all__ = [
     "RATE_MEMORY",
     "RATE_SIGMAS",
     "RELEASE_LEVEL",
+    "RESETS_WITHIN",
     "RESET_LEVEL",
     "RESET_SIGMA",
     "RESET_WINDOW",
@@ -126,6 +127,9 @@ H_COMMON_TIME = 0.5
 RESET_WINDOW = 50
 #: ... whose mean NIS exceeds this; 4 is expected, 8 is ten standard deviations more.
 RESET_LEVEL = 8.0
+#: Time, s, in which no machine changes so often that its filter begins anew twenty times: a fault
+#: that comes and goes five times a second makes fifteen.
+RESETS_WITHIN = 1.5
 #: NIS of one sample from which a change is told to be there: noise passes it once in 3e7 samples.
 #: With gains considered, whose offsets stay in the innovations, once in 1.1e7 healthy ones (1 of
 #: 11.5e6 in 115 runs of 10 s with drawn gains at 10 to 225 kW; 95 %: 2e6 to 4e8), and so before the
