@@ -268,7 +268,7 @@ def _following(
     change = [np.abs(np.diff(size[n])) / np.maximum(size[n][1:], 1e-9) for n in PHASES_I]
     # a load changes all three, a sensor one
     after = stepped[:-1] | (np.min(change, axis=0) > LOADED)
-    out = np.append(False, after) | np.append(after & ~stepped[:-1], False)
+    out: np.ndarray = np.append(False, after) | np.append(after & ~stepped[:-1], False)
     for at in faults:
         out |= (t > at - NEAR) & (t < at + FOLLOWED)
     return out
