@@ -33,13 +33,18 @@ _ROTOR = ("lam_fd", "lam_kd", "lam_kq")
 #: By "coefficients are constant": elsewhere slow states ripple, and their second derivative does.
 ORDER = {True: 2, False: 3}
 
+#: Fastest mode, over 1/T, up to which it is done.  Beside an open phase (3e4) what the ripple of
+#: the others leaves in the derivatives is not small, and a step that begins settled was 5e-6 off.
+STIFF = 300.0
+
 
 @kept
 def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     """Function (x, u, theta, T) -> (x as it settles, area of what passes by).
 
-    Both are the state itself and zero, to the last bit, where nothing is faster than T, s.  The
-    area is that of states over time, above what they settle to.
+    Both are the state itself and zero, to the last bit, where nothing is faster than T, s, or
+    something by more than ``STIFF`` times.  The area is that of states over time, above what they
+    settle to.
 
     Args:
         ss: model variant, linear in its windings.
@@ -64,7 +69,8 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     for _ in range(ORDER[constant]):
         d = ca.mtimes(K, d)
     D = -ca.mtimes(K, d)
-    on = ca.gt(ca.mmax(ca.fabs(ca.diag(J))) * T, 1.0)
+    fastest = ca.mmax(ca.fabs(ca.diag(J))) * T
+    on = ca.logic_and(ca.gt(fastest, 1.0), ca.lt(fastest, STIFF))
     if fast != stator:
         rest = ca.diag(ca.jacobian(f[stator], x)[:, stator])
         on = ca.logic_and(on, ca.lt(ca.mmax(ca.fabs(rest)) * T, 1.0))

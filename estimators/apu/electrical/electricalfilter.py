@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import DataError, ParameterError, nearest
@@ -45,6 +46,7 @@ from estimators.apu.electrical.tuning import (
     FREE_SIGMA,
     H_BALANCED,
     H_BALANCED_CONSIDERED,
+    H_COMMON_TIME,
     H_SIGMA,
     H_STRAIGHT,
     H_WALK,
@@ -477,10 +479,29 @@ def considering(filt: ElectricalFilter) -> ElectricalFilter:
 @remade
 @of_family
 def _estimating(
-    model: FilterModel, unknown: Mapping[str, Unknown], walks: Mapping[str, float]
+    model: FilterModel, unknown: Mapping[str, Unknown], walks: Mapping[str, float], alone: float
 ) -> FilterModel:
-    """Return the model with what is estimated as states."""
-    return augment(model, unknown).with_walk(walks).expanded()
+    """Return the model with what is estimated as states; ``alone``: see :func:`_one_phase`."""
+    made = augment(model, unknown).with_walk(walks)
+    return (_one_phase(made, alone) if alone else made).expanded()
+
+
+def _one_phase(model: FilterModel, time: float) -> FilterModel:
+    """Let what the three severities have in common go to that of one faulty phase, in ``time`` s.
+
+    Of a short circuit in phase k the mean of the three is h_k/3, and h_k is more than the mean by
+    twice that; of a healthy machine both are zero.
+    """
+    x, u, p, w, dt = model.symbols()
+    x1, check = model.transition(x, u, p, w, dt)
+    rows = model.x.indices(SHUNTS.names)
+    h = [x[i] for i in rows]
+    mean = sum(h) / 3
+    lacking = (ca.fmax(ca.fmax(h[0], h[1]), h[2]) - mean) / 2 - mean
+    x1[rows] += (1 - ca.exp(-dt / time)) * lacking
+    signals, symbols = (model.x, model.u, model.p, model.w, model.y), (x, u, p, w, dt)
+    out = model.output(x, u, p, w)
+    return FilterModel.of(f"{model.name}_one", signals, symbols, (x1, check), out, like=model)
 
 
 @last(32)
@@ -510,9 +531,11 @@ def _filter(
             for n, low in zip(ADMITTANCE.names, (-math.inf, LEAST_SUSCEPTANCE), strict=True)
         }
         walks["i_shunt"] = 0.0
+    alone = 0.0
     if gains == "consider":
         walks["theta_e"] = ANGLE_WALK_CONSIDERED
+        alone = H_COMMON_TIME if phases == PHASES else 0.0
     if gains != "none":
         unknown |= {f"gain_{n}": Unknown(consider=gains == "consider") for n in GAIN_SENSORS}
-    model = _estimating(model, unknown | dict(free), walks)
+    model = _estimating(model, unknown | dict(free), walks, alone)
     return ElectricalFilter(model, machine, sensors, gains, kappa, phase, power)

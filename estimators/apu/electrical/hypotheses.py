@@ -31,7 +31,7 @@ __all__ = ["COMMON", "FAULTY", "H_SCALE", "Hypotheses", "SeverityPrior", "loose_
 FAULTY = 0.1  # probability that a machine has a short circuit when a recording begins
 H_SCALE = 3e-3  # scale of the severity of one
 #: Standard deviation of what all three severities have in common, beside what the filter claims: it
-#: learns of that from noise in its derivatives, -2.5e-4 in 1.6 s, two claimed standard deviations.
+#: takes that for the third of one severity (``H_COMMON_TIME``), which a sensor's error is not.
 COMMON = 3e-4
 
 
