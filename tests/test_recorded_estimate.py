@@ -99,7 +99,7 @@ def test_run_measure_estimate_is_the_joint_estimation(run, joint):
 
 @pytest.mark.long
 def test_gas_path_alone_is_the_filter_of_the_studies(run, files):
-    filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)
+    filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False, consider_inertia=True)
     noise = np.random.default_rng([SEED, 2])
     data = filt.recording(run, noise, gains=joint_case(SEED).gas_gains)
     tracked = track_jumps(filt, data, backend="vm")
