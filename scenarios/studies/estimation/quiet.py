@@ -52,7 +52,7 @@ recordings that are not believed.
 
 @claim alarms
 joint | false reports, healthy units, {recorded} | <= 1 an hour | {alarms} in {hours:.2f} h
-| at most {limit:.3g} an hour | {seeds}
+| at most {limit:.3g} an hour | {seeds} | {doubted} of {runs} recordings were doubted
 
 @table
 recorded | load [kW] | hours | reports | of parts believed | doubted recordings | doubts
@@ -134,6 +134,7 @@ def claims(r: Results) -> list[Claim]:
         alarms = sum(x["believed"] for x in found.values())
         seeds = r.seeds_from(f"{recorded} {next(iter(found))} kW")
         values: dict[str, Any] = {"recorded": recorded, "alarms": alarms, "hours": hours}
+        values |= {n: sum(x[n] for x in found.values()) for n in ("doubted", "runs")}
         values |= {"limit": count_limit(alarms) / hours, "seeds": seeds}
         out.append(STUDY.claim("claim alarms", alarms <= hours, **values))
     return out
