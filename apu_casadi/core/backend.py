@@ -44,7 +44,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.cachefolder import cache_folder, say, unsafe_file
+from apu_casadi.core.cachefolder import SUFFIX, cache_folder, say, unsafe_file
 from apu_casadi.core.calling import Caller, Mapped, available_threads, mapped
 from apu_casadi.core.errors import BackendError, nearest
 from apu_casadi.core.sharing import BUILDING
@@ -57,7 +57,6 @@ __all__ = [
     "available_threads",
     "backend_in_use",
     "cache_folder",
-    "clear_cache",
     "compiled",
     "find_compiler",
     "library",
@@ -194,20 +193,6 @@ def _identity(command: tuple[str, ...]) -> str:
     real = Path(command[0]).resolve()
     s = real.stat()
     return f"{real} {s.st_size} {s.st_mtime_ns} {' '.join(command[1:])}"
-
-
-def clear_cache() -> int:
-    """Delete the libraries of the cache folder; return how many there were.
-
-    Libraries that a process has loaded stay usable in it.
-    """
-    folder = cache_folder()
-    n = 0
-    for path in folder.glob("apu-*") if folder else ():
-        n += path.suffix == _SUFFIX
-        with suppress(OSError):
-            path.unlink()
-    return n
 
 
 # ------------------------------------------------------------------------------ compile and load
@@ -495,9 +480,6 @@ def _toolchain(wanted: str) -> tuple[str, ...] | None:
     return command
 
 
-_SUFFIX = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
-
-
 def _key_of(code: Code, command: tuple[str, ...], level: int) -> str:
     digest = hashlib.sha256(code.content.encode()).hexdigest()
     return _library_key(digest, command, level, code.flags)
@@ -519,7 +501,7 @@ def _load(name: str, key: str) -> ca.Function | None:
     folder = cache_folder()
     if folder is None:
         return None
-    path, written = folder / f"apu-{key}{_SUFFIX}", folder / f"apu-{key}.sum"
+    path, written = folder / f"apu-{key}{SUFFIX}", folder / f"apu-{key}.sum"
     try:
         for each in (written, path):
             if reason := unsafe_file(each):
@@ -573,7 +555,7 @@ def _compile(code: Code, key: str, command: tuple[str, ...]) -> None:
         raise BackendError("no folder for the library")
     text = code.write()
     with tempfile.TemporaryDirectory(prefix="tmp-", dir=folder) as work:
-        source, library = Path(work) / "code.c", Path(work) / f"code{_SUFFIX}"
+        source, library = Path(work) / "code.c", Path(work) / f"code{SUFFIX}"
         source.write_text(text, encoding="utf-8")
         # relative names: the library does not depend on where it was made
         done = subprocess.run(
@@ -589,7 +571,7 @@ def _compile(code: Code, key: str, command: tuple[str, ...]) -> None:
         content = library.read_bytes()
         library.chmod(0o700)  # whatever the umask: what others can write to is not loaded
         # the library first: a sum without its library says only that there is none
-        os.replace(library, folder / f"apu-{key}{_SUFFIX}")
+        os.replace(library, folder / f"apu-{key}{SUFFIX}")
     digest = hashlib.sha256(content).hexdigest()
     _write(folder / f"apu-{key}.sum", f"{len(content)} {digest}\n".encode())
 

@@ -12,14 +12,17 @@ import getpass
 import logging
 import os
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
-__all__ = ["cache_folder", "unsafe", "unsafe_file"]
+__all__ = ["SUFFIX", "cache_folder", "clear_cache", "unsafe", "unsafe_file"]
 
 log: logging.Logger = logging.getLogger("apu_casadi")
+SUFFIX: str = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")  # of a library
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _LINKS = 40  # symbolic links followed at most, as the kernel does
 _said: set[str] = set()
@@ -157,3 +160,17 @@ def unsafe_file(path: Path) -> str | None:
     if s.st_uid not in (os.getuid(), 0):
         return f"it belongs to another user ({s.st_uid})"
     return f"others can write to it (mode {s.st_mode & 0o7777:04o})" if s.st_mode & OTHERS else None
+
+
+def clear_cache() -> int:
+    """Delete the libraries of the cache folder; return how many there were.
+
+    Libraries that a process has loaded stay usable in it.
+    """
+    folder = cache_folder()
+    n = 0
+    for path in folder.glob("apu-*") if folder else ():
+        n += path.suffix == SUFFIX
+        with suppress(OSError):
+            path.unlink()
+    return n

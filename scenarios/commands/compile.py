@@ -38,11 +38,11 @@ def run(args: argparse.Namespace) -> int:
     """Compile every group; return 1 if there is no compiler."""
     from importlib import import_module
 
-    from apu_casadi.core import backend
+    from apu_casadi.core import backend, cachefolder
     from apu_casadi.core.errors import BackendError, nearest
 
     if args.clear:
-        n = backend.clear_cache()
+        n = cachefolder.clear_cache()
         if args.json:
             jsontext.show({"deleted": n})
         else:

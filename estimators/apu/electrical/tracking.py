@@ -75,8 +75,7 @@ def track(
     exceeds ``RESET_LEVEL``, h and fluxes become uncertain again at the window's start
     (``RESET_SIGMA``).  The first two windows of a piece are not judged: a start needs them.
 
-    With exact sensors severities are watched as well: while they move, their rates are states, see
-    :mod:`.growing`.
+    With exact sensors severities that move have their rates as states, see :mod:`.growing`.
 
     Where gains are estimated, they are considered from the first reset on, with what is known then:
     during the transient of a fault they are learnt falsely, by 18 to 48 claimed deviations, and h
@@ -88,7 +87,7 @@ def track(
         own_level: whether a window is compared with those before it (the first four are not judged)
             instead of with white innovations: where gain errors are considered (the default there),
             or taken as noise, each unit has a level of its own.
-        cov_at: samples whose covariances are kept, see :func:`estimators.filters.filtering.run`.
+        cov_at: as of :func:`estimators.filters.filtering.run`: samples whose covariances are kept.
         common: what all three h may have in common after a reset, as ``H_BALANCED``.
 
     Returns:
