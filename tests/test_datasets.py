@@ -410,7 +410,7 @@ def test_commands(made, tmp_path, capsys, monkeypatch):
 @pytest.mark.ci  # starts a scheduler and its workers
 def test_a_cluster_whose_worker_is_killed_gives_the_same_bits(small, made, tmp_path):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as c:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as c:
         killed = []
 
         def progress(k, n):

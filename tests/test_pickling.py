@@ -288,7 +288,7 @@ if __name__ == "__main__":
     for processes in (False, True):
         with LocalCluster(
             n_workers=1, threads_per_worker=2, processes=processes,
-            dashboard_address=None, protocol="tcp" if processes else None,
+            dashboard_address=":0", protocol="tcp" if processes else None,
         ) as cluster, Client(cluster) as client:
             got = client.gather([
                 (client.submit(run, apu, k, pure=False),
