@@ -259,10 +259,10 @@ class Gradual:
         *,
         level: int = 1,
         copy: bool = True,
-        by: Callable[..., ca.Function] | None = None,
+        by: Callable[..., ca.Function] = compiled,
     ) -> None:
         self._fun, self._level, self._copy, self._calls = fun, level, copy, 0
-        self._by: Callable[..., ca.Function] = by or compiled
+        self._by = by
         self._call = self._made(build=False)
 
     def _made(self, *, build: bool) -> Caller:

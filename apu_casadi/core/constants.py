@@ -15,6 +15,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from apu_casadi.core.instructions import rewritten
 from apu_casadi.core.reciprocals import as_written
 from apu_casadi.core.sharing import BUILDING, keep
 
@@ -91,38 +92,13 @@ def with_constants(fun: ca.Function, place: np.ndarray, at: int) -> ca.Function:
     with BUILDING, as_written():
         given = [ca.SX.sym(fun.name_in(i), fun.sparsity_in(i)) for i in range(fun.n_in())]
         more = ca.SX.sym("constants", n)
-        out = _rebuilt(fun, given, [more[k] for k in range(n)], place.tolist())
+        uses = iter(place.tolist())
+
+        def use(value: ca.SX, constant: bool) -> ca.SX:
+            which = next(uses) if constant else -1
+            return value if which < 0 else more[which]
+
+        out = rewritten(fun, given, use=use)
         given[at] = ca.vertcat(given[at], more)
         how = {"is_diff_in": fun.is_diff_in()}
         return ca.Function(fun.name(), given, out, fun.name_in(), fun.name_out(), how)
-
-
-def _rebuilt(
-    fun: ca.Function, given: list[ca.SX], more: list[ca.SX], place: list[int]
-) -> list[ca.SX]:
-    parts = [x.nonzeros() for x in given]
-    results = [[ca.SX(0)] * fun.nnz_out(j) for j in range(fun.n_out())]
-    work, constant, uses = dict[int, ca.SX](), dict[int, bool](), iter(place)
-
-    def read(n: int) -> ca.SX:
-        which = next(uses) if constant[n] else -1
-        return work[n] if which < 0 else more[which]
-
-    for k in range(fun.n_instructions()):
-        op, i, o = fun.instruction_id(k), fun.instruction_input(k), fun.instruction_output(k)
-        if op == ca.OP_OUTPUT:
-            results[o[0]][o[1]] = read(i[0])
-            continue
-        if op == ca.OP_CONST:
-            made = ca.SX(fun.instruction_constant(k))
-        elif op == ca.OP_INPUT:
-            made = ca.SX(parts[i[0]][i[1]])
-        elif len(i) == 1:
-            made = ca.SX.unary(op, read(i[0]))
-        else:
-            made = ca.SX.binary(op, read(i[0]), read(i[1]))
-        work[o[0]], constant[o[0]] = made, op == ca.OP_CONST
-    return [
-        ca.SX(fun.sparsity_out(j), ca.vertcat(*r)) if r else ca.SX(fun.sparsity_out(j))
-        for j, r in enumerate(results)
-    ]

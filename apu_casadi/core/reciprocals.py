@@ -12,6 +12,8 @@ from contextlib import contextmanager
 
 import casadi as ca
 
+from apu_casadi.core.instructions import applied, rewritten
+
 __all__ = ["as_written", "by_reciprocals"]
 
 LEAST = 2  # quotients by a number from which its reciprocal pays
@@ -37,13 +39,10 @@ def by_reciprocals(fun: ca.Function, *, least: int = LEAST) -> ca.Function:
         fun: the function.
         least: quotients by one number from which it is done.
     """
-    steps = [
-        (fun.instruction_id(k), fun.instruction_input(k), fun.instruction_output(k))
-        for k in range(fun.n_instructions())
-    ]
     holds, divides = dict[int, int](), Counter[int]()  # which instruction made what work holds
     divisor = dict[int, int]()
-    for k, (op, i, o) in enumerate(steps):
+    for k in range(fun.n_instructions()):
+        op, i, o = fun.instruction_id(k), fun.instruction_input(k), fun.instruction_output(k)
         if op == ca.OP_DIV:
             divisor[k] = holds[i[1]]
             divides[holds[i[1]]] += 1
@@ -51,39 +50,17 @@ def by_reciprocals(fun: ca.Function, *, least: int = LEAST) -> ca.Function:
             holds[o[0]] = k
     given = fun.sx_in()
     divisor = {k: b for k, b in divisor.items() if divides[b] >= least}
+    inverse = dict[int, ca.SX]()
+
+    def operation(k: int, op: int, parts: list[ca.SX], _: list[bool]) -> ca.SX:
+        if k not in divisor:
+            return applied(op, parts)
+        b = divisor[k]
+        if b not in inverse:
+            inverse[b] = ca.SX.binary(ca.OP_DIV, 1.0, parts[1])
+        return parts[0] * inverse[b]
+
     with as_written():  # CasADi would make a (1/b) a/b again
-        made = _rebuilt(fun, given, steps, divisor)
+        made = rewritten(fun, given, operation)
     how = {"is_diff_in": fun.is_diff_in()}
     return ca.Function(fun.name(), given, made, fun.name_in(), fun.name_out(), how)
-
-
-def _rebuilt(
-    fun: ca.Function,
-    given: list[ca.SX],
-    steps: list[tuple[int, list[int], list[int]]],
-    divisor: dict[int, int],
-) -> list[ca.SX]:
-    """Return the outputs of a function made anew; divisors by number of their quotients."""
-    parts = [x.nonzeros() for x in given]
-    results = [[ca.SX(0)] * fun.nnz_out(j) for j in range(fun.n_out())]
-    work, inverse = dict[int, ca.SX](), dict[int, ca.SX]()
-    for k, (op, i, o) in enumerate(steps):
-        if op == ca.OP_CONST:
-            work[o[0]] = ca.SX(fun.instruction_constant(k))
-        elif op == ca.OP_INPUT:
-            work[o[0]] = ca.SX(parts[i[0]][i[1]])
-        elif op == ca.OP_OUTPUT:
-            results[o[0]][o[1]] = work[i[0]]
-        elif k in divisor:
-            b = divisor[k]
-            if b not in inverse:
-                inverse[b] = ca.SX.binary(ca.OP_DIV, 1.0, work[i[1]])
-            work[o[0]] = work[i[0]] * inverse[b]
-        elif len(i) == 1:
-            work[o[0]] = ca.SX.unary(op, work[i[0]])
-        else:
-            work[o[0]] = ca.SX.binary(op, work[i[0]], work[i[1]])
-    return [
-        ca.SX(fun.sparsity_out(j), ca.vertcat(*r)) if r else ca.SX(fun.sparsity_out(j))
-        for j, r in enumerate(results)
-    ]

@@ -32,6 +32,7 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.instructions import applied, rewritten
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.core.simulation import StepResult
@@ -267,28 +268,17 @@ def _multiplied(
         Outputs with new symbols for the factors, these symbols, and what they are reciprocals of.
     """
     f = ca.Function("f", [fixed, *varying], list(outputs), {"cse": True})
-    inputs = [ca.vertsplit(ca.vec(a)) for a in (fixed, *varying)]
-    results = [ca.SX(f.sparsity_out(i)) for i in range(f.n_out())]
-    values: list[Any] = [None] * f.sz_w()
-    constant = [True] * f.sz_w()  # follows from what is fixed
     factors = dict[int, tuple[Any, Any]]()
-    for k in range(f.n_instructions()):
-        op, at, to = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
-        if op == ca.OP_OUTPUT:
-            results[to[0]].nz[to[1]] = values[at[0]]
-            continue
-        if op == ca.OP_INPUT:
-            made, known = inputs[at[0]][at[1]], at[0] == 0
-        elif op == ca.OP_CONST:
-            made, known = ca.SX(f.instruction_constant(k)), True
-        else:
-            parts, known = [values[i] for i in at], all(constant[i] for i in at)
-            if op == ca.OP_DIV and constant[at[1]] and not constant[at[0]]:
-                # a product with 1/b itself would be written as a division again
-                key = parts[1].element_hash()
-                op, parts[1] = ca.OP_MUL, factors.setdefault(key, (ca.SX.sym("r"), parts[1]))[0]
-            made = (ca.SX.unary if len(at) == 1 else ca.SX.binary)(op, *parts)
-        values[to[0]], constant[to[0]] = made, known
+
+    def operation(_: int, op: int, parts: list[Any], vary: list[bool]) -> Any:
+        if op == ca.OP_DIV and vary[0] and not vary[1]:
+            # a product with 1/b itself would be written as a division again
+            key = parts[1].element_hash()
+            op, parts[1] = ca.OP_MUL, factors.setdefault(key, (ca.SX.sym("r"), parts[1]))[0]
+        return applied(op, parts)
+
+    all_but_fixed = range(1, 1 + len(varying))
+    results = rewritten(f, [fixed, *varying], operation, varying=all_but_fixed)
     return results, [r for r, _ in factors.values()], [b for _, b in factors.values()]
 
 

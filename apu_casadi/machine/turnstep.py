@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.instructions import applied, rewritten
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import exciter_step, hoisted
@@ -257,28 +258,16 @@ def _given_exps(f: ca.Function) -> tuple[ca.Function, ca.Function]:
         Function(*inputs, exponentials) -> outputs, and Function(*inputs, exponentials) -> their
         arguments.
     """
-    inputs = f.sx_in()
-    results = [ca.SX(f.sparsity_out(i)) for i in range(f.n_out())]
-    values, moves = [ca.SX(0)] * f.sz_w(), [False] * f.sz_w()
-    exps, arguments = [ca.SX(0, 1)], [ca.SX(0, 1)]
-    for k in range(f.n_instructions()):
-        op, at, to = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
-        if op == ca.OP_OUTPUT:
-            results[to[0]].nz[to[1]] = values[at[0]]
-            continue
-        if op == ca.OP_INPUT:
-            made, moving = inputs[at[0]].nz[at[1]], at[0] < 2
-        elif op == ca.OP_CONST:
-            made, moving = ca.SX(f.instruction_constant(k)), False
-        else:
-            parts, moving = [values[i] for i in at], any(moves[i] for i in at)
-            if op == ca.OP_EXP and moving:
-                made = ca.SX.sym("e")
-                exps.append(made)
-                arguments += parts
-            else:
-                made = (ca.SX.unary if len(at) == 1 else ca.SX.binary)(op, *parts)
-        values[to[0]], moves[to[0]] = made, moving
+    inputs, exps, arguments = f.sx_in(), [ca.SX(0, 1)], [ca.SX(0, 1)]
+
+    def operation(_: int, op: int, parts: list[Any], vary: list[bool]) -> Any:
+        if op != ca.OP_EXP or not vary[0]:
+            return applied(op, parts)
+        exps.append(ca.SX.sym("e"))
+        arguments.extend(parts)
+        return exps[-1]
+
+    results = rewritten(f, inputs, operation, varying=(0, 1))
     e = ca.vertcat(*exps)
     given = [*inputs, e]
     return ca.Function("given", given, results), ca.Function("of", given, [ca.vertcat(*arguments)])
