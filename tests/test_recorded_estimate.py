@@ -81,8 +81,10 @@ def test_run_measure_estimate_is_the_joint_estimation(run, joint):
     )
     assert joint.joint and joint.believable, joint.doubts
     for n in ("N", *HEALTH):
-        for end in ("", "_sigma"):
-            assert_allclose(joint.gaspath[n + end], e[n + end], rtol=1e-7, err_msg=n)
+        assert_allclose(joint.gaspath[n], e[n], rtol=1e-7, err_msg=n)
+        # a sensor that is off by more than was stated is in the band of a recording alone
+        wider = joint.gaspath[f"{n}_sigma"].values / e[f"{n}_sigma"].values
+        assert np.all((wider > 1 - 1e-7) & (wider < 1.1)), n  # most in the first samples
     machine = joint.machines[1]
     for n in ("h_a", "h_b", "h_c", "h_a_sigma", "P_total", "faulty_phase"):
         assert_allclose(machine[n], e[n], rtol=1e-6, atol=1e-10, err_msg=n)

@@ -405,7 +405,8 @@ def gas_doubts(
         *r.x.names
     }:  # freer than a load moves: innovations alternate, sigma is large
         found = [f for f in found if f.test != "colour" or f.value > 0]
-    found += _creeping(creep(filt, tracked) if drifts is None else drifts)
+    drifts = creep(filt, tracked) if drifts is None else drifts
+    found += _creeping(drifts)
     for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
@@ -415,6 +416,7 @@ def gas_doubts(
             f"{MOST_JUMPS} changes of health were reported, and further ones were not looked for",
         )
     yield from _prior_doubts(filt, tracked)
+    yield from _off(drifts)
     x = {n: float(r[n][0][-1]) for n in HEALTH}
     for n, v in x.items():
         if abs(v - 1) > STEEP:
@@ -437,11 +439,29 @@ def _creeping(found: Creep | None) -> list[Finding]:
     """
     if found is None:
         return []
-    z = np.abs(found.size / found.sigma)
+    z = np.abs(found.size / found.sigma)[~found.lasting]  # drifts come first
     # others share a part of its signature: the most striking one alone is told
     k = int(z.argmax())
     chance = float(2 * ndtr(-z[k] / math.sqrt(MARGIN))) * len(z)
     return [Finding(found.names[k], "creep", chance, float(found.size[k]))]
+
+
+def _off(found: Creep | None) -> Iterator[Doubt]:
+    """Say where errors all along, beyond what was stated, are more probable than none.
+
+    Such an error shows in no innovation: the health factors follow it, farther than they probably
+    are.  A wrong day, or an engine that is much worse than its prior, looks alike.
+    """
+    if found is None or (p := found.probability * found.lasting).sum() < SURELY:
+        return
+    k = int(p.argmax())
+    name, size = found.names[k], found.size[k]
+    yield Doubt(
+        "prior",
+        f"{name}: an error of {size:+.1%} all along, beyond what was stated, explains the readings "
+        f"better than the health does ({100 * p.sum():.0f} % for one of this kind); or the day is "
+        "another, or the engine much worse than its prior",
+    )
 
 
 def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

@@ -221,10 +221,13 @@ def estimate(
         given = ambient or {}, notes, doubts, backend, start
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
         drifts = creep(filt, tracked)
-        e = gas_dataset(filt, tracked, None if fused_by else drifts)  # the joint band is its own
         found_of, odd = told(gas_causes(filt, tracked))
         causes[GAS] = (*still_causes(still), *found_of)
         doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
+        if drifts is not None:
+            wide = drifts.widened(tracked.result, drifts=not fused_by)
+            tracked = dataclasses.replace(tracked, result=wide)
+        e, found_by = gas_dataset(filt, tracked), (filt, tracked)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     lost = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)
