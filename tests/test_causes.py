@@ -182,6 +182,20 @@ def test_a_reading_beyond_its_stated_error(gas):
     assert max(z) > 4 and max(moved) < 3.5, (z, moved)
 
 
+def test_another_day(gas):
+    """12 K warmer than was given; the recording says by how much, and it is no change of health."""
+    filt, quiet = gas_path_filter(eta=ETA_SIGMA, consider_eta=False), gas[1]
+    data = filt.recording(quiet, 1, gains=joint_case(1).gas_gains)
+    u = data.u.copy()
+    u[filt.model.u.index("dT_isa")] -= 12.0
+    off = dataclasses.replace(data, u=u)
+    tracked = Tracked(filt.run(off, backend="vm"), (), (), off)
+    found = creep(filt, tracked)
+    assert found.names[-1] == "dT_isa" and found.probability[-1] > 0.5
+    assert found.size[-1] == pytest.approx(12.0, abs=3 * found.sigma[-1])
+    assert any(d.startswith("dT_isa: an error of +") for d in gas_doubts(filt, tracked))
+
+
 def test_health_that_was_off_before_is_no_error_of_a_sensor():
     """By as much as the prior has it probable, 2 % of each factor; 1.5 times that in this run."""
     filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)

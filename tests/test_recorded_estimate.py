@@ -333,7 +333,7 @@ def test_a_short_circuit_too_small_to_report_is_no_change_of_health():
     for k_rf, found in ((713.0, False), (100.0, True)):
         fault = Ttsc(mu=0.05, k_rf=k_rf, phase="b")
         ds = simulate_joint(
-            APU, duration=0.2, load=SeriesLoad.from_power(100e3), health={"f_eta_c": 0.92},
+            APU, duration=0.2, load=SeriesLoad.from_power(100e3), health={"f_eta_c": 0.94},
             fault=fault, dt=0.005, waveform_dt=1e-4,
         )  # fmt: skip
         made = measure_run(ds, APU, SEED, gains=False)

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.creeping import Creep, creep, quiet_of
@@ -456,11 +457,11 @@ def _off(found: Creep | None) -> Iterator[Doubt]:
         return
     k = int(p.argmax())
     name, size = found.names[k], found.size[k]
+    error = f"{size:+.3g} {CONDITIONS[name].unit}" if name in CONDITIONS else f"{size:+.1%}"
     yield Doubt(
         "prior",
-        f"{name}: an error of {size:+.1%} all along, beyond what was stated, explains the readings "
-        f"better than the health does ({100 * p.sum():.0f} % for one of this kind); or the day is "
-        "another, or the engine much worse than its prior",
+        f"{name}: an error of {error} all along, beyond what was stated, explains the readings "
+        f"better than the health does ({100 * p.sum():.0f} % for some such error)",
     )
 
 

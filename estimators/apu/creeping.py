@@ -6,8 +6,9 @@ is significant is a doubt (:mod:`.believable`), and so is an error that is more 
 one that is not may still move an estimate by several of its standard deviations: in a second of
 recording by 3 where the shaft power gains 10 %, and by 4 where T5 reads 5 % too much, which no
 innovation shows, as four health factors follow any such reading.  That they would have to go 2
-standard deviations of their own prior for it is the evidence.  So the band holds such an error as
-far as it is probable: with a prior probability for each sensor and kind and a size d of zero mean,
+standard deviations of their own prior for it is the evidence.  A day that is warmer than was given
+is such an error as well.  So the band holds each as far as it is probable: with a prior probability
+and a size d of zero mean,
 
     variance + sum_i p_i (d_i^2 + s_i^2) (dx/dd_i)^2,
 
@@ -24,18 +25,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from apu_casadi.gaspath.health import HEALTH
-from estimators.apu.gascauses import jumps_of
+from estimators.apu.gascauses import SIZE, jumps_of
 from estimators.apu.gaspath import MODEL_ERROR, GasPathFilter
 from estimators.apu.healthjumps import Tracked
 from estimators.apu.trust import GAS
 from estimators.detection.signatures import LinearFilter, linearised
-from estimators.filters.filtering import FilterResult
+from estimators.filters.filtering import FilterResult, StepMaker
 from estimators.information.posterior import posterior
 
 __all__ = ["Creep", "creep", "quiet_of"]
 
 #: Probability that a sensor drifts along a recording, and that it is off from the first sample on.
 PRIOR = 0.01
+#: The same of the day's temperature, K, and the standard deviation of what it is off by then.
+TEMPERATURE, KELVIN = "dT_isa", 5.0
 SETTLED = 0.1  # s after a report, in which its innovations are explained
 FEWEST = 8  # samples in which one is looked for
 _JUMPS = ("state", "drift", "output")
@@ -97,8 +100,20 @@ def quiet_of(tracked: Tracked) -> np.ndarray:
     return quiet
 
 
-def creep(filt: GasPathFilter, tracked: Tracked) -> Creep | None:
-    """Look for such errors along a recording; None in one of too few samples."""
+def creep(
+    filt: GasPathFilter,
+    tracked: Tracked,
+    *,
+    step: StepMaker | None = None,
+    backend: str | None = None,
+) -> Creep | None:
+    """Look for such errors along a recording; None in one of too few samples.
+
+    Args:
+        filt, tracked: the filter and what it said.
+        step: with which it did, as in :meth:`GasPathFilter.run`.
+        backend: see :func:`apu_casadi.core.backend.compiled`.
+    """
     r, quiet = tracked.result, quiet_of(tracked)
     if quiet.sum() < FEWEST:
         return None
@@ -109,14 +124,34 @@ def creep(filt: GasPathFilter, tracked: Tracked) -> Creep | None:
     f = linearised(filt.model, r, tracked.data, [j for j in jumps if j.name not in HEALTH])
     at, at_off = (f.columns([of[0] for of, _ in some.values()]) for some in (own, off))
     both, columns = _beside(f.ramps(r.t), f), [*at, *(len(f.names) + c for c in at_off)]
-    size, sigma = both.evidence(quiet)
+    warmer = _warmer(filt, tracked, step, backend)
+    g, error = (
+        np.concatenate([x[:, :, columns], of_day], axis=2)
+        for x, of_day in zip((both.signature(0), both.errors()), warmer, strict=True)
+    )
+    size, sigma = both.evidence(quiet, g)
+    names = (*(n.removeprefix("sensor ") for n in (*own, *off)), TEMPERATURE)
+    scale = np.array([s[0] for some in (own, off) for _, s in some.values()] + [KELVIN])
     # in ten minutes one by what the model is off is significant, and says nothing
-    sigma = np.hypot(sigma, MODEL_ERROR)
-    names = tuple(n.removeprefix("sensor ") for n in (*own, *off))
+    sigma = np.hypot(sigma, MODEL_ERROR / SIZE * scale)
     lasting = np.arange(len(names)) >= len(own)
-    scale = np.array([scales[0] for some in (own, off) for _, scales in some.values()])
-    error = both.errors()[:, :, columns]
-    return Creep(names, lasting, size[columns], sigma[columns], scale, error)
+    return Creep(names, lasting, size, sigma, scale, error)
+
+
+def _warmer(
+    filt: GasPathFilter, tracked: Tracked, step: StepMaker | None, backend: str | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a day that is 1 K warmer than given adds to innovations and states.
+
+    By the filter itself on such a day; shapes (K, ny, 1) and (K, nx, 1).
+    """
+    r, data = tracked.result, tracked.data
+    u = data.u.copy()
+    u[filt.model.u.index(TEMPERATURE)] += 1.0
+    day = dataclasses.replace(data, u=u)
+    other = filt.run(day, prior=tracked.prior, step=step, backend=backend)
+    nu = np.nan_to_num(r.innovation - other.innovation)
+    return nu.T[:, :, None], (other.mean - r.mean).T[:, :, None]
 
 
 def _beside(a: LinearFilter, b: LinearFilter) -> LinearFilter:

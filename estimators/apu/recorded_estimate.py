@@ -220,7 +220,7 @@ def estimate(
     if gas:
         given = ambient or {}, notes, doubts, backend, start
         filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
-        drifts = creep(filt, tracked)
+        drifts = creep(filt, tracked, step=ROBUST, backend=backend)
         found_of, odd = told(gas_causes(filt, tracked))
         causes[GAS] = (*still_causes(still), *found_of)
         doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
