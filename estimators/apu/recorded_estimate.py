@@ -452,7 +452,7 @@ class _GasPath:
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x, generators=False)
+        self.prior.check(filt.model.x, generators=bool(self.m.electrical))
         means = self._start(readings, sensors) | dict(known.mean)
         return filt, data, filt.prior(known.sigma, **means)
 
