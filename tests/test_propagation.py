@@ -184,7 +184,7 @@ def test_what_is_not_linear_or_too_coarse_is_refused():
 def test_single_samples_beside_an_open_phase_are_refused():
     """They take the slope of the terminal voltage: power was 2 % off."""
     ss, u = GEN.variant(OPEN, None), GEN.inputs(OPEN)
-    with pytest.raises(NotApplicable, match="open phase leaves no digits"):
+    with pytest.raises(NotApplicable, match="digits an open phase takes"):
         Propagator(GEN, ss, u, GEN.fault_vector(OPEN, None), n_out=400, dt=0.02, fine=True)
 
 
