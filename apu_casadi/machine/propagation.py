@@ -72,11 +72,10 @@ class Strides(NamedTuple):
 
     A new speed at the start of a step lets the terminal voltage jump and settle within a
     millisecond, which single samples resolve.  After that, where nothing ripples, the exciter can
-    take five samples at once.  Under a fault or an unbalanced load its drive follows the ripple of
-    the terminal voltage, and two are right, from the start: single samples take the voltage's rate,
-    which beside an open phase, or a fault's loop beside an inductive load, has no digits left.
-    ``fine`` is single samples throughout: while a regulator limit is met or left, say
-    (``DRIVE_TOL`` tells).
+    take five samples at once; under a fault its drive follows the ripple of the terminal voltage
+    and two are right.  ``fine`` is single samples throughout: while a regulator limit is met or
+    left, say (``DRIVE_TOL`` tells).  Single samples take the voltage's slope under a ripple: where
+    that has no digits, there are none.
     """
 
     head: int
@@ -88,12 +87,12 @@ class Strides(NamedTuple):
         return np.concatenate([np.arange(self.head), self.head + self.m * np.arange(self.many)])
 
 
-def strides(n_out: int, h: float, constant: bool, fine: bool) -> Strides:
-    """Choose the strides for n_out samples of length h, s."""
+def strides(n_out: int, h: float, constant: bool, fine: bool, sloped: bool = True) -> Strides:
+    """Choose the strides for n_out samples of length h, s; ``sloped`` where slopes have digits."""
     if fine:
         return Strides(n_out, 1, 0)
     m = 5 if constant else 2
-    head = min(n_out, math.ceil(SETTLING / h)) if constant else 0
+    head = min(n_out, math.ceil(SETTLING / h)) if sloped else 0
     head += (n_out - head) % m
     return Strides(head, m, (n_out - head) // m)
 
@@ -314,7 +313,7 @@ def _advance(
     PP = [ca.MX.sym(k, n, columns) for k, n in zip("PQ", rows[plan.m], strict=False)]
     single, V_of = leap(ss, 1, constant)
     # a fault's current beside an inductive load settles within microseconds of a new speed
-    first_x = X0 if constant else settled(ss, constant)(X0, U, TH, H / 4)[0]
+    first_x = settled(ss, False)(X0, U, TH, H / 4)[0] if "i_fault" in ss.linear else X0
     S = ca.vertcat(X0, *V_of(first_x, U, TH), 0, U, TH, H)
     parts = []
     if plan.head:
@@ -451,10 +450,12 @@ class Propagator(Rebuilt):
         given, w_rated = np.array(theta, dtype=float), gen.machine.w_rated
         self.theta = ss.full(given)
         self.constant = constant = symmetry(ss, u, given, w_rated)
-        plan = strides(n_out, self.h, constant, fine)
-        if fine and not constant and self.h * fastest(ss, u, given, w_rated) > LOST:
+        stiff = not constant and self.h * fastest(ss, u, given, w_rated) > LOST
+        if fine and stiff:
             text = "single samples take the slope of a voltage whose digits an open phase takes"
             raise NotApplicable(f"{ss.name}: {text}")
+        # a fault's current that is a state, beside an inductive load, may be as stiff on its way
+        plan = strides(n_out, self.h, constant, fine, not stiff and "i_fault" not in ss.linear)
         table = cached_table(ss, u, given, w_rated, h=self.h, leaps=plan.m)
         self.table = table.filled(max(harmonics, table.harmonics))
         # what ``function`` depends on
