@@ -91,7 +91,7 @@ def _widest() -> int:
 def digest() -> str:
     """Tell one writer of code from another."""
     h = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.glob("*.[cp]*")):
         h.update(path.read_bytes())
     return h.hexdigest()
 
@@ -276,7 +276,7 @@ def source(fun: ca.Function, lanes: int, common: Sequence[int] = ()) -> str:
     text = framed(*names, inputs, outputs, (total + 1) * lanes)
     before, after = _wide_call(sizes_in, sizes_out, wide)
     call = f"{done.name}(a,r,v);"
-    return "\n".join([writer.source(), text, *before, call, *after, "DONE return 0;}", ""])
+    return "\n".join([writer.source(), text, *before, call, *after, "TO_SCALAR return 0;}", ""])
 
 
 def _patterns(patterns: Sequence[ca.Sparsity]) -> str:

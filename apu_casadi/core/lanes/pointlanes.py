@@ -44,7 +44,7 @@ const int n=COUNT-c<L?COUNT-c:L;
 GIVEN
 CALL(a,r,0);
 BACK}
-DONE return 0;}
+TO_SCALAR return 0;}
 """
 
 #: z + x y of dense matrices, rows in lanes and columns of y side by side: a sum waits for each of
@@ -72,7 +72,7 @@ for(casadi_int k=0;k<p;k++){const V b=V_FROM(m,x+j+k*n);\
 for(int c=0;c<C;c++)s[c]=s[c]+b*v_all(y[k+(i+c)*p]);}\
 for(int c=0;c<C;c++)V_TO(m,z+j+(i+c)*n,s[c]);}
 static void product(const double*x,casadi_int n,casadi_int p,const double*y,casadi_int q,double*z){
-casadi_int i=0;COLUMNS(4)COLUMNS(1)}
+casadi_int i=0;COLUMNS(4)COLUMNS(1)TO_SCALAR}
 """
 _BY_ROWS = "  if (!tr) { product(x, nrow_x, ncol_x, y, ncol_y, z); return; }\n"
 
