@@ -67,6 +67,7 @@ NAMES = {getattr(ca, n): n for n in dir(ca) if n.startswith("OP_")}
 _PRELUDE = """
 #include <math.h>
 #include <stdint.h>
+#include <string.h>
 #if defined(__SSE2__)
 #include <immintrin.h>
 #elif defined(__aarch64__)
@@ -139,6 +140,16 @@ int i[L],k=0;for(int l=0;l<L;l++)i[l]=(int)q[l];
 for(;k+TURNED<=n;k+=TURNED)v_turned(t+k,i,to+k);
 #endif
 for(int l=0;l<L;l++)for(int j=k;j<n;j++)((double*)to)[j*L+l]=t[i[l]+j];}
+/* n numbers of some lanes, those of a lane side by side */
+IN void v_back(const V*r,int n,int some,double*to){
+int k=0;
+#ifdef TURNED
+int i[L];for(int l=0;l<L;l++)i[l]=l*L;
+for(;k+L<=n;k+=L){
+V t[L];v_turned((const double*)(r+k),i,t);
+for(int l=0;l<some;l++)memcpy(to+l*n+k,t+l,sizeof(V));}
+#endif
+for(int l=0;l<some;l++)for(int j=k;j<n;j++)to[l*n+j]=((const double*)r)[j*L+l];}
 #define EACH(f) static V v_##f(V a){V r;TO_SCALAR for(int l=0;l<L;l++)r[l]=f(a[l]);return r;}
 #if L==8 && defined(__AVX512F__)
 IN V v_sqrt(V a){return (V)_mm512_sqrt_pd((__m512d)a);}

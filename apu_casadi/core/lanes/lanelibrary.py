@@ -299,22 +299,16 @@ def _wide_call(
 ) -> tuple[list[str], list[str]]:
     """Code that puts columns into lanes before the call, and back after it."""
     before = ["V*v=(V*)(((uintptr_t)w+8*L-1)&~(uintptr_t)(8*L-1));"]
+    before.append("V at;for(int l=0;l<L;l++)at[l]=l;")
     for k, n in enumerate([*n_in, *n_out]):
         before.append(f"V*const b{k}=v;v+={n};")
     for k, n in enumerate(n_in):
         zero = f"else for(int k=0;k<{n};k++)b{k}[k]=v_all(0.0);"
         copy = f"for(int k=0;k<{n};k++)b{k}[k]=v_all(arg[{k}][k]);"
         if wide[k] > 1:
-            copy = (
-                f"for(int l=0;l<L;l++)for(int k=0;k<{n};k++)"
-                f"((double*)b{k})[k*L+l]=arg[{k}][l*{n}+k];"
-            )
+            copy = f"v_rows(arg[{k}],at*v_all({n}.0),{n},b{k});"
         before.append(f"if(arg[{k}]){copy}{zero}")
-    after = [
-        f"if(res[{k}])for(int l=0;l<L;l++)for(int k=0;k<{n};k++)"
-        f"res[{k}][l*{n}+k]=((double*)b{k + len(n_in)})[k*L+l];"
-        for k, n in enumerate(n_out)
-    ]
+    after = [f"if(res[{k}])v_back(b{k + len(n_in)},{n},L,res[{k}]);" for k, n in enumerate(n_out)]
     before.append(_pointers("V", "b{}", len(n_in), len(n_out)))
     return before, after
 
