@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from apu_casadi.core.errors import EstimationError
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gascauses import SIZE, jumps_of
 from estimators.apu.gaspath import MODEL_ERROR, GasPathFilter
@@ -143,13 +144,16 @@ def _warmer(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a day that is 1 K warmer than given adds to innovations and states.
 
-    By the filter itself on such a day; shapes (K, ny, 1) and (K, nx, 1).
+    By the filter itself on such a day; shapes (K, ny, 1) and (K, nx, 1), 0 where it is lost.
     """
     r, data = tracked.result, tracked.data
     u = data.u.copy()
     u[filt.model.u.index(TEMPERATURE)] += 1.0
     day = dataclasses.replace(data, u=u)
-    other = filt.run(day, prior=tracked.prior, step=step, backend=backend)
+    try:
+        other = filt.run(day, prior=tracked.prior, step=step, backend=backend)
+    except EstimationError:  # data that are too odd for it: they tell nothing of the day
+        other = r
     nu = np.nan_to_num(r.innovation - other.innovation)
     return nu.T[:, :, None], (other.mean - r.mean).T[:, :, None]
 
