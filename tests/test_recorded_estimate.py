@@ -81,8 +81,10 @@ def test_run_measure_estimate_is_the_joint_estimation(run, joint):
     )
     assert joint.joint and joint.believable, joint.doubts
     for n in ("N", *HEALTH):
-        for end in ("", "_sigma"):
-            assert_allclose(joint.gaspath[n + end], e[n + end], rtol=1e-7, err_msg=n)
+        assert_allclose(joint.gaspath[n], e[n], rtol=1e-7, err_msg=n)
+        # a sensor that is off by more than was stated is in the band of a recording alone
+        wider = joint.gaspath[f"{n}_sigma"].values / e[f"{n}_sigma"].values
+        assert np.all((wider > 1 - 1e-7) & (wider < 1.1)), n  # most in the first samples
     machine = joint.machines[1]
     for n in ("h_a", "h_b", "h_c", "h_a_sigma", "P_total", "faulty_phase"):
         assert_allclose(machine[n], e[n], rtol=1e-6, atol=1e-10, err_msg=n)
@@ -352,7 +354,7 @@ def test_a_short_circuit_too_small_to_report_is_no_change_of_health():
     for k_rf, found in ((713.0, False), (100.0, True)):
         fault = Ttsc(mu=0.05, k_rf=k_rf, phase="b")
         ds = simulate_joint(
-            APU, duration=0.2, load=SeriesLoad.from_power(100e3), health={"f_eta_c": 0.92},
+            APU, duration=0.2, load=SeriesLoad.from_power(100e3), health={"f_eta_c": 0.94},
             fault=fault, dt=0.005, waveform_dt=1e-4,
         )  # fmt: skip
         made = measure_run(ds, APU, SEED, gains=False)

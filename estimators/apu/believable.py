@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.creeping import Creep, creep, quiet_of
@@ -423,7 +424,8 @@ def gas_doubts(
         *r.x.names
     }:  # freer than a load moves: innovations alternate, sigma is large
         found = [f for f in found if f.test != "colour" or f.value > 0]
-    found += _creeping(creep(filt, tracked) if drifts is None else drifts)
+    drifts = creep(filt, tracked) if drifts is None else drifts
+    found += _creeping(drifts)
     for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
@@ -433,6 +435,7 @@ def gas_doubts(
             f"{MOST_JUMPS} changes of health were reported, and further ones were not looked for",
         )
     yield from _prior_doubts(filt, tracked)
+    yield from _off(drifts)
     x = {n: float(r[n][0][-1]) for n in HEALTH}
     for n, v in x.items():
         if abs(v - 1) > STEEP:
@@ -455,11 +458,29 @@ def _creeping(found: Creep | None) -> list[Finding]:
     """
     if found is None:
         return []
-    z = np.abs(found.size / found.sigma)
+    z = np.abs(found.size / found.sigma)[~found.lasting]  # drifts come first
     # others share a part of its signature: the most striking one alone is told
     k = int(z.argmax())
     chance = float(2 * ndtr(-z[k] / math.sqrt(MARGIN))) * len(z)
     return [Finding(found.names[k], "creep", chance, float(found.size[k]))]
+
+
+def _off(found: Creep | None) -> Iterator[Doubt]:
+    """Say where errors all along, beyond what was stated, are more probable than none.
+
+    Such an error shows in no innovation: the health factors follow it, farther than they probably
+    are.  A wrong day, or an engine that is much worse than its prior, looks alike.
+    """
+    if found is None or (p := found.probability * found.lasting).sum() < SURELY:
+        return
+    k = int(p.argmax())
+    name, size = found.names[k], found.size[k]
+    error = f"{size:+.3g} {CONDITIONS[name].unit}" if name in CONDITIONS else f"{size:+.1%}"
+    yield Doubt(
+        "prior",
+        f"{name}: an error of {error} all along, beyond what was stated, explains the readings "
+        f"better than the health does ({100 * p.sum():.0f} % for some such error)",
+    )
 
 
 def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

@@ -237,11 +237,14 @@ def estimate(
             causes[GAS] = tuple(still_causes(still))
     if found_by is not None:
         filt, tracked = found_by
-        drifts = creep(filt, tracked)
-        e = gas_dataset(filt, tracked, None if fused_by else drifts)  # the joint band is its own
+        drifts = creep(filt, tracked, step=ROBUST, backend=backend)
         found_of, odd = _causes_of(filt, tracked)
         causes[GAS] = (*still_causes(still), *found_of)
         doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
+        if drifts is not None:
+            wide = drifts.widened(tracked.result, drifts=not fused_by)
+            tracked = dataclasses.replace(tracked, result=wide)
+        e, found_by = gas_dataset(filt, tracked), (filt, tracked)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
     balanced = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)
@@ -484,7 +487,7 @@ class _GasPath:
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x, generators=False)
+        self.prior.check(filt.model.x, generators=bool(self.m.electrical))
         means = self._start(readings, sensors) | dict(known.mean)
         return filt, data, filt.prior(known.sigma, **means)
 

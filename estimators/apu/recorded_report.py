@@ -12,7 +12,6 @@ from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH, HEALTH_FACTORS
 from apu_casadi.machine.park import PHASES
-from estimators.apu.creeping import Creep
 from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
@@ -40,12 +39,9 @@ SURE = 3.0  # sigmas from which a factor is said to have changed
 TOLD = 0.7  # share of the prior's sigma above which the data say little of a factor
 
 
-def gas_dataset(filt: GasPathFilter, tracked: Tracked, drifts: Creep | None = None) -> xr.Dataset:
-    """Return speed and health with their sigmas over time; alarms and onsets as attributes.
-
-    The sigmas hold what ``drifts`` of sensors may have moved (:mod:`.creeping`).
-    """
-    r = tracked.result if drifts is None else drifts.widened(tracked.result)
+def gas_dataset(filt: GasPathFilter, tracked: Tracked) -> xr.Dataset:
+    """Return speed and health with their sigmas over time; alarms and onsets as attributes."""
+    r = tracked.result
     names = [
         n for n in ("N", *HEALTH, "PW", *(f"gain_{g}" for g in filt.gains)) if n in filt.model.x
     ]
