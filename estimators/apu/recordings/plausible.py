@@ -266,9 +266,9 @@ def stuck(values: np.ndarray, others: Sequence[np.ndarray]) -> tuple[int, int] |
 
 
 #: Samples at the end of the range over those at the next value, of a transducer that clips; and
-#: where they are in runs. Of the highest two digits of a sinusoid the upper one has 2.4 times as
+#: where digits are in runs. Of the highest two digits of a sinusoid the upper one has 2.4 times as
 #: many, 1/(sqrt(2) - 1).
-PILED, IN_RUNS = 8, 3
+PILED, DIGITS = 8, 3
 
 
 def clipped(values: np.ndarray) -> int:
@@ -277,12 +277,17 @@ def clipped(values: np.ndarray) -> int:
     They stand there so often that digits do not explain it.
     """
     count, same = 0, 1e-9 * float(np.nanmax(values) - np.nanmin(values))
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    steps = steps[steps > same]
+    # in digits all steps are whole ones
+    whole = steps / steps.min() if steps.size else steps
+    digits = bool(steps.size) and bool((abs(whole - np.round(whole)) < 1e-3).all())
     for end, sign in ((np.nanmax(values), 1), (np.nanmin(values), -1)):
         at = sign * (end - values) <= same
         rest = sign * values[~at & np.isfinite(values)]
         beside = int((rest >= rest.max() - same).sum()) if rest.size else 0
         runs = int((at[1:] & at[:-1]).sum())
-        most = IN_RUNS if 4 * runs > at.sum() else PILED
+        most = PILED if 4 * runs <= at.sum() else DIGITS if digits else 0
         count += int(at.sum()) if beside and at.sum() > most * beside else 0
     return count if count >= 4 and count > 0.002 * values.size else 0
 
