@@ -22,6 +22,7 @@ from estimators.apu.electrical.residuals import field_steps
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.healthjumps import Tracked
+from estimators.apu.jointcases import joint_case
 from estimators.apu.measuring import measure_run
 from estimators.apu.sensors import ELECTRICAL
 from estimators.apu.unknowns import ETA_SIGMA
@@ -33,10 +34,10 @@ pytestmark = pytest.mark.ci
 APU, AT = Apu(), 0.1
 
 
-def run(*events, apu=APU, duration=0.2):
+def run(*events, apu=APU, duration=0.2, health=None):
     return simulate_joint(
         apu, duration=duration, load=SeriesLoad.from_power(150e3), events=events, dt=0.005,
-        exchange="corrected", waveform_dt=1e-4,
+        exchange="corrected", waveform_dt=1e-4, health=health,
     )  # fmt: skip
 
 
@@ -152,13 +153,60 @@ def test_a_drift_that_hardly_shows_is_in_the_band(gas):
         assert np.all(same.variance[:, -1] < 1.1 * r.variance[:, -1])
         found = creep(filt, Tracked(off, (), (), dataclasses.replace(data, u=u)))
         wide = found.widened(off)
-        k = found.names.index("shaft power")
+        k = found.names.index("shaft power")  # drifts come first
         assert found.size[k] == pytest.approx(0.05, abs=4 * found.sigma[k])
         # what the drift moves is what the filters differ by
         moved = (off.mean - r.mean)[filt.model.x.index("f_eta_t"), -1]
         said = -0.05 * found.error[-1, filt.model.x.index("f_eta_t"), k]
         assert said == pytest.approx(moved, rel=0.3)
         assert max(abs(wide[n][0][-1] - v) / wide[n][1][-1] for n, v in truth.items()) < 3
+
+
+def test_a_reading_beyond_its_stated_error(gas):
+    """T5 5 % too high, ten times its sigma, moves four factors and shows in no innovation."""
+    filt, quiet = gas_path_filter(eta=ETA_SIGMA, consider_eta=False), gas[1]
+    z, moved = [], []
+    for seed in range(4):
+        data = filt.recording(quiet, seed, gains=joint_case(seed).gas_gains)
+        y = data.y.copy()
+        y[filt.model.y.index("T5")] *= 1.05
+        off = dataclasses.replace(data, y=y)
+        r = filt.run(off, backend="vm")
+        found = creep(filt, Tracked(r, (), (), off))
+        wide = found.widened(r, drifts=False)
+        z.append(max(abs(r[n][0][-1] - 1) / r[n][1][-1] for n in HEALTH))
+        moved.append(max(abs(wide[n][0][-1] - 1) / wide[n][1][-1] for n in HEALTH))
+        doubts = [*gas_doubts(filt, Tracked(r, (), (), off), drifts=found)]
+        surely = (found.probability * found.lasting).sum() > 0.5
+        assert any(d.startswith("T5: an error of +") for d in doubts) == surely
+    assert max(z) > 4 and max(moved) < 3.5, (z, moved)
+
+
+def test_another_day(gas):
+    """12 K warmer than was given; the recording says by how much, and it is no change of health."""
+    filt, quiet = gas_path_filter(eta=ETA_SIGMA, consider_eta=False), gas[1]
+    data = filt.recording(quiet, 1, gains=joint_case(1).gas_gains)
+    u = data.u.copy()
+    u[filt.model.u.index("dT_isa")] -= 12.0
+    off = dataclasses.replace(data, u=u)
+    tracked = Tracked(filt.run(off, backend="vm"), (), (), off)
+    found = creep(filt, tracked)
+    assert found.names[-1] == "dT_isa" and found.probability[-1] > 0.5
+    assert found.size[-1] == pytest.approx(12.0, abs=3 * found.sigma[-1])
+    assert any(d.startswith("dT_isa: an error of +") for d in gas_doubts(filt, tracked))
+
+
+def test_health_that_was_off_before_is_no_error_of_a_sensor():
+    """By as much as the prior has it probable, 2 % of each factor; 1.5 times that in this run."""
+    filt = gas_path_filter(eta=ETA_SIGMA, consider_eta=False)
+    factors = {"f_eta_c": 0.97, "f_W_c": 0.97, "f_eta_t": 0.97, "f_W_t": 1.03}
+    worn = run(health=factors, duration=1.0)
+    for seed in range(3):
+        data = filt.recording(worn, seed, gains=joint_case(seed).gas_gains)
+        r = filt.run(data, backend="vm")
+        found = creep(filt, Tracked(r, (), (), data))
+        assert (found.probability * found.lasting).sum() < 0.3
+        assert not [*gas_doubts(filt, Tracked(r, (), (), data), drifts=found)]
 
 
 def told(filt, data, k=55):

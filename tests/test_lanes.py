@@ -130,6 +130,48 @@ def test_a_graph_has_the_bits_of_scalar_c():
         assert bits(a.full()) == bits(b.full())
 
 
+def random_graph(rng, operations=40, n=5):
+    """An MX function that reads what it made long ago, in place and by parts, at random."""
+    x, y = ca.MX.sym("x", n), ca.MX.sym("y", n)
+    inner = ca.SX.sym("a", n), ca.SX.sym("b", n)
+    g = ca.Function("g", [*inner], [ca.sin(inner[0]) * inner[1], inner[0] - inner[1]])
+    some = [x, y]
+
+    def drawn():
+        return some[int(rng.integers(max(0, len(some) - 12), len(some)))]
+
+    for _ in range(operations):
+        a, b = drawn(), drawn()
+        placed = ca.MX(a)
+        placed[[0, n - 1]] = b[:2]
+        kinds = [[a + b], [a * 0.5], [placed], g(a, b), [ca.mtimes(ca.diag(a), b)]]
+        kinds += [ca.vertsplit(ca.vertcat(a, b), n), [ca.sum1(a) * b], [a[::-1] / (2 + b * b)]]
+        kinds += [[ca.sum2(ca.reshape(g.map(2)(ca.repmat(a, 1, 2), ca.horzcat(a, b))[0], n, 2))]]
+        some += kinds[int(rng.integers(len(kinds)))]
+    return ca.Function("random", [x, y], [some[-1], ca.vertcat(*some[-6:])])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_work_that_is_still_read_is_never_written_over(seed):
+    """Work vectors share places; one that goes too early would change bits, not shapes."""
+    rng = np.random.default_rng(seed)
+    f = random_graph(rng)
+    x, y = rng.normal(size=(2, 5, 16))
+    for a, b in zip(batch(f, 1)(x, y), f.map(16)(x, y), strict=True):
+        assert bits(a) == bits(b)
+
+
+def test_work_does_not_grow_with_the_length_of_a_chain():
+    def work(steps):
+        x = v = ca.MX.sym("x", 50)
+        for k in range(steps):
+            v = ca.vertcat(v[10:], ca.sin(v[:10])) * (1 + k)
+        text = lanelibrary.source(ca.Function("chain", [x], [v]), 4)
+        return int(re.search(r"\*sz_w=(\d+)", text)[1])
+
+    assert work(80) <= 1.5 * work(4)  # gaps between places may stay
+
+
 def test_newton_lanes_converge_each_in_its_own_time():
     """Starts near and far, one that finds nothing, and one that is not a number."""
     root, n = newton(), 12

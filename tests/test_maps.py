@@ -9,10 +9,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.interpolate import BSpline, CubicSpline
+from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
-from apu_casadi.core.bsplines import derivative, spline
 from apu_casadi.core.errors import MapError, ParameterError
 from apu_casadi.gaspath.maps.mapfiles import SHIPPED, shipped
 from apu_casadi.gaspath.maps.maptable import MapTable
@@ -418,18 +417,3 @@ def test_tables_are_read_only():
     t = power_law_table()
     with pytest.raises(ValueError, match="read-only"):
         t.W[0, 0] = 2.0
-
-
-def test_splines_are_those_of_scipy():
-    """Values, derivatives and splines of derivatives: the same operations, equal in every bit."""
-    draws = np.random.default_rng(1)
-    for n in range(4, 20):
-        x = np.sort(draws.uniform(0.0, 2.0, n))
-        knots, C = np.r_[[x[0] - 1] * 4, x, [x[-1] + 2] * 4], draws.standard_normal((n + 4, 3, 2))
-        at, theirs = np.r_[knots, draws.uniform(-1.5, 4.5, 20)], BSpline(knots, C, 3)
-        for nu in range(4):
-            np.testing.assert_array_equal(spline(knots, C, 3, at, nu), theirs(at, nu=nu))
-        slope = derivative(knots, C, 3)
-        np.testing.assert_array_equal(spline(*slope, at), theirs.derivative(1)(at))
-        curvature = derivative(*slope)
-        np.testing.assert_array_equal(spline(*curvature, at), theirs.derivative(2)(at))

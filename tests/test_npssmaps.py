@@ -104,6 +104,29 @@ def test_the_design_alpha_is_read(write):
     assert read_map(write(two)).W.shape == table.W.shape
 
 
+@pytest.mark.parametrize("name", ["axi5", "lpt2269"])
+def test_a_star_repeats_the_coordinates_of_the_line_before(write, name):
+    """As in the maps of the JT9D in NASA's T-MATS, after the first line of each table or alpha."""
+    text = npss(shipped(name), alphas=(0.0, 90.0) if name == "axi5" else (0.0,))
+    along = "RlineMap" if name == "axi5" else "PRmap"
+    table, block = re.compile(r"Table TB_.*?\n   }", re.DOTALL), rf"{along} = {{[^}}]*}}"
+
+    def starred(match):
+        head, *rest = re.split(rf"({block})", match.group(), maxsplit=1)
+        return head + rest[0] + re.sub(block, f"{along} = *;", rest[1])
+
+    short = table.sub(starred, text)
+    assert short.count(f"{along} = *;") > 5 * text.count("Table TB_")
+    found, whole = read_map(write(short)), read_map(write(text))
+    for n in ("N", "beta", "W", "PR", "eta"):
+        assert_array_equal(getattr(found, n), getattr(whole, n))
+    none = re.sub(block, f"{along} = *;", text, count=1)
+    with pytest.raises(
+        DataError, match=rf"line \d+: values of {along}, none of it before, expected"
+    ):
+        read_map(write(none))
+
+
 def test_an_engine_runs_on_it(write):
     """The default engine's own maps from such files give its own operating points (to 1e-5)."""
     gg = GasGenerator()

@@ -103,7 +103,7 @@ def test_power_and_waveforms_give_one_answer():
 
 def test_a_sensor_that_stands_still_is_a_cause():
     places = ("T5", "gas path"), ("i_a_2", "machine 2")
-    still = [Still(n, 2.0, Doubt("sensor", "stands still", part)) for n, part in places]
+    still = [Still(n, 2.0, 3.0, Doubt("sensor", "stands still", part)) for n, part in places]
     (c,) = still_causes(still)
     (d,) = diagnoses({"gas path": (c,)})
     assert d.best == "sensor T5" and d.failure == {"stuck": 1.0} and d.t == 2.0

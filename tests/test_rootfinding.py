@@ -1,13 +1,10 @@
 """Newton's method: finds known roots, and never calls a bad point good."""
 
-import math
-
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
-from apu_casadi.core.rootfinding import Newton, bracketed, solve_bordered
+from apu_casadi.core.rootfinding import Newton, solve_bordered
 
 
 def newton(residual, n=1, n_p=0, **options):
@@ -132,23 +129,3 @@ def test_bordered_systems_are_solved_as_by_elimination(n, k):
     b = ca.SX.sym("b", n, 3)
     X = ca.Function("X", [a, b], [solve_bordered(a, b, k)])(ca.sparsify(pattern), B)
     np.testing.assert_allclose(X.full(), np.linalg.solve(A, B), rtol=1e-10, atol=1e-12)
-
-
-def test_a_bracketed_root_is_that_of_scipy():
-    """The same operations: equal in every bit, whatever the tolerance and the side it starts on."""
-    draws = np.random.default_rng(0)
-    seen = 0
-    while seen < 100:
-        c, (a, b) = draws.standard_normal(5), draws.uniform(-3.0, 3.0, 2).tolist()
-
-        def f(x, c=c):
-            return c[0] + c[1] * x + c[2] * math.sin(3 * x) + c[3] * math.exp(x / 2) + c[4] * x**3
-
-        if f(a) * f(b) > 0:
-            with pytest.raises(ValueError, match="no change of sign"):
-                bracketed(f, a, b, 1e-12, 1e-15)
-            continue
-        seen += 1
-        for xtol, rtol in ((1e-12, 1e-15), (1e-4, 1e-13)):
-            assert bracketed(f, a, b, xtol, rtol) == brentq(f, a, b, xtol=xtol, rtol=rtol)
-    assert bracketed(lambda x: x, 0.0, 1.0, 1e-12, 1e-15) == 0.0

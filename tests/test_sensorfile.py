@@ -12,7 +12,7 @@ from estimators.apu.priorfile import read_prior
 from estimators.apu.recordings.measured import read_recording
 from estimators.apu.sensorfile import KEYS, TABLED, SensorFile, read_sensors, sensor_schema, to_toml
 from estimators.apu.sensors import ELECTRICAL, GAS_PATH, KNOWN, Sensor, SensorSet, unregister
-from estimators.apu.unknowns import UNKNOWNS
+from estimators.apu.unknowns import UNKNOWNS, Knowledge
 from scenarios import cli
 
 OWN = """
@@ -170,6 +170,27 @@ def test_a_prior_file(tmp_path):
         ("[f_eta_c]\nsigma = 0", "sigma must be a number > 0, got 0"),
         ("f_eta_c = 1", r"a table \[f_eta_c\] with mean or sigma is expected"),
         ("[", "no TOML"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=words):
+            read_prior(path)
+
+
+def test_a_prior_file_says_what_is_done_about_a_parameter(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text(
+        '[machine.L_md]\nsigma = 0.05\nhow = "estimated"\n[machine.r_s]\nhow = "known"\n'
+        '[J]\nhow = "estimated"\n'
+    )
+    of = read_prior(path).unknowns()
+    assert of["machine.L_md"] == Knowledge("estimated", 0.05)
+    assert of["machine.r_s"] == Knowledge("known")
+    assert of["J"] == Knowledge("estimated", UNKNOWNS["J"].sigma)
+    for text, words in (
+        ('[J]\nhow = "estimate"', "J: how = 'estimate' .did you mean 'estimated'"),
+        ('[machine.L_mq]\nhow = "considered"', "L_mq: sigma = 0.0: a share of the value > 0"),
+        ('[J]\nhow = "known"\nsigma = 0.1', "0 for what is known"),
+        ('[f_eta_c]\nhow = "known"', "f_eta_c: unknown key 'how'"),
     ):
         path.write_text(text)
         with pytest.raises(DataError, match=words):

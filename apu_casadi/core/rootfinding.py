@@ -7,15 +7,12 @@ root finders report success with residuals above the tolerance on hard points.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-
-_BRENT = 100  # steps of Brent's method
 
 
 @dataclass(frozen=True)
@@ -154,45 +151,3 @@ def schur_sign(A: Any, k: int) -> Any:
     """
     lower, border, C, D = A[:k, :k], A[:k, k:], A[k:, :k], A[k:, k:]
     return ca.sign(ca.det(ca.densify(D - ca.mtimes(C, ca.solve(lower, border)))))
-
-
-def bracketed(f: Callable[[float], float], a: float, b: float, xtol: float, rtol: float) -> float:
-    """Return a root of f between a and b, where it has different signs, by Brent's method.
-
-    As ``scipy.optimize.brentq`` does it, operation by operation: that package takes longer to
-    import than all roots of a run.
-
-    Args:
-        xtol, rtol: half of what the root may be off, and that relative to it, together.
-
-    Raises:
-        ValueError: no change of sign.
-        RuntimeError: no convergence.
-    """
-    x0, x, x1, f1, before, step = a, b, 0.0, 0.0, 0.0, 0.0
-    f0, fx = f(x0), f(x)
-    if f0 == 0 or fx == 0:
-        return x0 if f0 == 0 else x
-    if (f0 < 0) == (fx < 0):
-        raise ValueError(f"no change of sign between {a:.6g} and {b:.6g}: {f0:.3g}, {fx:.3g}")
-    for _ in range(_BRENT):
-        if f0 != 0 and fx != 0 and (f0 < 0) != (fx < 0):
-            x1, f1, before, step = x0, f0, x - x0, x - x0
-        if abs(f1) < abs(fx):
-            x0, x, x1, f0, fx, f1 = x, x1, x, fx, f1, fx
-        delta, half = (xtol + rtol * abs(x)) / 2, (x1 - x) / 2
-        if fx == 0 or abs(half) < delta:
-            return x
-        tried = math.inf
-        if abs(before) > delta and abs(fx) < abs(f0):
-            if x0 == x1:
-                tried = -fx * (x - x0) / (fx - f0)
-            else:
-                s0, s1 = (f0 - fx) / (x0 - x), (f1 - fx) / (x1 - x)
-                tried = -fx * (f1 * s1 - f0 * s0) / (s1 * s0 * (f1 - f0))
-        near = 2 * abs(tried) < min(abs(before), 3 * abs(half) - delta)
-        before, step = (step, tried) if near else (half, half)
-        x0, f0 = x, fx
-        x += step if abs(step) > delta else math.copysign(delta, half) if half else -delta
-        fx = f(x)
-    raise RuntimeError(f"no root between {a:.6g} and {b:.6g} after {_BRENT} steps")

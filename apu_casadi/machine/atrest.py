@@ -8,13 +8,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from apu_casadi.core.errors import OperatingPointError
 from apu_casadi.core.means import PHASORS, RMS, SEQUENCES, sequences
-from apu_casadi.core.rootfinding import bracketed
 from apu_casadi.core.sharing import Parametric, derived
 from apu_casadi.machine import exciter as ac5a
 from apu_casadi.machine.generatormodel import GeneratorModel
@@ -138,7 +138,7 @@ class AtRest:
                 f"w_r = {w_r:.5g} rad/s: even at {low:.4g} V the regulator would need "
                 f"V_R = {self.at(load, w_r, low)[1].V_R:.4g}, ceiling {e.V_R_max:g}"
             )
-        return bracketed(excess, low, high, 1e-12, 1e-15)
+        return _root(excess, low, high)
 
     def excited(self, load: Load, w_r: float, V_fd: float) -> float:
         """Return the terminal voltage, V rms, that a field voltage gives, V: the highest one."""
@@ -163,7 +163,7 @@ class AtRest:
                     f"V_fd = {V_fd:.5g} V does not carry {load!r} at w_r = {w_r:.5g} rad/s"
                     + (f"; {load.caveat}" if load.caveat else "")
                 )
-        return bracketed(excess, low, low / 0.99, 1e-12, 1e-15)
+        return _root(excess, low, low / 0.99)
 
 
 def _saturated_field(
@@ -188,3 +188,9 @@ def _saturated_field(
             f"{V_t:.5g} V would need a field current of {i_fd:.4g} A"
         )
     return p.r_fd * i_fd, Windings(i_q, i_d, 0.0, i_fd, 0.0, 0.0)
+
+
+def _root(excess: Callable[[float], float], low: float, high: float) -> float:
+    import scipy.optimize
+
+    return float(scipy.optimize.brentq(excess, low, high, xtol=1e-12, rtol=1e-15))

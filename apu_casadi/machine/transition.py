@@ -345,6 +345,12 @@ def symmetry(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray, w_rated: floa
     return bool(np.abs(M - M[0]).max() <= 1e-12 * largest)
 
 
+def fastest(ss: GeneratorModel, u: np.ndarray, theta: np.ndarray, w_rated: float) -> float:
+    """Return the largest rate, 1/s, at which a winding's state acts on itself."""
+    M = _scaled(ss, u, theta)(_PROBE, np.full(_PROBE.size, w_rated))
+    return float(np.abs(M.diagonal(axis1=1, axis2=2)).max())
+
+
 @dataclass(frozen=True)
 class Table:
     """Transition matrices of one load, fault and sample, as Fourier series in the rotor angle.
@@ -471,7 +477,8 @@ def transition_table(
         pairs = np.stack([2 * part.real, -2 * part.imag], axis=2)
         if first == 0:
             pairs[:, 0] /= 2
-        return powers(pairs.reshape(NODES, -1, which.size), which)
+        # an isolated neutral without a fault has no odd entries: no shape follows from their number
+        return powers(pairs.reshape(NODES, 2 * pairs.shape[1], which.size), which)
 
     even, odd = series(0, kinds.even), series(1, kinds.odd)
     return Table(centre, half, even, odd, highest, error)

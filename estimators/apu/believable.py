@@ -25,6 +25,7 @@ level.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -32,6 +33,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from apu_casadi.gaspath.conditions import CONDITIONS
 from apu_casadi.gaspath.health import HEALTH
 from apu_casadi.machine.park import PHASE_ANGLE, PHASES
 from estimators.apu.creeping import Creep, creep, quiet_of
@@ -67,6 +69,7 @@ __all__ = [
     "machine_doubts",
     "standing_still",
     "still_causes",
+    "without_still",
 ]
 
 KINDS = (
@@ -89,6 +92,7 @@ RECENT = 0.1  # s, before a report, in which a reset is its own
 SLOWLY = 0.06  # s, before a report, in which a short circuit came that made no reset
 SLIP = 1.5  # rad; the angle between voltage and rotor of a machine in step changes by less
 FEWEST_SAMPLES = 100
+FEWEST_STILL = 20
 MOST_CAUSES = 3  # changes of a generator of which the cause is told
 SURELY = 0.5  # probability below which a report is doubted
 OFF_MAP = ("off_c", "off_t")
@@ -98,10 +102,11 @@ OFF_MAP = ("off_c", "off_t")
 
 
 class Still(NamedTuple):
-    """A sensor that stands still: its name, from when on, and what that makes doubtful."""
+    """A sensor that stands still: its name, from when until when, what that makes doubtful."""
 
     name: str
     t: float
+    end: float
     doubt: Doubt
 
 
@@ -120,8 +125,20 @@ def channels_still(m: Measurements, table: SensorSet, coarse: Collection[str] = 
         if rows is not None:
             a, b = (c.t[k] for k in rows)
             text = f"{c.source}: {n} stands still from {a:g} to {b:g} s"
-            out.append(Still(n, float(a), Doubt("sensor", text, part_of(n, m.electrical))))
+            out.append(
+                Still(n, float(a), float(b), Doubt("sensor", text, part_of(n, m.electrical)))
+            )
     return out
+
+
+def without_still(m: Measurements, still: Sequence[Still], table: SensorSet) -> Measurements:
+    """Return the recording without what outputs of the gas path show while they stand still."""
+    channels = dict(m.channels)
+    for s in (s for s in still if s.name in table.outputs):
+        c = channels[s.name]
+        stuck = (c.t >= s.t) & (c.t <= s.end)
+        channels[s.name] = dataclasses.replace(c, values=np.where(stuck, np.nan, c.values))
+    return dataclasses.replace(m, channels=channels)
 
 
 def still_causes(still: Sequence[Still]) -> Iterator[Causes]:
@@ -138,7 +155,8 @@ def standing_still(
     """Return first and last row of the longest run of one reading, if most others change in it.
 
     A coarse sensor repeats itself: the share q of its repeated readings, the longest run left out,
-    gives a run of n readings somewhere among K with a probability of less than K q^(n-1).
+    gives a run of n readings somewhere among K with a probability of less than K q^(n-1).  One that
+    never moves has no such share: as many as ``FEWEST_STILL`` are enough.
     """
     change = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
     length = np.diff(np.append(change, values.size))
@@ -146,7 +164,8 @@ def standing_still(
     n = int(length[k])
     repeats = K - change.size - (n - 1)
     q = min((repeats + 1) / max(K - n, 1), 1.0)
-    if n < 4 or math.log(K) + (n - 1) * math.log(q) > math.log(level):
+    never = n == K >= FEWEST_STILL
+    if n < 4 or (math.log(K) + (n - 1) * math.log(q) > math.log(level) and not never):
         return None
     part = slice(change[k], change[k] + n)
     there = [o[part][np.isfinite(o[part])] for o in others]
@@ -405,7 +424,8 @@ def gas_doubts(
         *r.x.names
     }:  # freer than a load moves: innovations alternate, sigma is large
         found = [f for f in found if f.test != "colour" or f.value > 0]
-    found += _creeping(creep(filt, tracked) if drifts is None else drifts)
+    drifts = creep(filt, tracked) if drifts is None else drifts
+    found += _creeping(drifts)
     for f in least(found, LEVEL):
         text = _GAS[f.test].format(v=f.value, t=float(r.t[f.at]))
         yield Doubt(_GAS_KIND.get(f.test, "colour"), f"{f.sensor}: {text}")
@@ -415,6 +435,7 @@ def gas_doubts(
             f"{MOST_JUMPS} changes of health were reported, and further ones were not looked for",
         )
     yield from _prior_doubts(filt, tracked)
+    yield from _off(drifts)
     x = {n: float(r[n][0][-1]) for n in HEALTH}
     for n, v in x.items():
         if abs(v - 1) > STEEP:
@@ -437,11 +458,29 @@ def _creeping(found: Creep | None) -> list[Finding]:
     """
     if found is None:
         return []
-    z = np.abs(found.size / found.sigma)
+    z = np.abs(found.size / found.sigma)[~found.lasting]  # drifts come first
     # others share a part of its signature: the most striking one alone is told
     k = int(z.argmax())
     chance = float(2 * ndtr(-z[k] / math.sqrt(MARGIN))) * len(z)
     return [Finding(found.names[k], "creep", chance, float(found.size[k]))]
+
+
+def _off(found: Creep | None) -> Iterator[Doubt]:
+    """Say where errors all along, beyond what was stated, are more probable than none.
+
+    Such an error shows in no innovation: the health factors follow it, farther than they probably
+    are.  A wrong day, or an engine that is much worse than its prior, looks alike.
+    """
+    if found is None or (p := found.probability * found.lasting).sum() < SURELY:
+        return
+    k = int(p.argmax())
+    name, size = found.names[k], found.size[k]
+    error = f"{size:+.3g} {CONDITIONS[name].unit}" if name in CONDITIONS else f"{size:+.1%}"
+    yield Doubt(
+        "prior",
+        f"{name}: an error of {error} all along, beyond what was stated, explains the readings "
+        f"better than the health does ({100 * p.sum():.0f} % for some such error)",
+    )
 
 
 def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, Doubt | None]]:

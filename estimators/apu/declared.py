@@ -94,12 +94,18 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     every = slow | waves
     for n, s in every.items():
         part = part_of(n, m.electrical)
+        if plain(n) in WAVES and (c := channels[n]).t.size > 1 and _constant(c.values):
+            text = f"{c.source}: {n} shows {np.nanmin(c.values):g} {c.unit} all the time"
+            doubts.append(Doubt("sensor", f"{text}, and is not used", part))
+            del channels[n]
+            continue
         channels[n] = _kept(channels[n], s, notes, doubts, part, wave=plain(n) in WAVES)
         lost = 1 - np.isfinite(channels[n].values).sum() / max(np.isfinite(m[n].values).sum(), 1)
         if plain(n) in VOLTAGES and lost > FILLED:
             notes.append(f"{n}: {100 * lost:.0f} % are too many to be filled, none is used")
             del channels[n]
     waves = {n: s for n, s in waves.items() if n in channels}
+    every = slow | waves
     for n, s in slow.items():
         if s.delay:
             c = channels[n]
@@ -117,6 +123,11 @@ def as_declared(m: Measurements, gas_path: SensorSet, electrical: SensorSet) -> 
     return Declared(
         ready, gas_path, SensorSet(tuple(changed)), tuple(notes), tuple(doubts), late, coarse
     )
+
+
+def _constant(v: np.ndarray) -> bool:
+    """Whether a channel has readings, and all are the same."""
+    return bool(np.isfinite(v).any() and np.nanmin(v) == np.nanmax(v))
 
 
 def _end(name: str) -> str:

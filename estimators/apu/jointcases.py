@@ -30,7 +30,8 @@ class JointCase:
     Args:
         gas_gains, electrical_gains: of sensors; ``PW`` is the error of the efficiency.
         delay: of the phase currents, s.
-        r_s: relative error of the stator's resistance as the filters know it.
+        r_s: by what share the stator's resistance is larger than the filters know it: what they
+            consider of it is a share of what they know.
     """
 
     gas_gains: dict[str, float]
@@ -40,7 +41,7 @@ class JointCase:
 
     def unit(self, apu: Apu) -> Apu:
         """Return the unit as the filters know it, of a true one."""
-        return apu.change({"machine.r_s": apu.generator.machine.r_s * (1 + self.r_s)})
+        return apu.change({"machine.r_s": apu.generator.machine.r_s / (1 + self.r_s)})
 
     def errors(self) -> dict[str, Any]:
         """Return what :func:`~estimators.apu.joint.estimate_joint` takes of it."""

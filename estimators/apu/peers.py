@@ -121,6 +121,7 @@ def compared_sides(
     beliefs = [s.beliefs for s in both or () if s.beliefs is not None]
     if len(beliefs) < 2 or len(beliefs) < len(sides):
         return None, {}, []
+    end = {"to": float(both[0].t[-1])} if both else {}
     found, doubts = compare(beliefs), list[str]()
     for k, (number, side) in enumerate(sides.items()):
         own = int(side.phase[-1])
@@ -136,7 +137,7 @@ def compared_sides(
             )
             part = f"{machine(number)}: {severity(PHASES[own - 1])}"
             doubts.append(Doubt("machine", text, part))
-    return found, found.report([*sides]), doubts
+    return found, end | found.report([*sides]), doubts
 
 
 def compare(

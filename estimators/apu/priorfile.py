@@ -7,6 +7,9 @@
     sigma = 0.001          # calibrated: the mean stays
     [machine.r_s]
     sigma = 0.02           # of the value; 0: known
+    [machine.L_md]
+    sigma = 0.05
+    how = "estimated"      # or "considered", as without it, or "known"
     [delay_i]
     sigma = 2e-6           # s, of the currents behind the voltages
     [h]
@@ -57,12 +60,15 @@ class Prior:
         mean, sigma: what differs from the usual.
         source: file that says so.
         probability: that a generator has a short circuit; None: the usual one.
+        how: what is done about a parameter, by name: see
+            :class:`~estimators.apu.unknowns.Knowledge`.
     """
 
     mean: Mapping[str, float] = field(default_factory=dict)
     sigma: Mapping[str, float] = field(default_factory=dict)
     source: str = "prior"
     probability: float | None = None
+    how: Mapping[str, str] = field(default_factory=dict)
 
     def check(self, states: Signals, *, generators: bool = True) -> None:
         """Refuse states that the filters do not have.
@@ -75,7 +81,7 @@ class Prior:
             DataError: with the nearest name.
         """
         own = (*SEVERITIES, *known_parameters())
-        for n in {**self.mean, **self.sigma}:
+        for n in {**self.mean, **self.sigma, **self.how}:
             if n in own and n not in BOTH and not generators:
                 what = "severity" if n in SEVERITIES else "parameter of the generators"
                 raise DataError(f"{self.source}: {n} is a {what}, and none of them was measured")
@@ -110,15 +116,24 @@ class Prior:
         """Return what is known of parameters, by name, the usual included.
 
         Raises:
-            DataError: a standard deviation below 0.
+            DataError: a standard deviation below 0, or none of what is not known.
         """
         out = dict(UNKNOWNS)
         for n in known_parameters():
-            if n in self.sigma:
-                if not self.sigma[n] >= 0:
-                    raise DataError(f"{self.source}, {n}: sigma = {self.sigma[n]!r} must be >= 0")
-                how = out[n].how if n in out else "considered"
-                out[n] = Knowledge.of(self.sigma[n], how)
+            if n not in self.sigma and n not in self.how:
+                continue
+            usual = out.get(n, Knowledge("known"))
+            sigma = self.sigma.get(n, usual.sigma)
+            if not sigma >= 0:
+                raise DataError(f"{self.source}, {n}: sigma = {sigma!r} must be >= 0")
+            try:
+                if n in self.how:
+                    known = self.how[n] == "known" and n not in self.sigma
+                    out[n] = Knowledge(self.how[n], 0.0 if known else sigma)
+                else:
+                    out[n] = Knowledge.of(sigma, usual.how if usual.sigma else "considered")
+            except ParameterError as e:
+                raise DataError(f"{self.source}, {n}: {e}") from None
         return out
 
     def severity(self) -> SeverityPrior:
@@ -149,14 +164,18 @@ def read_prior(path: str | Path) -> Prior:
     """
     data = read_toml(path, "")
     found: dict[str, dict[str, float]] = {k: {} for k in KEYS}
-    probability = None
+    probability, how = None, dict[str, str]()
     for name, row in _flat(data).items():
         if not isinstance(row, dict) or not row:
             raise DataError(f"{path}: a table [{name}] with mean or sigma is expected, got {row!r}")
         keys = (*KEYS, "probability") if name == ANY else KEYS
+        keys = (*keys, "how") if name in known_parameters() else keys
         for key, v in row.items():
             if key not in keys:
                 raise DataError(f"{path}, {name}: unknown key {key!r} {nearest(key, keys)}")
+            if key == "how":
+                how[name] = str(v)
+                continue
             number = isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
             zero = name in known_parameters()  # what is known
             if not number or (key == "sigma" and not (v > 0 or (zero and v == 0))):
@@ -166,7 +185,9 @@ def read_prior(path: str | Path) -> Prior:
                 probability = float(v)
             else:
                 found[key][name] = float(v)
-    return Prior(found["mean"], found["sigma"], str(path), probability)
+    made = Prior(found["mean"], found["sigma"], str(path), probability, how)
+    made.unknowns()  # says what cannot be
+    return made
 
 
 def _flat(data: Mapping[str, object]) -> dict[str, object]:

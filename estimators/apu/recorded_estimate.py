@@ -24,12 +24,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apu_casadi.core.errors import DataError, ParameterError, nearest
+from apu_casadi.core.errors import DataError, EstimationError, ParameterError, nearest
 from apu_casadi.gaspath.conditions import CONDITIONS, assumed_words
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.enginefile import read_unit
 from apu_casadi.unit.events import who
-from estimators.apu.believable import channels_still, gas_causes, gas_doubts, still_causes
+from estimators.apu.believable import (
+    channels_still,
+    gas_causes,
+    gas_doubts,
+    lost,
+    still_causes,
+    without_still,
+)
 from estimators.apu.creeping import creep
 from estimators.apu.declared import as_declared, tables
 from estimators.apu.diagnosis import Diagnosis, diagnoses
@@ -45,6 +52,7 @@ from estimators.apu.gaspath import (
 )
 from estimators.apu.gaspathmodel import DT, lag_of
 from estimators.apu.healthjumps import JumpTest, Tracked, track_jumps
+from estimators.apu.inputgaps import bridged, input_gaps
 from estimators.apu.joint import ElectricalSide, Pickup, fused, unit_of
 from estimators.apu.machinepowers import fusable
 from estimators.apu.peers import compared_sides
@@ -78,8 +86,8 @@ __all__ = ["PARTS", "RecordedEstimate", "electrical_data", "estimate", "gas_path
 PARTS = ("gaspath", "electrical")
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
 SLOW = 0.1  # s, a step of the fuel flow with which transients are not seen
-GAP = 5.0  # steps of a measured input, from which nobody knows what it was meanwhile
 STEP = 1.5 * DT  # longest of the gas-path filter
+MOST_TOLD = 12  # columns that are not used, by name
 FEWEST = 20  # innovations that a verdict takes
 #: The gas path's filter step, and its test of jumps, that single wild readings do not reach.
 ROBUST = partial(robust_ekf_step, iterations=ITERATIONS, iterated=ITERATED)
@@ -201,8 +209,9 @@ def estimate(
     how |= {"efficiency_error": efficiency_error}
     ready = as_declared(m, *tables(m, sensors, electrical_sensors))
     m, table, electrical_sensors = ready.m, ready.gas_path, ready.electrical
-    notes = [*m.notes, *ready.notes]
+    notes = [*m.notes, *ready.notes, *_unused(m)]
     still = channels_still(m, table, ready.coarse)
+    m = without_still(m, still, table)
     doubts = list[str]([*ready.doubts, *(s.doubt for s in still)])
     sides: dict[int, ElectricalSide] = {}
     found: dict[str, Sequences] = {}
@@ -219,27 +228,46 @@ def estimate(
     fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
         given = ambient or {}, notes, doubts, backend, start
-        filt, tracked = found_by = _GasPath(m, apu, table, *given).run(fused_by, electrical_sensors)
-        drifts = creep(filt, tracked)
-        e = gas_dataset(filt, tracked, None if fused_by else drifts)  # the joint band is its own
-        found_of, odd = told(gas_causes(filt, tracked))
+        path = _GasPath(m, apu, table, *given)
+        try:
+            found_by = path.run(fused_by, electrical_sensors)
+        except EstimationError as error:
+            lacking[GAS] = f"{error}"
+            doubts.append(lost(error).of(GAS))
+            causes[GAS] = tuple(still_causes(still))
+    if found_by is not None:
+        filt, tracked = found_by
+        drifts = creep(filt, tracked, step=ROBUST, backend=backend)
+        found_of, odd = _causes_of(filt, tracked)
         causes[GAS] = (*still_causes(still), *found_of)
         doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
+        if drifts is not None:
+            wide = drifts.widened(tracked.result, drifts=not fused_by)
+            tracked = dataclasses.replace(tracked, result=wide)
+        e, found_by = gas_dataset(filt, tracked), (filt, tracked)
         if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
             notes.append("so few readings hardly show whether the model holds")
-    lost = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)
+    balanced = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)
     compared, alike = compared_sides(sides)[1:]
     doubts += alike
-    if e is None and lost is None and not sides and not found:
-        raise DataError(f"nothing can be estimated: {_why(lacking)}")
+    if e is None and balanced is None and not sides and not found:
+        raise DataError("\n".join([f"nothing can be estimated: {_why(lacking)}", *notes, *doubts]))
     if apu.alike and 0 < len(sides) < len(apu.machines):
         notes.append(_some_of(tuple(sides), len(apu.machines)))
     texts = tuple(dict.fromkeys(notes)), tuple(dict.fromkeys(doubts))
     told_of = [k for k in machines_in(m) if k in sides or is_lost(texts[1], k)]
-    belief = believed(texts[1], gas=e is not None, machines=told_of, power_of=[*fused_by])
-    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared, belief, lost
+    belief = believed(texts[1], gas=gas, machines=told_of, power_of=[*fused_by])
+    end: Any = found_by and found_by[1].result, found_by, sides, causes, compared, belief, balanced
     machines = {k: side_dataset(s) for k, s in sides.items()}
     return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
+
+
+def _causes_of(filt: GasPathFilter, tracked: Tracked) -> tuple[tuple[Causes, ...], list[Doubt]]:
+    """Return what the changes are, and what that makes doubtful; of data too odd for it, that."""
+    try:
+        return told(gas_causes(filt, tracked))
+    except EstimationError as error:
+        return (), [Doubt("innovations", f"no cause of the changes fits these data: {error}", GAS)]
 
 
 def _balanced(
@@ -269,6 +297,16 @@ def _beforehand(m: Measurements, table: SensorSet, only: str | None) -> tuple[bo
         return False, {} if m.electrical else {"generators": "nothing of them was measured"}
     reason = _no_gas_path(m, table)
     return reason is None, {"gas path": reason} if reason and (m.gaspath or only) else {}
+
+
+def _unused(m: Measurements) -> list[str]:
+    """Tell of columns that no quantity of the model is."""
+    if not m.unused:
+        return []
+    more = f" and {len(m.unused) - MOST_TOLD} more" if len(m.unused) > MOST_TOLD else ""
+    return [
+        f"columns of no quantity of the model, not used: {', '.join(m.unused[:MOST_TOLD])}{more}"
+    ]
 
 
 def _why(lacking: Mapping[str, str]) -> str:
@@ -449,7 +487,7 @@ class _GasPath:
             consider_eta=False,
         )
         data = filt.of_readings(readings, inputs=inputs, max_dt=STEP)
-        self.prior.check(filt.model.x, generators=False)
+        self.prior.check(filt.model.x, generators=bool(self.m.electrical))
         means = self._start(readings, sensors) | dict(known.mean)
         return filt, data, filt.prior(known.sigma, **means)
 
@@ -470,22 +508,27 @@ class _GasPath:
     def _readings(
         self,
         sensors: SensorSet,
-        inputs: Mapping[str, Any],
+        inputs: dict[str, Any],
         span: tuple[float, float],
         *,
         known_power: bool,
     ) -> Streams:
-        """Readings from the instant that has all inputs to the last one."""
+        """Readings from the instant that has all inputs to the last one.
+
+        Where an input is not known, ``inputs`` is told its standard deviation.
+        """
         streams = self.m.streams(*(n for n in sensors.names if n in self.m))
         for n in [n for n, (t, _) in streams.items() if not t.size]:
             del streams[n]
+        self._note_unused(sensors, streams)
         inputs_of = ["Wf", "PW"] if known_power else ["Wf"]
         for n in inputs_of:
             if n not in streams:
                 raise DataError(f"{n} has no reading")
         held = [n for n in inputs_of if not sensors[n].tau]
         for n in held:
-            self._check_gaps(n, streams[n][0])
+            self._check_rate(n, streams[n][0])
+        gaps = {n: g for n in held if (g := input_gaps(streams[n][0]))}
         stamps = [v[0] for v in inputs.values() if isinstance(v, tuple)]
         firsts = [*(streams[n][0][0] for n in held), *(t[0] for t in stamps)]
         begin = max([span[0], *firsts])
@@ -501,22 +544,27 @@ class _GasPath:
                 )
             if inside.any():
                 out[n] = t[inside], v[inside]
+        out, unsure = bridged(gaps, out, sensors, self.notes)
+        inputs |= unsure
         if not [n for n in out if n in sensors.outputs]:
             raise DataError(f"no output was measured between {begin:g} and {end:g} s")
         return out
 
-    def _check_gaps(self, name: str, t: np.ndarray) -> None:
+    def _note_unused(self, sensors: SensorSet, streams: Streams) -> None:
+        """Tell of sensors without a reading, and of quantities that no sensor reads."""
+        empty = [n for n in sensors.names if n in self.m and n not in streams]
+        if empty:
+            self.notes.append(f"{', '.join(empty)}: no reading in the whole recording")
+        known = {OUTPUT, "P0", *CONDITIONS, *self.table.names}
+        left = [n for n in self.m.gaspath if n not in known]
+        if left:
+            self.notes.append(f"no sensor of the filter reads {', '.join(left)}: not used")
+
+    def _check_rate(self, name: str, t: np.ndarray) -> None:
+        """Refuse one reading of an input, and doubt what comes of slow ones."""
         if t.size < 2:
             raise DataError(f"{name}: one reading is no recording; apu fit takes steady points")
-        step = np.diff(t)
-        usual = float(np.median(step))
-        k = int(step.argmax())
-        if step[k] > max(GAP * usual, 0.2):
-            raise DataError(
-                f"{name}: no reading from {t[k]:g} to {t[k + 1]:g} s; the filter takes it as an "
-                "input and cannot go over that: give the parts before and after as files of "
-                "their own"
-            )
+        usual = float(np.median(np.diff(t)))
         if usual > SLOW:
             text = f"{name} is known every {usual:g} s only: what happens in between is taken for"
             self.doubts.append(Doubt("time", f"{text} a change of health", GAS))

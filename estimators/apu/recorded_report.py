@@ -12,7 +12,6 @@ from apu_casadi.core.results import dataset
 from apu_casadi.core.signals import Signal
 from apu_casadi.gaspath.health import HEALTH, HEALTH_FACTORS
 from apu_casadi.machine.park import PHASES
-from estimators.apu.creeping import Creep
 from estimators.apu.electrical.sequences import Sequences
 from estimators.apu.gaspath import HEALTH_SIGMA, GasPathFilter
 from estimators.apu.healthjumps import JumpTest, Tracked
@@ -40,12 +39,9 @@ SURE = 3.0  # sigmas from which a factor is said to have changed
 TOLD = 0.7  # share of the prior's sigma above which the data say little of a factor
 
 
-def gas_dataset(filt: GasPathFilter, tracked: Tracked, drifts: Creep | None = None) -> xr.Dataset:
-    """Return speed and health with their sigmas over time; alarms and onsets as attributes.
-
-    The sigmas hold what ``drifts`` of sensors may have moved (:mod:`.creeping`).
-    """
-    r = tracked.result if drifts is None else drifts.widened(tracked.result)
+def gas_dataset(filt: GasPathFilter, tracked: Tracked) -> xr.Dataset:
+    """Return speed and health with their sigmas over time; alarms and onsets as attributes."""
+    r = tracked.result
     names = [
         n for n in ("N", *HEALTH, "PW", *(f"gain_{g}" for g in filt.gains)) if n in filt.model.x
     ]
@@ -135,6 +131,15 @@ def sequence_report(s: Sequences) -> dict[str, Any]:
     return out | {"reference_windows": s.reference, "alarms": list(s.alarms)}
 
 
+def _at(t: float) -> str:
+    """An instant in words, s: to a millisecond in the hours of a day, too."""
+    return f"{t:.8g}"
+
+
+def _span(part: Mapping[str, Any]) -> str:
+    return f"{_at(part['from'])} to {_at(part['to'])} s"
+
+
 def _likely(probability: Mapping[str, float]) -> str:
     likely = sorted(probability.items(), key=lambda x: -x[1])[:3]
     return ", ".join(f"{what} {100 * p:.0f} %" for what, p in likely if p > 0.005)
@@ -142,10 +147,12 @@ def _likely(probability: Mapping[str, float]) -> str:
 
 def compared_words(r: Mapping[str, Any] | None) -> Iterator[str]:
     """Yield what a comparison of the machines says."""
-    for k, of in (r or {"machines": {}})["machines"].items():
+    r = r or {"machines": {}}
+    until = f" until {_at(r['to'])} s" if "to" in r else ""
+    for k, of in r["machines"].items():
         yield (
-            f"compared with the others, generator {k} has a short circuit with a probability of "
-            f"{of['probability']:.3f}, likeliest in phase {of['likeliest_phase']}"
+            f"compared with the others{until}, generator {k} has a short circuit with a "
+            f"probability of {of['probability']:.3f}, likeliest in phase {of['likeliest_phase']}"
         )
 
 
@@ -156,11 +163,11 @@ def _balance_words(b: Mapping[str, Any] | None) -> Iterator[str]:
     (loss, dl), (h, dh) = (
         (b["values"][n]["estimate"], b["values"][n]["half_width"]) for n in ("loss", "h")
     )
-    yield f"shaft power over electrical output, {b['from']:g} to {b['to']:g} s; at the end, 95 %"
+    yield f"shaft power over electrical output, {_span(b)}; at the end, 95 %"
     yield f"  {'new loss [kW]':<22} {1e-3 * loss:.2f} +- {1e-3 * dl:.2f}"
     yield f"  {'as a severity [1e-3]':<22} {1e3 * h:.3f} +- {1e3 * dh:.3f}"
     for t, onset in zip(b["alarms"], b["onsets"], strict=True):
-        yield f"  it changed after {onset:g} s, reported at {t:g} s"
+        yield f"  it changed after {_at(onset)} s, reported at {_at(t)} s"
 
 
 def words(r: Mapping[str, Any]) -> Iterator[str]:
@@ -168,7 +175,7 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
     if "gaspath" in r:
         g = r["gaspath"]
         how = "gas path with the power of the waveforms" if g["joint"] else "gas path"
-        yield f"{how}, {g['from']:g} to {g['to']:g} s, {g['samples']} samples; at the end, 95 %"
+        yield f"{how}, {_span(g)}, {g['samples']} samples; at the end, 95 %"
         for n in HEALTH:
             v, f = g["values"][n], HEALTH_FACTORS[n]
             mark = "changed" if n in g["changed"] else ""
@@ -178,20 +185,20 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
         v = g["values"]["N"]
         yield f"  {'speed [rad/s]':<22} {'N':<8} {v['estimate']:.1f} +- {v['half_width']:.1f}"
         for t, onset in zip(g["alarms"], g["onsets"], strict=True):
-            yield f"  change of health after {onset:g} s, reported at {t:g} s"
+            yield f"  change of health after {_at(onset)} s, reported at {_at(t)} s"
         if not g["alarms"]:
             yield "  no sudden change of health"
         yield f"  (at most {g['false_alarms_per_hour']:g} false report an hour if the model holds)"
     yield from _balance_words(r.get("balance"))
     for k, e in r["machines"].items():
-        yield f"generator {k}, {e['from']:g} to {e['to']:g} s; at the end, 95 %"
+        yield f"generator {k}, {_span(e)}; at the end, 95 %"
         for n, v in e["values"].items():
             scale, form = (1e-3, ".2f") if n == "P_total" else (1e3, ".3f")
             label = "power of both [kW]" if n == "P_total" else f"severity {n} [1e-3]"
             x, half = (f"{scale * v[key]:{form}}" for key in ("estimate", "half_width"))
             yield f"  {label:<22} {x} +- {half}"
         for a in e["alarms"]:
-            yield f"  short circuit in phase {a['phase']}, reported at {a['t']:g} s"
+            yield f"  short circuit in phase {a['phase']}, reported at {_at(a['t'])} s"
         if not e["alarms"]:
             yield "  no short circuit reported; one within the bands above may be there"
     yield from compared_words(r.get("compared"))
@@ -208,10 +215,10 @@ def words(r: Mapping[str, Any]) -> Iterator[str]:
             yield "  no change of it" if s["reference_windows"] else f"  {few}"
     for n, told in r["causes"].items():
         for c in told:
-            yield f"{n}: the change at {c['t']:g} s is: {_likely(c['probability'])}"
+            yield f"{n}: the change at {_at(c['t'])} s is: {_likely(c['probability'])}"
     for d in r["changes"]:
         how = "of it" if GAS in [*d["probability"]][:1] else "it failed by"
-        yield f"at {d['t']:g} s: {_likely(d['probability'])}" + (
+        yield f"at {_at(d['t'])} s: {_likely(d['probability'])}" + (
             f"; {how} {_likely(d['failure'])}" if d["failure"] else ""
         )
     yield from (f"not estimated: {n}: {why}" for n, why in r["lacking"].items())

@@ -12,6 +12,7 @@ import numpy as np
 from apu_casadi.core.errors import DataError, EstimationError
 from apu_casadi.unit.apu import Apu
 from estimators.apu.believable import lost, machine_causes, machine_doubts
+from estimators.apu.declared import FILLED
 from estimators.apu.electrical.causes import Causes, causes_of_change
 from estimators.apu.electrical.electricalfilter import (
     ElectricalFilter,
@@ -29,9 +30,11 @@ from estimators.apu.electrical.terminalsignals import (
 )
 from estimators.apu.electrical.tracking import LostError
 from estimators.apu.electrical.wild import wild_samples
+from estimators.apu.electrical.wiring import miswired
 from estimators.apu.gaspathmodel import DT
 from estimators.apu.joint import ElectricalSide, electrical_side
 from estimators.apu.recordings.measured import Measurements
+from estimators.apu.sensorchain import onto
 from estimators.apu.sensors import SensorSet
 from estimators.apu.trust import Doubt, machine
 from estimators.filters.belief import Belief
@@ -144,9 +147,9 @@ class Waves:
                 f"{rate:g} samples a second; the electrical filter needs {PER_PERIOD * f:g}, "
                 f"{PER_PERIOD} a period"
             )
-        waves = self.m.samples(*NEEDED[1:])
+        waves = self._together(notes)
         w = self.m.streams("w_r")["w_r"]
-        if self.m["w_r"].t is not self.m["v_a"].t:
+        if waves["t"] is not self.m["w_r"].t:
             inside = (waves["t"] >= w[0][0]) & (waves["t"] <= w[0][-1])
             waves["w_r"] = np.where(inside, np.interp(waves["t"], *w), np.nan)
         else:
@@ -155,7 +158,29 @@ class Waves:
         a = {n: v[a["t"] >= begin - 1e-9] for n, v in a.items()}
         if a["t"].size < 2 or a["t"][-1] - a["t"][0] < DT:
             raise DataError(f"the waveforms hold no window of {DT * 1e3:g} ms")
+        if why := miswired(a, self.apu.generator.machine):
+            raise DataError(why)
         return self._tame(a, notes)
+
+    def _together(self, notes: list[str]) -> dict[str, np.ndarray]:
+        """Return the waveforms at common instants.
+
+        Where the voltages were sampled at others than the currents, the instants are those of the
+        currents and the rest is interpolated, to 1e-4 from a dozen samples a period on.
+        """
+        names = NEEDED[1:]
+        t, f = self.m["i_a"].t, self.apu.generator.machine.f_rated
+        waves = self.m.samples(*names)
+        lost = max(1 - np.isin(waves["t"], self.m[n].t).mean() for n in VOLTAGES)
+        apart = [n for n in names if not np.array_equal(self.m[n].t, t)]
+        if not apart or lost < FILLED or self.m["i_a"].rate < PER_PERIOD * f * (1 - 1e-6):
+            return waves
+        notes.append(
+            f"machine {self.number}: {', '.join(apart)} were sampled at other instants than i_a, "
+            "and are interpolated to those"
+        )
+        moved = {n: onto(t, self.m[n].t, self.m[n].values, 2 * math.pi * f) for n in apart}
+        return {"t": t} | {n: moved[n] if n in moved else self.m[n].values for n in names}
 
     def filtered(self, notes: list[str]) -> tuple[ElectricalFilter, Recording, Belief]:
         """Return a filter with the three severities, its recording and prior.

@@ -14,9 +14,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from estimators.apu.electrical.gaps import evened
 from estimators.apu.sensors import Sensor, SensorSet
 
-__all__ = ["Draws", "disturbed", "interpolated", "sampled", "sampled_wave", "slopes", "spread"]
+__all__ = [
+    "Draws",
+    "disturbed",
+    "interpolated",
+    "onto",
+    "sampled",
+    "sampled_wave",
+    "slopes",
+    "spread",
+]
 
 POINTS = 6  # of a local polynomial; of 25 samples a period it is right to 1e-5
 FINER = 20  # parts of a step over which a lag shorter than it is integrated
@@ -140,6 +150,19 @@ def interpolated(
     weight[np.abs(weight) < 1e-12] = 0.0
     used = np.where(weight == 0.0, 0.0, v[near])
     return (weight * used).sum(1), np.sqrt((weight**2).sum(1))
+
+
+def onto(at: np.ndarray, t: np.ndarray, v: np.ndarray, w: float) -> np.ndarray:
+    """Return a waveform at other instants; NaN beside gaps, before its first and after its last.
+
+    Args:
+        at, t: instants, s: those wanted, and those of its samples v, (K,).
+        w: angular frequency, rad/s, by which a long step is a gap.
+    """
+    a = evened({"t": t, "v": v, "w_r": np.full(t.size, w)})
+    shown = interpolated(a["t"], a["v"], at)[0]
+    shown[(at < t[0]) | (at > t[-1])] = np.nan
+    return shown
 
 
 def slopes(t: np.ndarray, v: np.ndarray, *, wave: bool) -> np.ndarray:

@@ -113,13 +113,16 @@ class LinearFilter:
             output=share[:, None, None] * self.output,
         )
 
-    def evidence(self, there: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def evidence(
+        self, there: np.ndarray | None = None, signature: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return each jump alone, there from the first sample on: its most likely size and sigma.
 
         Args:
             there: samples that count, (K,); all by default.
+            signature: of other errors, (K, ny, q); that of the jumps by default.
         """
-        g = self.signature(0)
+        g = self.signature(0) if signature is None else signature
         if there is not None:
             g = g * there[:, None, None]
         weighted = np.linalg.solve(self.S, g)

@@ -92,7 +92,7 @@ double pc[NP+NC],check,measured,work[WORK];
 V P[NV*L*NV],X[NX*NV],F[(NX+NW)*NV],HP[NY*MV],B[NY*MV],d[MV],G[NY*NV],D[NY*NV],E[NY*NV];
 memset(P,0,sizeof P);memset(F,0,sizeof F);memset(HP,0,sizeof HP);memset(B,0,sizeof B);
 for(int k=0;k<NP;k++)pc[k]=arg[8][k];
-{const double*a1[]={arg[8]};double*r1[]={pc+NP};CONSTANTS(a1,r1,0,work,0);}
+TO_SCALAR {const double*a1[]={arg[8]};double*r1[]={pc+NP};CONSTANTS(a1,r1,0,work,0);}
 for(int i=0;i<NX;i++){m[i]=arg[0][i];for(int j=0;j<=i;j++)ROW(P,i)[j]=arg[1][j*NX+i];}
 mirrored(P);
 for(int k=0;k<NCONST;k++)((double*)F)[const_to[k]]=const_of[k];
@@ -104,13 +104,13 @@ for(int s=0;s<K;s++){
 const double*us=arg[3]+s*NU,*ys=arg[4]+s*NY,*Rs=arg[5]+s*NY,*dts=arg[6]+s;
 if(Rs[0]==PADDED)break;
 double*stats=res[7]+4*s;
-{const double*a1[]={m,at,us,pc,ys,Rs,dts};
+TO_SCALAR {const double*a1[]={m,at,us,pc,ys,Rs,dts};
 double*r1[]={nu,Hz,Rd,res[5]+s*NY,&check,&measured};READ(a1,r1,0,work,0);}
 /* H P as columns; below the states the noise */
 """
 _GAIN = """
 for(int l=0;l<NY;l++)for(int i=0;i<NX;i++)hp[l*NX+i]=((double*)(HP+l*MV))[i];
-{const double*a1[]={Hz,hp,Rd,nu,&measured};
+TO_SCALAR {const double*a1[]={Hz,hp,Rd,nu,&measured};
 double*r1[]={Lz,inv,a,res[6]+s*NY,stats+1};GAIN(a1,r1,0,work,0);}
 for(int v=0;v<MV;v++){
 """
@@ -118,7 +118,7 @@ _FORECAST = """
 }
 for(int i=0;i<NX;i++)res[3][s*NX+i]=at[i]=gains[i]?m[i]+((double*)d)[i]:m[i];
 for(int i=0;i<NW;i++)at[NX+i]=((double*)(d+NV))[i];
-{const double*a1[]={m,at,us,pc,ys,Rs,dts};
+TO_SCALAR {const double*a1[]={m,at,us,pc,ys,Rs,dts};
 double*r1[]={m1,Fz,stats};FORECAST(a1,r1,0,work,0);}
 stats[0]=check+stats[0];
 for(int k=0;k<NF;k++)((double*)F)[f_to[k]]=Fz[k];
@@ -143,7 +143,7 @@ mirrored(P);
 for(int i=0;i<NX;i++)m[i]=m1[i];
 }
 for(int i=0;i<NX;i++){res[0][i]=m[i];for(int j=0;j<NX;j++)res[1][i*NX+j]=ROW(P,i)[j];}
-DONE return 0;}
+TO_SCALAR return 0;}
 """
 SOME = 8  # samples of a block whose covariances are kept
 INPUTS = ["m", "P", "P_last", "u", "y", "R", "dt", "keep", "p"]

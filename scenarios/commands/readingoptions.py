@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Any
 
 from scenarios.commands import given
@@ -19,7 +20,7 @@ OPTIONS = """
 --names A,B            | names of the columns in order, where the file has none; an empty one
                        | leaves a column out
 --units A,B            | their units, an empty one for SI
---time COLUMN          | time column (default: time, t, Timestamp and the like)
+--time COLUMN[:UNIT]   | time column (default: time, t, Timestamp and the like)
 --rate float HZ        | of the rows, where no column is the time
 --sort                 | put the rows in the order of time, and join those of one stamp
 --barometer PRESSURE   | of the air around, for gauge pressures: 101.3kPa
@@ -83,6 +84,7 @@ def _blanks(text: str | None) -> list[str]:
 
 def _number_or_word(text: str) -> float | str:
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return text
+    return number if math.isfinite(number) else text

@@ -67,17 +67,20 @@ NAMES = {getattr(ca, n): n for n in dir(ca) if n.startswith("OP_")}
 _PRELUDE = """
 #include <math.h>
 #include <stdint.h>
+#include <string.h>
 #if defined(__SSE2__)
 #include <immintrin.h>
 #elif defined(__aarch64__)
 #include <arm_neon.h>
 #endif
 #define L LANES
-/* after it code of other libraries, without AVX, is not slowed down by what registers still hold */
+/* goes before scalar code of other libraries, which has no AVX: while the upper parts of registers
+   hold something, each of its instructions waits for them.  Compilers put it by themselves only
+   from -O2 on. */
 #if defined(__AVX__)
-#define DONE _mm256_zeroupper();
+#define TO_SCALAR _mm256_zeroupper();
 #else
-#define DONE
+#define TO_SCALAR
 #endif
 typedef double V __attribute__((vector_size(8*L)));
 typedef int64_t M __attribute__((vector_size(8*L)));
@@ -137,7 +140,17 @@ int i[L],k=0;for(int l=0;l<L;l++)i[l]=(int)q[l];
 for(;k+TURNED<=n;k+=TURNED)v_turned(t+k,i,to+k);
 #endif
 for(int l=0;l<L;l++)for(int j=k;j<n;j++)((double*)to)[j*L+l]=t[i[l]+j];}
-#define EACH(f) static V v_##f(V a){V r;for(int l=0;l<L;l++)r[l]=f(a[l]);return r;}
+/* n numbers of some lanes, those of a lane side by side */
+IN void v_back(const V*r,int n,int some,double*to){
+int k=0;
+#ifdef TURNED
+int i[L];for(int l=0;l<L;l++)i[l]=l*L;
+for(;k+L<=n;k+=L){
+V t[L];v_turned((const double*)(r+k),i,t);
+for(int l=0;l<some;l++)memcpy(to+l*n+k,t+l,sizeof(V));}
+#endif
+for(int l=0;l<some;l++)for(int j=k;j<n;j++)to[l*n+j]=((const double*)r)[j*L+l];}
+#define EACH(f) static V v_##f(V a){V r;TO_SCALAR for(int l=0;l<L;l++)r[l]=f(a[l]);return r;}
 #if L==8 && defined(__AVX512F__)
 IN V v_sqrt(V a){return (V)_mm512_sqrt_pd((__m512d)a);}
 IN V v_floor(V a){return (V)_mm512_roundscale_pd((__m512d)a,_MM_FROUND_TO_NEG_INF|8);}
@@ -243,7 +256,8 @@ class Writer:
         prelude = _PRELUDE.replace("ALL_LANES", ",".join("a" * self.lanes))
         prelude = prelude.replace("LANES", str(self.lanes))
         calls = [f"EACH({n})" for n in _CALLS_1 if n not in VECTOR]
-        two = "static V v_{0}(V a,V b){{V r;for(int l=0;l<L;l++)r[l]={0}(a[l],b[l]);return r;}}"
+        two = "static V v_{0}(V a,V b){{V r;TO_SCALAR "
+        two += "for(int l=0;l<L;l++)r[l]={0}(a[l],b[l]);return r;}}"
         calls += [two.format(n) for n in _CALLS_2 if n not in VECTOR]
         tables = []
         for key, name in self._tables.items():

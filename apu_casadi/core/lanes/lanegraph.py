@@ -60,8 +60,62 @@ def _positions(sparsity: ca.Sparsity) -> ca.DM:
     return ca.DM(sparsity, np.arange(1.0, sparsity.nnz() + 1))
 
 
+class _Places:
+    """Where each work vector of a graph stands while something still reads it.
+
+    The first place that is free, from the front: what is used stays near, in the cache.  CasADi's
+    own numbers of work vectors are kept apart: a graph reuses few of them.
+
+    Args:
+        graph: the function; its instructions are come to one after the other.
+    """
+
+    def __init__(self, graph: _Graph) -> None:
+        self.most = 0  # work in all
+        self._graph = graph
+        self._at: dict[int, int] = {}  # where a vector stands, by CasADi's number of it
+        self._taken: dict[int, tuple[int, int]] = {}  # first: (end, last instruction that reads)
+        self._need: dict[int, tuple[int, int]] = {}  # by number: size, last instruction
+        last: dict[int, int] = {}
+        #: by instruction and number of a vector that is made there: its size, its last instruction
+        self._made: dict[int, dict[int, tuple[int, int]]] = {}
+        size: dict[int, int] = {}
+        for k in range(graph.n - 1, -1, -1):
+            self._made[k] = {}
+            outs = () if graph.op[k] == ca.OP_OUTPUT else graph.outs[k]
+            ins = () if graph.op[k] == ca.OP_INPUT else graph.ins[k]
+            for i, n in zip(outs, graph.sizes(k) if outs else (), strict=True):
+                size[i] = max(n, size.get(i, 0))
+                if i >= 0 and i not in ins:  # else it goes on in its place
+                    self._made[k][i] = size.pop(i), last.pop(i, k)
+            for i in ins:
+                last.setdefault(i, k)
+
+    def come_to(self, k: int) -> None:
+        """Free what no instruction from ``k`` on reads; what it makes has no place yet."""
+        self._taken = {at: v for at, v in self._taken.items() if v[1] >= k}
+        for i, need in self._made[k].items():
+            self._at.pop(i, None)
+            self._need[i] = need
+
+    def of(self, i: int) -> int:
+        """Return where a vector stands; it is given a place if it has none."""
+        if i not in self._at:
+            n, last = self._need[i]
+            at = 0
+            for first in sorted(self._taken):
+                if first >= at + n:
+                    break
+                at = max(at, self._taken[first][0])
+            self._at[i] = at
+            if n:
+                self._taken[at] = at + n, last
+            self.most = max(self.most, at + n)
+        return self._at[i]
+
+
 class _Graph:
-    """Writes one MX function; work vectors stand one after the other in w."""
+    """Writes one MX function; work vectors stand in w where none that is still read stands."""
 
     def __init__(self, writer: Writer, fun: ca.Function, name: str) -> None:
         self.writer, self.fun, self.name = writer, fun, name
@@ -74,29 +128,19 @@ class _Graph:
         self.body: list[str] = []
         self.inner = 0  # largest work of what is called
         self.scratch = 0  # of outputs that nobody wants, inputs that are not there, copies
-        sizes: dict[int, int] = {}
-        for k in range(self.n):
-            if self.op[k] != ca.OP_OUTPUT:
-                for i, size in zip(self.outs[k], self._sizes(k), strict=True):
-                    if i >= 0:
-                        sizes[i] = max(size, sizes.get(i, 0))
-        at, self.at = 0, dict[int, int]()
-        for i in sorted(sizes):
-            self.at[i] = at
-            at += sizes[i]
-        #: where the one column stands that a map takes again and again, by instruction
-        self.repeated: dict[int, int] = {}
-        for k in range(self.n):
-            if self.op[k] == ca.OP_HORZREPMAT and self._for_maps(k):
-                self.repeated[k] = at
-                at += self.nodes[k].dep(0).nnz()
-        self.own = at
+        #: instructions whose one column maps take again and again
+        self.repeated = {
+            k for k in range(self.n) if self.op[k] == ca.OP_HORZREPMAT and self._for_maps(k)
+        }
+        self.place = _Places(self)
         self.alias: dict[int, str] = {}  # work that is a part of an input
         self.tables: dict[int, str] = {}  # work that is a constant table
 
-    def _sizes(self, k: int) -> list[int]:
-        """Nonzeros of the outputs of an instruction."""
+    def sizes(self, k: int) -> list[int]:
+        """Nonzeros of the outputs of an instruction; of the one column that is repeated."""
         node = self.nodes[k]
+        if k in self.repeated:
+            return [node.dep(0).nnz()]
         if self.op[k] == ca.OP_CALL:
             g = node.which_function()
             return [g.nnz_out(j) for j in range(g.n_out())]
@@ -122,21 +166,22 @@ class _Graph:
 
     def write(self) -> int:
         for k in range(self.n):
+            self.place.come_to(k)
             self._instruction(k)
-        T = self.T
+        T, own = self.T, self.place.most
         head = f"static void {self.name}(const {T}*const*a,{T}*const*r,{T}*w){{"
-        more = f"{T}*const x=w+{self.own};(void)x;"  # scratch, then the work of what is called
+        more = f"{T}*const x=w+{own};(void)x;"  # scratch, then the work of what is called
         body = [line.replace("SCRATCH", str(self.scratch)) for line in self.body]
         self.writer.put("\n".join([head, more, *body, "}"]))
-        return self.own + self.scratch + self.inner
+        return own + self.scratch + self.inner
 
     def _w(self, i: int) -> str:
         """Where work is; a part of scratch that holds zeros if there is none."""
-        return f"(w+{self.at[i]})" if i >= 0 else "x"
+        return f"(w+{self.place.of(i)})" if i >= 0 else "x"
 
     def _get(self, i: int) -> str:
         """Where work is read: a part of an input itself, as long as that is all it is."""
-        return self.alias.get(i, self._w(i))
+        return self.alias[i] if i in self.alias else self._w(i)
 
     def _stands(self, k: int) -> str:
         """Where the output of an instruction stands already, in an input; "" if it does not."""
@@ -172,7 +217,7 @@ class _Graph:
         if self.op[k] not in _SPLITS or self.ins[k][0] not in self.alias:
             return {}
         at, found = 0, {}
-        for target, n in zip(self.outs[k], self._sizes(k), strict=True):
+        for target, n in zip(self.outs[k], self.sizes(k), strict=True):
             found[target] = f"({self.alias[self.ins[k][0]]}+{at})"
             at += n
         found.pop(-1, None)
@@ -190,7 +235,7 @@ class _Graph:
             self._elementwise(k)
         elif k in self.repeated:
             n = node.dep(0).nnz()
-            self._each(n, f"w[{self.repeated[k]}+k]={self._get(i[0])}[k]")
+            self._each(n, f"{self._w(o[0])}[k]={self._get(i[0])}[k]")
         elif op in _MOVES:
             self._move(self._w(o[0]), self._get(i[0]), self._from(k))
         elif op in _JOINS:
@@ -201,7 +246,7 @@ class _Graph:
                 at += n
         elif op in _SPLITS:
             at = 0
-            for target, n in zip(o, self._sizes(k), strict=True):
+            for target, n in zip(o, self.sizes(k), strict=True):
                 if target >= 0:
                     self._each(n, f"{self._w(target)}[k]={self._get(i[0])}[{at}+k]")
                 at += n
@@ -405,11 +450,7 @@ class _Graph:
         self.inner = max(self.inner, done.work)
         if absent:
             self._each(absent, f"x[k]={self.p}all(0.0)")
-        where = [
-            f"(w+{self.repeated[by]})" if by in self.repeated else self._get(i)
-            for i, by in zip(self.ins[k], made, strict=True)
-        ]
-        args = ",".join(where) or "x"
+        args = ",".join(self._get(i) for i in self.ins[k]) or "x"
         at, results = absent, []
         for j, o in enumerate(self.outs[k]):
             results.append(self._w(o) if o >= 0 else f"x+{at}")

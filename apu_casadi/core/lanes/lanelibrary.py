@@ -91,7 +91,7 @@ def _widest() -> int:
 def digest() -> str:
     """Tell one writer of code from another."""
     h = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.glob("*.[cp]*")):
         h.update(path.read_bytes())
     return h.hexdigest()
 
@@ -276,7 +276,7 @@ def source(fun: ca.Function, lanes: int, common: Sequence[int] = ()) -> str:
     text = framed(*names, inputs, outputs, (total + 1) * lanes)
     before, after = _wide_call(sizes_in, sizes_out, wide)
     call = f"{done.name}(a,r,v);"
-    return "\n".join([writer.source(), text, *before, call, *after, "DONE return 0;}", ""])
+    return "\n".join([writer.source(), text, *before, call, *after, "TO_SCALAR return 0;}", ""])
 
 
 def _patterns(patterns: Sequence[ca.Sparsity]) -> str:
@@ -299,22 +299,16 @@ def _wide_call(
 ) -> tuple[list[str], list[str]]:
     """Code that puts columns into lanes before the call, and back after it."""
     before = ["V*v=(V*)(((uintptr_t)w+8*L-1)&~(uintptr_t)(8*L-1));"]
+    before.append("V at;for(int l=0;l<L;l++)at[l]=l;")
     for k, n in enumerate([*n_in, *n_out]):
         before.append(f"V*const b{k}=v;v+={n};")
     for k, n in enumerate(n_in):
         zero = f"else for(int k=0;k<{n};k++)b{k}[k]=v_all(0.0);"
         copy = f"for(int k=0;k<{n};k++)b{k}[k]=v_all(arg[{k}][k]);"
         if wide[k] > 1:
-            copy = (
-                f"for(int l=0;l<L;l++)for(int k=0;k<{n};k++)"
-                f"((double*)b{k})[k*L+l]=arg[{k}][l*{n}+k];"
-            )
+            copy = f"v_rows(arg[{k}],at*v_all({n}.0),{n},b{k});"
         before.append(f"if(arg[{k}]){copy}{zero}")
-    after = [
-        f"if(res[{k}])for(int l=0;l<L;l++)for(int k=0;k<{n};k++)"
-        f"res[{k}][l*{n}+k]=((double*)b{k + len(n_in)})[k*L+l];"
-        for k, n in enumerate(n_out)
-    ]
+    after = [f"if(res[{k}])v_back(b{k + len(n_in)},{n},L,res[{k}]);" for k, n in enumerate(n_out)]
     before.append(_pointers("V", "b{}", len(n_in), len(n_out)))
     return before, after
 

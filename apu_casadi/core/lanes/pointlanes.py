@@ -21,19 +21,6 @@ from apu_casadi.core.sharing import BUILDING
 
 __all__ = ["points_in_lanes"]
 
-_BACK = """
-#include <string.h>
-/* n numbers of some lanes, those of a lane side by side */
-IN void v_back(const V*r,int n,int some,double*to){
-int k=0;
-#ifdef TURNED
-int i[L];for(int l=0;l<L;l++)i[l]=l*L;
-for(;k+L<=n;k+=L){
-V t[L];v_turned((const double*)(r+k),i,t);
-for(int l=0;l<some;l++)memcpy(to+l*n+k,t+l,sizeof(V));}
-#endif
-for(int l=0;l<some;l++)for(int j=k;j<n;j++)to[l*n+j]=((const double*)r)[j*L+l];}
-"""
 _POINTS = """
 static int POINTS(const double**arg,double**res){
 ROOM
@@ -44,7 +31,7 @@ const int n=COUNT-c<L?COUNT-c:L;
 GIVEN
 CALL(a,r,0);
 BACK}
-DONE return 0;}
+TO_SCALAR return 0;}
 """
 
 #: z + x y of dense matrices, rows in lanes and columns of y side by side: a sum waits for each of
@@ -72,7 +59,7 @@ for(casadi_int k=0;k<p;k++){const V b=V_FROM(m,x+j+k*n);\
 for(int c=0;c<C;c++)s[c]=s[c]+b*v_all(y[k+(i+c)*p]);}\
 for(int c=0;c<C;c++)V_TO(m,z+j+(i+c)*n,s[c]);}
 static void product(const double*x,casadi_int n,casadi_int p,const double*y,casadi_int q,double*z){
-casadi_int i=0;COLUMNS(4)COLUMNS(1)}
+casadi_int i=0;COLUMNS(4)COLUMNS(1)TO_SCALAR}
 """
 _BY_ROWS = "  if (!tr) { product(x, nrow_x, ncol_x, y, ncol_y, z); return; }\n"
 
@@ -156,7 +143,7 @@ def _source(fun: ca.Function, maps: dict[str, ca.Function], lanes: int) -> str:
     # not to be found from outside, so that the compiler may put them where they are called
     text = re.sub(r"\n(void|casadi_real|casadi_int) casadi_", r"\nstatic \1 casadi_", text)
     at = text.index("/* ", text.index("/* Add prefix to internal symbols") + 1)
-    return "\n".join([text[:at], writer.source(), _PRODUCT, _BACK, *own, text[at:]])
+    return "\n".join([text[:at], writer.source(), _PRODUCT, *own, text[at:]])
 
 
 def _points(writer: Writer, mapped: ca.Function, name: str) -> str:

@@ -25,6 +25,7 @@
 #define SLOW_1(f)                                                                                  \
   NI V slow_##f(V y, V a, unsigned bits)                                                           \
   {                                                                                                \
+    TO_SCALAR                                                                                      \
     for (; bits; bits &= bits - 1) {                                                               \
       const int l = __builtin_ctz(bits);                                                           \
       ((double *)&y)[l] = f(((double *)&a)[l]);                                                    \
@@ -34,6 +35,7 @@
 #define SLOW_2(f)                                                                                  \
   NI V slow_##f(V y, V a, V b, unsigned bits)                                                      \
   {                                                                                                \
+    TO_SCALAR                                                                                      \
     for (; bits; bits &= bits - 1) {                                                               \
       const int l = __builtin_ctz(bits);                                                           \
       ((double *)&y)[l] = f(((double *)&a)[l], ((double *)&b)[l]);                                 \
@@ -152,7 +154,7 @@ NI V v_pow(V x, V b)
   const V p = c * h;
   const V t = FMA(c, l, FMA(c, h, -p));
   in &= v_fabs(p) < C(8.0);
-  const V y = exp_of(v_sel(in, p, C(0.0)), v_sel(in, t, C(0.0)), 1.08, &ok);
+  const V y = exp_of(v_sel(in, p, C(0.0)), v_sel(in, t, C(0.0)), 1.03, &ok);
   ok &= in;
   const unsigned no = v_bits(~ok);
   return no ? slow_pow(y, x, b, no) : y;
@@ -227,6 +229,7 @@ EACH_1(cos)
 __attribute__((unused)) static V v_pow(V a, V b)
 {
   V r;
+  TO_SCALAR
   for (int l = 0; l < L; l++)
     r[l] = pow(a[l], b[l]);
   return r;

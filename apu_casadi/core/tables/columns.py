@@ -126,7 +126,7 @@ def parsed(
     for k, c in enumerate(cells):
         v = _value(c, number)
         if v is not None and np.isinf(v):
-            raise DataError(f"{place(k)}: {cut(c)} is no number (an empty cell is a gap)")
+            raise DataError(f"{place(k)}: {cut(c)} is no number{remedy.format(cut(c))}")
         if v is None:
             (words if isinstance(c, str) and is_word(c) else wrong).append(k)
         else:

@@ -129,12 +129,25 @@ def _counts(cells: Sequence[str]) -> bool:
 # ------------------------------------------------------------------------------ text and rows
 
 
+#: First bytes of files that people rename, and what they are.
+OTHERS = {
+    b"PAR1": "a Parquet file does: let its name end in .parquet",
+    b"\x89HDF": "a netCDF file does: let its name end in .nc",
+    b"CDF": "a netCDF file does: let its name end in .nc",
+    b"PK\x03\x04": "a workbook or an archive does: export its table as CSV",
+    b"\x1f\x8b": "a compressed file does: unpack it",
+}
+
+
 def decoded(path: Any, raw: bytes, tell: Tell, layout: TableLayout) -> str:
     """Return the text of a file: UTF-8, UTF-16 and UTF-32 with a mark, else Windows-1252.
 
     Raises:
         DataError: damaged, or no text.
     """
+    for begin, what in OTHERS.items():
+        if raw.startswith(begin):
+            raise DataError(f"{path}: it begins as {what}")
     encoding, remedy = layout.encoding, layout.remedies["encoding"]
     if encoding is not None:
         try:

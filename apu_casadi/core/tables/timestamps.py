@@ -508,7 +508,7 @@ def _told(dates: Any, what: str, tell: Tell, zone: str | None, start: list[Start
             raise DataError(
                 f"{what}: from {there[k]} to {there[k + 1]} the clock jumps by an hour beside the "
                 f"usual {usual:g} s: summer time? give --time-zone (UTC, Europe/Berlin, ...), or "
-                "--steady"
+                "--steady (apu fit)"
             )
     tell(f"{what}: dates are taken in seconds since the first, {there[0]}")
     return _from_dates(_in_utc(dates), start, dates.tz is not None)

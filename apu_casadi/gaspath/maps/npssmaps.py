@@ -10,6 +10,10 @@
                     RlineMap = { 1.00, 1.25, 1.50 }
                     WcMap    = { 10.2, 11.4, 12.1 }
                 }
+                NcMap = 0.600 {
+                    RlineMap = *;
+                    WcMap    = { 12.3, 13.2, 13.9 }
+                }
             }
             NcMap.interp = "lagrange3";
         }
@@ -17,12 +21,13 @@
     }
 
 A compressor has the tables TB_Wc, TB_PR and TB_eff over speed and R-line, a turbine TB_Wp and
-TB_eff over speed and pressure ratio; the axis alpha before them may be absent.  The last argument
-of a table names the array of coordinates, the other array holds the values.  Of several alphas the
-design one is read (``alphaMapDes``), else the first.  Beta is the R-line, or how far a turbine's
-pressure ratio has gone along its line, 0 to 1; the surge line is the R-line ``RlineStall``, else
-the first.  Comments begin with ``//`` or ``#`` or stand in ``/* */``; what else a file may hold
-(interpolation, Reynolds effects) is passed over.  Maps as Python arrays (pyCycle) are not read.
+TB_eff over speed and pressure ratio; the axis alpha before them may be absent. The last argument of
+a table names the array of coordinates, the other array holds the values; ``*`` repeats the array of
+this name before it. Of several alphas the design one is read (``alphaMapDes``), else the first.
+Beta is the R-line, or how far a turbine's pressure ratio has gone along its line, 0 to 1; the surge
+line is the R-line ``RlineStall``, else the first. Comments begin with ``//`` or ``#`` or stand in
+``/* */``; what else a file may hold (interpolation, Reynolds effects) is passed over. Maps as
+Python arrays (pyCycle) are not read.
 """
 
 from __future__ import annotations
@@ -153,6 +158,7 @@ class _Parser:
         self.tables: dict[str, _Table] = {}
         self.scalars: dict[str, float] = {}
         self.notes: list[str] = []
+        self._before: dict[str, list[_Token]] = {}  # arrays of the table that "*" repeats
 
     def read(self) -> _Parser:
         while self.k < len(self.tokens):
@@ -231,6 +237,7 @@ class _Parser:
             if token.text not in ("real", "int", ","):
                 axes.append(token.text)
         self._take("{", f"'{{' of Table {name.text}")
+        self._before = {}
         body = self._body(f"Table {name.text}", name, 0)
         known = self.tables.get(name.text.lower())
         wanted = {t.lower() for names in _KINDS.values() for t in names.values()}
@@ -253,10 +260,10 @@ class _Parser:
                 continue
             self._take("=", f"'=' after {token.text!r}")
             value = self._next(f"a value of {token.text!r}")
-            if value.text == "{":
+            if value.text in "{*":
                 if token.text in body.arrays:
                     raise self._error(token, f"one array {token.text!r} expected, a second")
-                body.arrays[token.text] = self._array(token)
+                body.arrays[token.text] = self._array(token, value)
             elif self._peek() == "{":
                 self.k += 1
                 inner = self._body(f"{token.text} = {value.text}", token, depth + 1)
@@ -265,8 +272,13 @@ class _Parser:
                 after = self.tokens[self.k] if self.k < len(self.tokens) else None
                 raise self._error(after, f"'{{' after {token.text} = {value.text} expected")
 
-    def _array(self, opened: _Token) -> list[_Token]:
-        values = []
+    def _array(self, opened: _Token, begins: _Token) -> list[_Token]:
+        """Return the values of an array after its brace, or those that a star repeats."""
+        if begins.text == "*":
+            if opened.text not in self._before:
+                raise self._error(begins, f"values of {opened.text}, none of it before, expected")
+            return self._before[opened.text]
+        values = self._before[opened.text] = []
         while (token := self._next(f"'}}' of {opened.text} at line {opened.line}")).text != "}":
             if token.text == "=" or token.text == "{":
                 raise self._error(token, f"'}}' of {opened.text} at line {opened.line} expected")

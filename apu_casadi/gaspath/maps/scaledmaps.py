@@ -39,8 +39,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from scipy.interpolate import BSpline
 
-from apu_casadi.core.bsplines import derivative, spline
 from apu_casadi.core.errors import MapError
 from apu_casadi.core.parameters import Parameters, par
 from apu_casadi.core.sharing import Parametric, derived, kept
@@ -87,9 +87,9 @@ def spline_operator(x: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np
     """
     knots = np.concatenate([[lo] * 4, x, [hi] * 4])
     n = x.size
-    basis = knots, np.eye(n + 4), 3
-    curvature = derivative(*derivative(*basis))
-    A = np.vstack([spline(*basis, x), spline(*curvature, np.array([lo, x[0], x[-1], hi]))])
+    basis = BSpline(knots, np.eye(n + 4), 3)
+    sites = np.array([lo, x[0], x[-1], hi])
+    A = np.vstack([basis(x), basis.derivative(2)(sites)])
     return knots, np.linalg.solve(A, np.eye(n + 4)[:, :n])
 
 
@@ -116,14 +116,12 @@ def level_operator(
     inner, outer = [x[0] - a / 2, x[-1] + b / 2], [x[0] - a, x[-1] + b]
     knots = np.concatenate([[lo] * 4, [outer[0], inner[0]], x, [inner[1], outer[1]], [hi] * 4])
     n = x.size
-    basis = knots, np.eye(n + 8), 3
-    slope = derivative(*basis)
-    curvature = derivative(*slope)
-    straight = np.array([lo, outer[0], x[0], x[-1], outer[1], hi])
-    common = [spline(*basis, x), spline(*curvature, straight)]
+    basis = BSpline(knots, np.eye(n + 8), 3)
+    slope, curvature = basis.derivative(1), basis.derivative(2)
+    common = [basis(x), curvature(np.array([lo, outer[0], x[0], x[-1], outer[1], hi]))]
     made = []
-    for kind, sites in ((curvature, inner), (slope, outer)):
-        A = np.vstack([*common, spline(*kind, np.array(sites))])
+    for condition in (curvature(np.array(inner)), slope(np.array(outer))):
+        A = np.vstack([*common, condition])
         made.append(np.linalg.solve(A, np.eye(n + 8)[:, :n]))
     return knots, made[0], made[1]
 
@@ -145,8 +143,10 @@ def local_cubics(knots: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     breaks = knots[3:-3]
     width = np.diff(breaks).reshape(-1, *[1] * (C.ndim - 1))
-    powers = [spline(knots, C, 3, breaks[:-1], k) * width**k for k in range(4)]
-    return breaks, np.stack([p / math.factorial(k) for k, p in enumerate(powers)])
+    spline = BSpline(knots, C, 3)
+    return breaks, np.stack(
+        [spline(breaks[:-1], nu=k) * width**k / math.factorial(k) for k in range(4)]
+    )
 
 
 def _held(x: Any, breaks: np.ndarray) -> Any:

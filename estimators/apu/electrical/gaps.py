@@ -90,17 +90,14 @@ def filled(
         [f(m * angle) for m in harmonics for f in (np.cos, np.sin)[: 2 if m else 1]]
     )
     edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int)))
-    for i, j in zip(edges[::2], edges[1::2], strict=True):
-        gap = slice(i, j)
-        near = 2 * math.pi + 1e-6
-        before = ~missing & (angle < angle[i]) & (angle > angle[i] - near)
-        after = ~missing & (angle > angle[j - 1]) & (angle < angle[j - 1] + near)
-        long = angle[j - 1] - angle[i] > LONG * 2 * math.pi
-        fits = [
-            f
-            for f in (_fit(basis, x, s) for s in ((before, after) if long else (before | after,)))
-            if f is not None
-        ]
+    near = 2 * math.pi + 1e-6  # the angle only rises
+    firsts = np.searchsorted(angle, angle[edges[::2]] - near, side="right")
+    lasts = np.searchsorted(angle, angle[edges[1::2] - 1] + near, side="left")
+    for i, j, a, b in zip(edges[::2], edges[1::2], firsts, lasts, strict=True):
+        gap, long_gap = slice(i, j), angle[j - 1] - angle[i] > LONG * 2 * math.pi
+        before, after = a + np.flatnonzero(~missing[a:i]), j + np.flatnonzero(~missing[j:b])
+        sides = (before, after) if long_gap else (np.append(before, after),)
+        fits = [f for f in (_fit(basis, x, s) for s in sides) if f is not None]
         if not fits:
             raise DataError(
                 f"{name}: too few samples within a period of the gap at t = {t[i]:.9g} s "
@@ -116,10 +113,10 @@ def filled(
 
 
 def _fit(basis: np.ndarray, x: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Coefficients of the basis, and the rms of what is left; None of too few samples."""
+    """Coefficients of the basis at samples, and the rms of what is left; None of too few."""
     n = basis.shape[1]
-    if at.sum() < n + 2:
+    if at.size < n + 2:
         return None
     c = np.linalg.lstsq(basis[at], x[at], rcond=None)[0]
     rest = x[at] - basis[at] @ c
-    return c, float(np.sqrt(np.mean(rest**2) * at.sum() / (at.sum() - n)))
+    return c, float(np.sqrt(np.mean(rest**2) * at.size / (at.size - n)))

@@ -26,6 +26,8 @@ __all__ = ["WINDOW", "Sequences", "fitted", "sequences"]
 WINDOW = 0.1  # s, but PERIODS periods at least
 PERIODS = 4
 LEAST = 8  # windows of the reference
+FEW = 8  # samples of a period below which those that a transducer clips are missed
+POOR = 1.05  # error over that of as many even samples, from which they are
 TOGETHER = 64  # windows that are fitted at once
 MARGIN = 1.5  # on the threshold: the spread itself is estimated
 TURN = np.exp(2j * math.pi / 3)
@@ -82,6 +84,13 @@ def sequences(t: np.ndarray, phases: np.ndarray, *, rate: float = 1.0) -> Sequen
     rows = [(i, j) for i, j in pairwise(edges) if _fewest(x[:, i:j]) >= 16]
     if not rows:
         raise DataError("no window has 16 samples of all three phases")
+    if f * float(np.median(np.diff(t))) * FEW > 1:
+        rows = [(i, j) for i, j in rows if _even(t[i:j], x[:, i:j], f)]
+    if not rows:
+        raise DataError(
+            f"of less than {FEW} samples a period so many are missing at the same angles, clipped "
+            "for instance, that the rest tells no sinusoid"
+        )
     freq, parts, sigma = _windows(t, x, rows, f)
     ends = np.array([t[j - 1] for _, j in rows])
     ratio = parts[:, 1] / parts[:, 0]
@@ -123,8 +132,22 @@ def _share(t: np.ndarray, x: np.ndarray, f: float) -> float:
         return math.sqrt(2 / x.size)
     w = 2 * math.pi * f * (t - t[0])
     basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
-    each = [np.linalg.inv(basis[r].T @ basis[r]) for r in there]
+    each = [np.linalg.pinv(basis[r].T @ basis[r], hermitian=True) for r in there]
     return math.sqrt(sum(c[0, 0] + c[1, 1] for c in each) / 2) / 3
+
+
+def _even(t: np.ndarray, x: np.ndarray, f: float) -> bool:
+    """Whether the samples of a window are spread over the period as well as all would be.
+
+    Of few samples a period, 400 Hz at 1 kHz, those that are clipped are always at the same angles;
+    what is left beside them is chosen by its noise and may fit any sinusoid.
+    """
+    w = 2 * math.pi * f * (t - t[0])
+    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+    each = [basis[r] for r in np.isfinite(x)]
+    if min(np.linalg.matrix_rank(b) for b in each) < basis.shape[1]:
+        return False
+    return _share(t, x, f) < POOR * math.sqrt(2 / np.isfinite(x).sum())
 
 
 def fitted(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SLOW = 0.01  # s, a step with which no waveform is sampled
+EPOCH = 1e9  # s, from which numbers count from 1970, not from the beginning of a recording
 __all__ = ["Channel", "Measurements", "read_recording"]
 
 
@@ -236,7 +237,15 @@ def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurement
             hint = table.steady_hint()
             guess = f"; {hint} rises like one" if hint else ""
             raise DataError(
-                f"{table.source}: no column is the time{guess}: give time=COLUMN or rate=HZ"
+                f"{table.source}: no column is the time{guess}: give --time COLUMN or --rate HZ; "
+                "apu fit takes steady points"
+            )
+        if not start and t.size and t[0] > EPOCH:
+            t, begin = _since_first(t)
+            start.append(begin)
+            notes.append(
+                f"{table.source}: {begin[0].astype(float) / 1e9:.9g} s is taken as seconds since "
+                f"1970: {begin[0].astype('datetime64[s]')} UTC"
             )
         times.append(t)
         starts.append(start[0] if start else None)
@@ -248,7 +257,7 @@ def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurement
             "seconds of both from one instant"
         )
     if len({zoned for _, zoned in dated}) > 1:
-        raise DataError("some files have dates with a zone and some without: give time_zone=...")
+        raise DataError("some files have dates with a zone and some without: give --time-zone ZONE")
     zero = min((d for d, _ in dated), default=None)
     if several and zero is None:
         notes.append("all files are taken to count their seconds from the same instant")
@@ -274,10 +283,15 @@ def _joined(tables: list[Table], notes: list[str], several: bool) -> Measurement
     if not channels:
         raise DataError(
             f"{tables[0].source}: none of the columns {', '.join(tables[0].columns)} is a quantity "
-            "of the model: name them by columns={...} or a file of columns"
+            "of the model: give --column NAME=COLUMN for each, or a file of them by --columns"
         )
     notes += [f for table in tables for f in table.flags()]
     return Measurements(channels, tuple(notes), tuple(unused), zero)
+
+
+def _since_first(t: np.ndarray) -> tuple[np.ndarray, Start]:
+    """Return seconds from the first instant on, and the date of that, in UTC."""
+    return t - t[0], (np.datetime64(round(float(t[0]) * 1e9), "ns"), True)
 
 
 def _check_rate(c: Channel, table: Table) -> None:
@@ -286,7 +300,7 @@ def _check_rate(c: Channel, table: Table) -> None:
     if plain(c.name) in WAVES and step > SLOW:
         raise DataError(
             f"{c.source}: steps of {step:g} s are no sampling of a waveform: unit of the time "
-            "missing? give columns={'time': 'COLUMN:ms'}, or rate=HZ"
+            "missing? give --column time=COLUMN:ms, or --rate HZ"
         )
     if step >= 10 and table.notes is not None:
         note = f"{table.source}: steps of {step:g} s; if they are ms, give the time's unit"

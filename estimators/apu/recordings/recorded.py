@@ -103,14 +103,16 @@ class Table:
 
     def _find(self, name: str) -> tuple[Column, Any]:
         """Return the column for a name of the model, and its unit."""
-        column, unit = self.mapping.get(name, (name, None))
-        column = self._spelt(column)
+        given, unit = self.mapping.get(name, (name, None))
+        column = self._spelt(given)
         if column not in self.columns:
             raise DataError(
                 f"{self.source}: no column {name!r} {nearest(name, self.columns)}"
                 f"{self._other(column)}"
             )
         c = self.columns[column]
+        if unit is None and c.unit is None and column != given:
+            unit = (split_unit(given, _known) or (None, None))[1]
         return c, c.unit if unit is None else unit
 
     def place(self, column: str, k: int) -> str:
@@ -240,7 +242,7 @@ class Table:
             if names:
                 raise DataError(
                     f"{self.source}: {' and '.join(names)} may be the time: give --time COLUMN, or "
-                    "--steady if the rows are steady points"
+                    "--steady (apu fit) if the rows are steady points"
                 )
         return None
 
