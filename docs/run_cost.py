@@ -10,12 +10,14 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from apu_casadi.core.profiles.profile import varying
 from apu_casadi.core.profiles.shapes import Growth
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.multirate import simulate_joint
 from scenarios.registry import get, unit_for
 
@@ -24,20 +26,30 @@ BARE: dict[str, Any] = {"waveform_dt": None}
 JOINT: Case = ("joint", BARE)
 #: As ``JOINT``, with another number in one machine: all that is computed is computed twice.
 APART = "joint, r_s of generator 2 changed"
+#: As ``JOINT``, with four equal generators that carry half of the loads each.
+FOUR = "joint, four equal generators"
 PAIRS: dict[str, tuple[Case, Case]] = {
+    "four equal generators over two": ((FOUR, BARE), JOINT),
+    "they with waveforms": ((FOUR, {}), ("joint", {})),
     "two different generators over equal ones": (("joint_one_machine", BARE), JOINT),
     "the same with waveforms": (("joint_one_machine", {}), ("joint", {})),
     "two that differ throughout over equal ones": ((APART, BARE), JOINT),
-    "they with waveforms": ((APART, {}), ("joint", {})),
+    "two that differ throughout, with waveforms": ((APART, {}), ("joint", {})),
     "with phasors over without": (("joint", {**BARE, "phasors": True}), JOINT),
     "with waveforms over without": (("joint", {}), JOINT),
 }
 
+HALF = [SeriesLoad.from_power(112.5e3), SeriesLoad.from_power(50e3)]
+
 
 def prepared(name: str, **more: Any) -> Callable[[], Any]:
     """Return the call that runs a scenario of the library."""
-    s = get("joint" if name == APART else name)
+    s = get("joint" if name in (APART, FOUR) else name)
     unit, start, events = unit_for(s), s.start(), s.events()
+    if name == FOUR:
+        unit, start = unit.change({"generator.count": 4}), {**start, "load": HALF[0]}
+        changes = iter(HALF[1:])
+        events = [replace(e, load=next(changes)) if hasattr(e, "load") else e for e in events]
     if name == APART:
         unit = unit.change({"generator2.machine.r_s": 1.05 * unit.generators[1].machine.r_s})
     given = {"ambient": s.ambient, "waveform_dt": s.waveform_dt, "dt": s.dt, **more}

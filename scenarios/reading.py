@@ -295,6 +295,8 @@ def _fault_of(row: Any, place: str) -> FaultOf:
         k, fault = number_of(row.generator, f"{place}.generator"), row.fault
         healthy = fault is None or isinstance(fault, str)
         return FaultOf(k, None if healthy else read_fault(fault, place))
+    if isinstance(row, Mapping) and "generator" not in row:
+        read_fault(row, place)  # it may be misspelt, which this tells
     missing = "missing: which generator has it? Without a list, a fault is of all"
     require(isinstance(row, Mapping) and "generator" in row, f"{place}.generator", missing)
     own = {k: v for k, v in row.items() if k != "generator"}

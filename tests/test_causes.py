@@ -24,6 +24,8 @@ from estimators.apu.gaspath import gas_path_filter
 from estimators.apu.healthjumps import Tracked
 from estimators.apu.jointcases import joint_case
 from estimators.apu.measuring import measure_run
+from estimators.apu.recorded_estimate import estimate
+from estimators.apu.recordings.measured import read_recording
 from estimators.apu.sensors import ELECTRICAL
 from estimators.apu.unknowns import ETA_SIGMA
 from scenarios.studies.flightruns import flown
@@ -41,8 +43,8 @@ def run(*events, apu=APU, duration=0.2, health=None):
     )  # fmt: skip
 
 
-def waves(*events, apu=APU, seed=1):
-    made = measure_run(run(*events, apu=apu), APU, seed)["electrical"]
+def waves(*events, apu=APU, seed=1, duration=0.2):
+    made = measure_run(run(*events, apu=apu, duration=duration), APU, seed)["electrical"]
     return {"t": made["time"].values} | {str(n): made[n].values.copy() for n in made}
 
 
@@ -234,6 +236,18 @@ def test_large_steps_in_the_pipeline(name):
     """Of 4 %: a pressure was called a change of the gas path with a probability of 0.998."""
     found = flown(name, 0.04, 1)
     assert found["exact"] and found["said"] == ("gas path" if name in HEALTH else "sensor")
+
+
+def test_a_short_circuit_where_both_windings_are_hot():
+    """By 65 to 75 K: it was called shorted turns of the field with a probability of 0.99."""
+    known = APU.parameters()
+    warm = {"machine.r_s": 1.3, "machine.r_fd": 1.25}
+    hot = APU.change({n: known[n] * v for n, v in warm.items()})
+    fault = FaultChange(0.2, Ttsc.of_h(0.02, 4e-4, phase="b"))
+    e = estimate(read_recording(waves(fault, apu=hot, duration=0.4)), only="electrical")
+    (change,) = e.diagnoses
+    assert change.best == "machine 1: short circuit b", change.probability
+    assert change.probability[change.best] > 0.9 and e.believable, e.doubts
 
 
 def test_a_sensor_that_drifts_or_is_noisy(gas):

@@ -8,6 +8,7 @@ import argparse
 import dataclasses
 import json
 import os
+import re
 import signal
 import threading
 
@@ -121,6 +122,33 @@ def test_a_figure_is_drawn_from_what_is_saved(tmp_path):
         plot_joint_estimate(np.arange(3), {k: v for k, v in wrong.items() if k != "P_total_true"})
     with pytest.raises(SignalError, match="4 values expected of f_eta_c"):
         plot_joint_estimate(np.arange(4), wrong)
+
+
+def test_generators_that_differ_are_told_one_by_one(tmp_path, monkeypatch, capsys):
+    """Each has its table and its figure; health, power and speed are told once."""
+    e = made()
+    own = [str(n) for n in e if str(n).startswith(("h_", "faulty_phase"))]
+    ends = {n: next((x for x in ("_sigma", "_true") if n.endswith(x)), "") for n in own}
+    both = e.drop_vars(own)
+    for n, end in ends.items():
+        healthy = e[n] if end == "_sigma" else 0 * e[n]
+        for k, of_it in ((1, healthy), (2, e[n])):
+            both[f"{n.removesuffix(end)}_{k}{end}"] = of_it.assign_attrs(e[n].attrs)
+    for k in (1, 2):
+        both[f"ttsc_probability_{k}"] = e["faulty_phase"]
+    monkeypatch.setattr(jointrun, "truth", lambda *_, **__: None)
+    monkeypatch.setattr(jointrun, "estimate", lambda *_, **__: both)
+    args = ["estimate", "joint", "--scenario", "joint_one_machine", "--out", str(tmp_path)]
+    assert cli.main([*args, "--quiet"]) == 0
+    common, first, second = re.split(r"^generator \d$", capsys.readouterr().out, flags=re.M)
+    assert "turbine flow f_W_t" in common and "severity h_a" not in common
+    assert "No short circuit happened" in first and "turbine flow f_W_t" not in first
+    assert "Its severity is h = " in second
+    assert len(list(tmp_path.glob("*_generator[12].png"))) == 2
+    r = json.loads((tmp_path / "estimate.json").read_text())
+    assert [g["generator"] for g in r["generators"]] == [1, 2] and "phases" not in r
+    found, whole = r["generators"][1]["short_circuit"], jointrun.report(e)["short_circuit"]
+    assert (found["true_phase"], found["h"]) == (whole["true_phase"], whole["h"])
 
 
 def test_other_ambient_conditions_are_refused():

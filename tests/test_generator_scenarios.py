@@ -68,6 +68,7 @@ def test_python_takes_faults_by_number():
 REFUSED = [
     (dict(fault=[{"generator": 1, **SHORT}] * 2), r"fault\[2\].generator: generator 1 has a fault"),
     (dict(fault=[SHORT]), r"fault\[1\].generator: missing: which generator"),
+    (dict(fault=[{"genrator": 2, **SHORT}]), r"fault\[1\].genrator: unknown .* 'generator'"),
     (dict(fault=[]), "fault: an empty list"),
     (dict(fault={"generator": 3, **SHORT}), "fault: generator 3, but the unit has 1 to 2"),
     (dict(fault={"generator": 0, **SHORT}), r"fault.generator: the number of a generator, 1 to 4"),

@@ -333,7 +333,8 @@ def test_a_gap_of_the_fuel_flow_is_bridged(readings):
             (x, s), (y, r) = (
                 (float(g[n][-1]), float(g[f"{n}_sigma"][-1])) for g in (e.gaspath, whole.gaspath)
             )
-            assert r < s < 1.2 * r and abs(x - y) < s
+            # what wrong readings may have moved is in both, and hangs on the readings themselves
+            assert 0.98 * r < s < 1.2 * r and abs(x - y) < s
 
 
 @pytest.mark.long

@@ -8,7 +8,8 @@ knows what ripples.
   coefficients, sampled at a few instants that lie denser at the start of the step, where the
   speed has just changed.  Polynomials through them times the harmonics are integrated in closed
   form (Filon's method).
-* Periodic coefficients (fault, unbalanced load): :mod:`apu_casadi.machine.turnstep`.
+* Periodic coefficients (fault, unbalanced load): :mod:`apu_casadi.machine.turnstep`, with strides
+  half as long beside a severe fault.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from apu_casadi.machine.propagation import hoisted, leap
 from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import (
     NODES,
+    Table,
     cached_table,
     nominal_entries,
     parity,
@@ -44,6 +46,11 @@ PANELS = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
 #: Longest time, first intervals, in which the stator may settle behind the load and not be sampled.
 LAYER = 0.5
 HARMONICS = (12, 20, 30)  # of the rotor angle that a function takes; the first that fits
+FINE = 32  # with the finer strides
+#: Harmonics of a transition matrix from the fourth on, nominal units, from which strides are finer:
+#: a resistive load of 10, 100 or 225 kW with h = 0.0015, 0.005 or 0.012, an inductive one of 100 kW
+#: with 0.002.  Below, means err by less than 1e-6 with the coarse ones, which take half the time.
+SEVERE = 1e-2
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
@@ -258,6 +265,15 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
 # ------------------------------------------------------------------------------ both
 
 
+def _ripple(ss: GeneratorModel, table: Table) -> float:
+    """Harmonics of the transition matrices from the fourth on, nominal units, at rated speed."""
+    total = 0.0
+    for part, units in zip((table.even, table.odd), nominal_entries(ss, 1), strict=True):
+        pairs = part[0].reshape(-1, 2, part.shape[2])[2:]  # from 4, and from 5 on
+        total += float((np.hypot(pairs[:, 0], pairs[:, 1]) * units).max(axis=1, initial=0.0).sum())
+    return total
+
+
 @kept
 def _function(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int
@@ -330,21 +346,26 @@ class MeanStep(Rebuilt):
             tables = [cached_table(ss, u, given, w_rated, h=dt * share / 4) for _, share in PANELS]
             series, self.harmonics = [t.even.ravel() for t in tables], 0
         else:
-            angle = 2 * math.pi / STRIDES
-            tables = [cached_table(ss, u, given, w_rated, angle=angle)]
+            coarse, fine = (2 * math.pi / n for n in STRIDES)
+            tables = [cached_table(ss, u, given, w_rated, angle=coarse)]
+            severe = harmonics >= FINE or _ripple(ss, tables[0]) > SEVERE
+            if severe:
+                tables = [cached_table(ss, u, given, w_rated, angle=fine)]
             least = max(harmonics, tables[0].harmonics)
-            self.harmonics = next((k for k in HARMONICS if k >= least), 0)
+            fit = (FINE,) if severe else HARMONICS
+            self.harmonics = next((k for k in fit if k >= least), 0)
             if not self.harmonics:
                 raise NotApplicable(
-                    f"{ss.name}: {tables[0].harmonics} harmonics of the rotor angle, "
-                    f"{HARMONICS[-1]} fit"
+                    f"{ss.name}: {tables[0].harmonics} harmonics of the rotor angle, {fit[-1]} fit"
                 )
             table = tables[0].filled(self.harmonics)
             # entries, then terms, then powers
             series = [part.ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
         self.parameters = np.concatenate([*series, self._range])
-        turn = None if self.constant else turn_of(dt, w_rated)  # panels are shares of the step
+        turn = None  # panels are shares of the step
+        if not self.constant:
+            turn = turn_of(dt, w_rated, STRIDES[self.harmonics >= FINE])
         self.layout = (ss.shared, self.quad, turn, self.harmonics)
         self.advance = _function(*self.layout)
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]

@@ -14,13 +14,13 @@ with a smooth y_s, of which the derivative leaves the less the higher it is.  d 
 its area behind: the integral of exp(J t) d is D = -J^-1 d.  What is not fast, in its directions of
 y, is left as it is: by (1 + G^4)^-1 with G = (J T)^-1, of modes whose L/R is longer than T.
 
-y is the stator's flux linkages; or, where a fault's current is a state beside an inductive load,
-that current alone, with the stator among what is slow.
+y is the stator's flux linkages; where a fault's current is a state, that current with them, or,
+beside an inductive load, that current alone, with the stator among what is slow.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 
@@ -52,33 +52,55 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     """
     nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
     x, u, th, T = (ca.SX.sym(k, n) for k, n in zip("xuts", (nx, nu, nt, 1), strict=True))
-    rotor, angle = ss.x.indices(_ROTOR), ss.x.index("theta_e")
     stator = ss.x.indices([n for n in _STATOR if n in ss.linear])
-    fast = [ss.x.index("i_fault")] if "i_fault" in ss.linear else stator
-    slow = [i for i in (*stator, *rotor) if i not in fast]
-    n, f, rates = len(fast), ss.f(x, u, th), ca.SX(nx, 1)
-    moving = [*ss.x.indices(ss.linear), angle]
+    f, rates = ss.f(x, u, th), ca.SX(nx, 1)
+    moving = [*ss.x.indices(ss.linear), ss.x.index("theta_e")]
     rates[moving] = f[moving]  # the exciter does not move within microseconds
-    J, coupled = (ca.densify(ca.jacobian(f[rows], x)[:, fast]) for rows in (fast, slow))
-    J_inv, d = inverse(n)(J), f[fast]
-    for _ in range(ORDER[constant] - 1):
-        d = ca.jtimes(d, x, rates)
-    T_own = T if fast == stator else T / 2  # what is slower ripples in a loop's direction
-    G2 = ca.mtimes(J_inv, J_inv) / T_own**2
-    K = ca.mtimes(inverse(n)(ca.SX.eye(n) + ca.mtimes(G2, G2)), J_inv)
-    for _ in range(ORDER[constant]):
-        d = ca.mtimes(K, d)
-    D = -ca.mtimes(K, d)
-    fastest = ca.mmax(ca.fabs(ca.diag(J))) * T
-    on = ca.logic_and(ca.gt(fastest, 1.0), ca.lt(fastest, STIFF))
-    if fast != stator:
-        rest = ca.diag(ca.jacobian(f[stator], x)[:, stator])
-        on = ca.logic_and(on, ca.lt(ca.mmax(ca.fabs(rest)) * T, 1.0))
-    change, area = ca.SX.zeros(nx), ca.SX.zeros(nx)
-    change[fast], area[fast] = ca.if_else(on, -d, 0.0), ca.if_else(on, D, 0.0)
-    # what passes by in the stator moves the rotor's flux linkages for good
-    change[slow] = ca.if_else(on, ca.mtimes(coupled, D), 0.0)
-    outputs: list[Any] = [change, area]
+    own = ca.densify(ca.jacobian(f[stator], x)[:, stator])
+    fastest = ca.mmax(ca.fabs(ca.diag(own))) * T
+    light = ca.logic_and(ca.gt(fastest, 1.0), ca.lt(fastest, STIFF))
+    of_model = _Fast(ss, x, f, rates, ORDER[constant])
+    if "i_fault" not in ss.linear:
+        outputs = [ca.if_else(light, part, 0.0) for part in of_model.passing(stator, T)]
+    else:
+        loop = ss.x.index("i_fault")
+        fast = ca.fabs(ca.jacobian(f[loop], x)[loop]) * T
+        on = ca.logic_and(ca.logic_and(ca.gt(fast, 1.0), ca.lt(fast, STIFF)), ca.lt(fastest, 1.0))
+        # what is slower ripples in a loop's direction
+        alone, both = of_model.passing([loop], T / 2), of_model.passing([*stator, loop], T)
+        outputs = [
+            ca.if_else(light, b, ca.if_else(on, a, 0.0)) for a, b in zip(alone, both, strict=True)
+        ]
     if constant:
-        outputs = ca.substitute(outputs, [x[angle]], [ca.SX(0)])
+        outputs = ca.substitute(outputs, [x[ss.x.index("theta_e")]], [ca.SX(0)])
     return ca.Function("settled", [x, u, th, T], [x + outputs[0], outputs[1]], {"cse": True})
+
+
+class _Fast(NamedTuple):
+    """A model's rates: f all of them, ``rates`` those of what moves within microseconds."""
+
+    ss: GeneratorModel
+    x: Any
+    f: Any
+    rates: Any
+    order: int
+
+    def passing(self, fast: list[int], T: Any) -> list[Any]:
+        """Return the change of the state until some of its entries have settled, and the area."""
+        x, f, n = self.x, self.f, len(fast)
+        all_slow = self.ss.x.indices([n for n in (*_STATOR, *_ROTOR) if n in self.ss.linear])
+        slow = [i for i in all_slow if i not in fast]
+        J, coupled = (ca.densify(ca.jacobian(f[rows], x)[:, fast]) for rows in (fast, slow))
+        J_inv, d = inverse(n)(J), f[fast]
+        for _ in range(self.order - 1):
+            d = ca.jtimes(d, x, self.rates)
+        G2 = ca.mtimes(J_inv, J_inv) / T**2
+        K = ca.mtimes(inverse(n)(ca.SX.eye(n) + ca.mtimes(G2, G2)), J_inv)
+        for _ in range(self.order):
+            d = ca.mtimes(K, d)
+        D = -ca.mtimes(K, d)
+        change, area = ca.SX.zeros(x.numel()), ca.SX.zeros(x.numel())
+        change[fast], area[fast] = -d, D
+        # what passes by in the stator moves the rotor's flux linkages for good
+        change[slow] = ca.mtimes(coupled, D)
+        return [change, area]

@@ -13,7 +13,7 @@ what is made of each sample, have forms in vector lanes (:mod:`apu_casadi.core.l
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -28,20 +28,36 @@ from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through
 
-STRIDES = 28  # strides in a turn, where coefficients are periodic: 14 in a period of what ripples
-HALF = STRIDES // 2
+#: Strides in a turn, where coefficients are periodic: 14 in a period of what ripples, or 28 where a
+#: fault is severe: its power has more than ten harmonics in a turn.
+STRIDES = (28, 56)
 PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
-PAIRS = HALF // PACE
 #: Longest time, strides, in which the stator may settle behind the load and not be sampled.
 LAYER = 0.35
 _BACK = 8  # samples whose polynomial leads back to the start
 _AROUND = 10  # samples around the end of the step that its polynomial goes through
 _NEAR = _AROUND // 2
-#: Samples before and after an end of the step that its share of the means is made of, and degrees
-#: in time of the harmonics of half a turn in them.  The power of a severe fault has ten in a turn:
-#: with polynomials through ten samples means err by 4e-4, so by 2e-5 and less.
-_RIPPLE = (30, 5)
-_DEGREES = {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}
+
+
+class Rule(NamedTuple):
+    """Samples before and after an end of the step that its share of the means is made of.
+
+    And degrees in time of the harmonics of half a turn in them.  With polynomials through ten
+    samples means beside a severe fault err by 4e-4; with 28 strides by 2e-4, with 56 by 3e-6.  More
+    samples do not help: over more than a turn amplitudes are no polynomials of such degrees.
+    """
+
+    before: int
+    after: int
+    degrees: Mapping[int, int]
+
+
+#: By the number of strides.
+_RULES = {
+    28: Rule(30, 5, {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}),
+    56: Rule(60, 10, {0: 3, 1: 3, 2: 2, 3: 2, **dict.fromkeys(range(4, 8), 1),
+                      **dict.fromkeys(range(8, 14), 0)}),
+}  # fmt: skip
 
 
 def _powers(s: Any, count: int) -> Any:
@@ -49,24 +65,26 @@ def _powers(s: Any, count: int) -> Any:
     return ca.vertcat(1, *(s**k for k in range(1, count)))
 
 
-def _turned(pairs: int, *, odd: bool) -> ca.Function:
+def _turned(pairs: int, half: int, *, odd: bool) -> ca.Function:
     """Function theta -> cos and sin, in turn, of q times each of the angles of half a turn.
 
-    q = 0, 2, ... or 1, 3, ...; shape (2 pairs, HALF), angles a stride apart from theta on.
+    q = 0, 2, ... or 1, 3, ...; shape (2 pairs, half), angles a stride apart from theta on.
     """
     theta, rows = ca.SX.sym("theta"), []
     cos, sin = ca.cos(theta), ca.sin(theta)
     cos2, sin2 = cos * cos - sin * sin, 2 * cos * sin
     p, q = (cos, sin) if odd else (ca.SX(1), ca.SX(0))
     for k in range(pairs):
-        by = 2 * math.pi * (2 * k + odd) / STRIDES * np.arange(HALF)
+        by = math.pi * (2 * k + odd) / half * np.arange(half)
         C, S = ca.DM(np.cos(by)).T, ca.DM(np.sin(by)).T
         rows += [p * C - q * S, q * C + p * S]
         p, q = p * cos2 - q * sin2, q * cos2 + p * sin2
     return ca.Function("turned", [theta], [ca.densify(ca.vertcat(*rows))], {"cse": True})
 
 
-def _matrices(kinds: Parity, series: Any, s: Any, theta0: Any, harmonics: int) -> list[ca.MX]:
+def _matrices(
+    kinds: Parity, series: Any, s: Any, theta0: Any, harmonics: int, half: int
+) -> list[ca.MX]:
     """Transition matrices over the strides of half a turn, each of shape (n, n + EXTRA).
 
     Args:
@@ -75,6 +93,7 @@ def _matrices(kinds: Parity, series: Any, s: Any, theta0: Any, harmonics: int) -
         s: relative speed.
         theta0: rotor angle at the start.
         harmonics: that the table has.
+        half: strides in half a turn.
     """
     values, first, n = [], 0, kinds.sign.size - EXTRA
     for odd, entries in enumerate((kinds.even.size, kinds.odd.size)):
@@ -82,7 +101,7 @@ def _matrices(kinds: Parity, series: Any, s: Any, theta0: Any, harmonics: int) -
         size = terms * entries
         own = ca.reshape(series[first : first + NODES * size], size, NODES)
         now = ca.mtimes(own, _powers(s, NODES))
-        turned = _turned(terms // 2, odd=bool(odd))(theta0)
+        turned = _turned(terms // 2, half, odd=bool(odd))(theta0)
         values.append(ca.mtimes(ca.reshape(now, entries, terms), turned))
         first += NODES * size
     order = np.argsort(np.append(kinds.even, kinds.odd)).tolist()
@@ -102,25 +121,39 @@ def _later(h: Any) -> ca.Function:
 
 
 class Turn(NamedTuple):
-    """Half turns in a step, and the samples between which it may end."""
+    """Half turns in a step, the samples between which it may end, and strides in a turn."""
 
     halves: int
     first: int
+    strides: int
+
+    @property
+    def half(self) -> int:
+        """Strides in half a turn."""
+        return self.strides // 2
+
+    @property
+    def pairs(self) -> int:
+        """Steps of the exciter in half a turn."""
+        return self.half // PACE
 
     @property
     def samples(self) -> int:
         """Samples of a step, the start included."""
-        return 1 + self.halves * HALF
+        return 1 + self.halves * self.half
 
 
-def turn_of(dt: float, w_rated: float) -> Turn:
+def turn_of(dt: float, w_rated: float, each: int) -> Turn:
     """How many strides are needed for the fastest speed, and where the slowest ends.
 
     Half of the samples that its polynomial goes through lie beyond the end.
+
+    Args:
+        each: strides in a turn.
     """
-    strides = dt * w_rated * STRIDES / (2 * math.pi)
-    halves = math.ceil(((1 + SPEED_RANGE) * strides + _NEAR) / HALF)
-    return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND)
+    strides = dt * w_rated * each / (2 * math.pi)
+    halves = math.ceil(((1 + SPEED_RANGE) * strides + _NEAR) / (each // 2))
+    return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND, each)
 
 
 def _slice(values: Any, count: int, at: Any) -> ca.MX:
@@ -161,13 +194,14 @@ class _End:
 
     def means(self) -> Any:
         """Weights of the samples in a mean, relative to a stride, (samples,)."""
-        first, partial = rippling(*_RIPPLE, HALF, _DEGREES)
+        rule = _RULES[self.turn.strides]
+        first, partial = rippling(rule.before, rule.after, self.turn.half, rule.degrees)
         count, whole = first.size, np.array([np.polyval(row[::-1], 0.5) for row in partial])
         # less what the intervals from J on would give to a sample near it, and what the last does
         after = np.append(np.cumsum(whole[:0:-1])[::-1], 0.0) - 1.0
         last = ca.mtimes(ca.DM(partial), _powers(self._s - 0.5, partial.shape[1])) + ca.DM(after)
         n, earliest = self.turn.samples, self.turn.first + _AROUND
-        begin = earliest + 1 - _RIPPLE[0]
+        begin = earliest + 1 - rule.before
         beyond = n - begin - count
         ends = ca.vertcat(ca.DM.zeros(beyond), last, -ca.DM.ones(beyond))
         later = ca.fmin(ca.fmax(self.J - earliest, 0), beyond)
@@ -184,7 +218,8 @@ class _Seen:
     once for each, and harmonics are taken out of the sums over the half turns.
     """
 
-    def __init__(self, ss: GeneratorModel, quad: Sequence[str], halves: int) -> None:
+    def __init__(self, ss: GeneratorModel, quad: Sequence[str], turn: Turn) -> None:
+        halves, self._half = turn.halves, turn.half
         self._asked = [Term.of(q) for q in quad]
         #: values and whether they are weighted; harmonics apart
         self._own = list(dict.fromkeys((q.base, q.power, q.weighted) for q in self._asked))
@@ -224,15 +259,15 @@ class _Seen:
         self.over = ca.Function("over", [*samples, plain, light, d], [total], {"cse": True})
 
     def sums(self, samples: Sequence[Any], weights: tuple[Any, Any], fixed: Any) -> Any:
-        """Sums over the half turns at each angle of one, (terms, HALF).
+        """Sums over the half turns at each angle of one, (terms, half).
 
         Args:
-            samples: of each half turn, (n + 2, HALF).
-            weights: plain and of weighted means, (HALF, halves).
-            fixed: u, theta and angle, (..., HALF).
+            samples: of each half turn, (n + 2, half).
+            weights: plain and of weighted means, (half, halves).
+            fixed: u, theta and angle, (..., half).
         """
-        d = self.before.map(HALF)(fixed)
-        return self.over.map(HALF)(*samples, *(w.T for w in weights), d)
+        d = self.before.map(self._half)(fixed)
+        return self.over.map(self._half)(*samples, *(w.T for w in weights), d)
 
     def means(self, sums: Any, angles: Any) -> Any:
         """Return the means asked for from sums over the half turns at angles, (terms, angles)."""
@@ -394,7 +429,7 @@ def _between(
     return hoisted("between", given, ca.vertcat(u, th, h, angle), outputs)
 
 
-def _half_turn(ss: GeneratorModel, between: ca.Function, n_d: int) -> ca.Function:
+def _half_turn(ss: GeneratorModel, between: ca.Function, n_d: int, pairs: int) -> ca.Function:
     """Function (z, S, matrices of each pair, d of each) -> (z, S, samples, S of each pair).
 
     It is called again and again: unrolled to a step, it would not stay in the processor's cache of
@@ -402,10 +437,10 @@ def _half_turn(ss: GeneratorModel, between: ca.Function, n_d: int) -> ca.Functio
     """
     n = len(ss.linear)
     z, S = z_k, S_k = ca.MX.sym("z", n + EXTRA), ca.MX.sym("S", between.numel_in(PACE + 1))
-    P = [ca.MX.sym("P", n + 2, n + EXTRA) for _ in range(HALF)]
-    d = [ca.MX.sym("d", n_d) for _ in range(PAIRS)]
+    P = [ca.MX.sym("P", n + 2, n + EXTRA) for _ in range(PACE * pairs)]
+    d = [ca.MX.sym("d", n_d) for _ in range(pairs)]
     samples, starts = [], []
-    for k in range(PAIRS):
+    for k in range(pairs):
         starts.append(S_k)
         x = [ca.mtimes(own, z_k) for own in P[PACE * k : PACE * (k + 1)]]
         z_k, S_k, its = between(*x, z_k, S_k, d[k])
@@ -446,7 +481,7 @@ def _seen_of_a_jump(V_now: Any, V: Sequence[Any], length: Any) -> Any:
 
     Args:
         V_now: at the first instant.
-        V: those at the samples of the first half turns, (1, HALF) each.
+        V: those at the samples of the first half turns, (1, half) each.
         length: of the step, in strides.
     """
     near = ca.mtimes(V[0][:_BACK], ca.DM(through(1, _BACK)[:, 0]))
@@ -456,7 +491,7 @@ def _seen_of_a_jump(V_now: Any, V: Sequence[Any], length: Any) -> Any:
 
 
 class _Chain(NamedTuple):
-    """What followed in turn: samples of each half turn, (n + 2, HALF), and S of each pair."""
+    """What followed in turn: samples of each half turn, (n + 2, half), and S of each pair."""
 
     samples: list[Any]
     starts: list[Any]
@@ -469,18 +504,19 @@ def _at_end(ss: GeneratorModel, chain: _Chain, end: _End) -> tuple[Any, Any, lis
     The latter by its states where its last step starts, and the terminal voltages there, in the
     middle and at the end.
     """
-    n, first = len(ss.linear), (end.turn.first - 1) // HALF
-    rows, n_S = n + 2, chain.starts[0].numel() // PAIRS
+    half, pairs = end.turn.half, end.turn.pairs
+    n, first = len(ss.linear), (end.turn.first - 1) // half
+    rows, n_S = n + 2, chain.starts[0].numel() // pairs
     tail = ca.vertcat(*(ca.vec(v) for v in chain.samples[first:]))
-    begin = 1 + HALF * first  # number of the first sample of the tail
+    begin = 1 + half * first  # number of the first sample of the tail
 
     def around(J: Any) -> Any:
         place = (J + 1 - _NEAR - begin) * rows
         return ca.reshape(_slice(tail, rows * _AROUND, place), rows, _AROUND)
 
     # the phases as they are after so many half turns
-    count = HALF * (end.turn.halves - first)
-    signs = ca.DM((-1.0) ** (first + np.arange(count) // HALF))
+    count = half * (end.turn.halves - first)
+    signs = ca.DM((-1.0) ** (first + np.arange(count) // half))
     turned = _slice(ca.MX(signs), _AROUND, end.J + 1 - _NEAR - begin)
     weights = ca.horzcat(end.full, end.fewer)
     keep = np.append(parity(ss, 1).sign[:n], [1.0, 1.0]) > 0
@@ -490,7 +526,7 @@ def _at_end(ss: GeneratorModel, chain: _Chain, end: _End) -> tuple[Any, Any, lis
         found += ca.mtimes(samples, weights * ca.repmat(turned, 1, 2)) * ~keep[:, None]
     V_middle = ca.mtimes(around(end.J_middle)[n + 1, :], end.middle)
     starts = ca.vertcat(*chain.starts[first:])
-    slow = _slice(starts, len(split(ss).slow), (end.start / PACE - PAIRS * first) * n_S)
+    slow = _slice(starts, len(split(ss).slow), (end.start / PACE - pairs * first) * n_S)
     V_start = _slice(tail, 2, (end.start - begin) * rows + n)[1]  # of E and V_t
     return found[:n, 0], found[:n, 1], [slow, ca.vertcat(V_start, V_middle, found[n + 1, 0])]
 
@@ -506,10 +542,11 @@ def periodic_step(
     X0, U, TH = (ca.MX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True))
     parameters, DT = ca.MX.sym("series", size + 2), ca.MX.sym("dt")
     w, V_ref = U[ss.u.index("w_r")], U[ss.u.index("V_ref")]
-    theta0, stride = X0[at.angle], 2 * math.pi / STRIDES
+    half, pairs = turn.half, turn.pairs
+    theta0, stride = X0[at.angle], math.pi / half
     h, s = stride / w, (w - parameters[-2]) / parameters[-1]
-    length, angles = DT / h, theta0 + stride * ca.DM(np.arange(HALF + 1)).T
-    end, seen = _End(turn, length), _Seen(ss, quad, turn.halves)
+    length, angles = DT / h, theta0 + stride * ca.DM(np.arange(half + 1)).T
+    end, seen = _End(turn, length), _Seen(ss, quad, turn)
     relative = end.means()
     plain = relative / length
     # beyond the end of the step the weight goes on as the polynomial that it is
@@ -519,22 +556,22 @@ def periodic_step(
 
     exciter, voltage = _Exciter(ss), _Voltage(ss)
     between, before = _between(ss, exciter, voltage)
-    held = ca.repmat(ca.vertcat(U, TH), 1, HALF)
-    fixed = ca.vertcat(held[:, :PAIRS], ca.repmat(h, 1, PAIRS), angles[:-1:PACE])
-    rows = voltage.rows.map(HALF)(held[: len(ss.u), :], held[len(ss.u) :, :], angles[1:])
-    P = _matrices(kinds, parameters, s, theta0, harmonics)
+    held = ca.repmat(ca.vertcat(U, TH), 1, half)
+    fixed = ca.vertcat(held[:, :pairs], ca.repmat(h, 1, pairs), angles[:-1:PACE])
+    rows = voltage.rows.map(half)(held[: len(ss.u), :], held[len(ss.u) :, :], angles[1:])
+    P = _matrices(kinds, parameters, s, theta0, harmonics, half)
     P = _from_start(P, ca.horzsplit(rows, n + 2), h)
-    given = [*P, *ca.horzsplit(before.map(PAIRS)(fixed))]
-    half_turn = _half_turn(ss, between, before.numel_out(0))
+    given = [*P, *ca.horzsplit(before.map(pairs)(fixed))]
+    half_turn = _half_turn(ss, between, before.numel_out(0), pairs)
     rates, drive, e = exciter.started(x_now[at.slow], V_now, V_ref, TH)
     z, S = ca.vertcat(x_now[at.linear], drive, 1), ca.vertcat(x_now[at.slow], rates, e, 0)
     samples, starts = [], []
     for _ in range(turn.halves):
         z, S, of_samples, of_starts = half_turn(z, S, *given)
-        samples.append(ca.reshape(of_samples, n + 2, HALF))
+        samples.append(ca.reshape(of_samples, n + 2, half))
         starts.append(of_starts)
     chain = _Chain(samples, starts, S[-1])
-    weights = tuple(ca.reshape(v[1:], HALF, turn.halves) for v in (plain, light))
+    weights = tuple(ca.reshape(v[1:], half, turn.halves) for v in (plain, light))
     sums = seen.sums(samples, (weights[0], weights[1]), ca.vertcat(held, angles[1:]))
     mean = seen.means(ca.horzcat(terms, sums), angles)
 

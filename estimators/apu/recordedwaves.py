@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from apu_casadi.core.errors import DataError, EstimationError
+from apu_casadi.machine.machinedata import MachineParameters
 from apu_casadi.unit.apu import Apu
 from estimators.apu.believable import lost, machine_causes, machine_doubts
 from estimators.apu.declared import FILLED
@@ -19,6 +20,7 @@ from estimators.apu.electrical.electricalfilter import (
     electrical_filter,
     window_starts,
 )
+from estimators.apu.electrical.electricalside import with_field
 from estimators.apu.electrical.gaps import evened, usable
 from estimators.apu.electrical.sequences import Sequences, sequences
 from estimators.apu.electrical.terminalsignals import (
@@ -115,7 +117,7 @@ class Waves:
             t = even[window_starts(even, DT, None)]
             side = electrical_side(self.apu, self.sensors, a, t, judged=True, **self.how)
         except LostError as e:
-            given = self.apu.generator.machine, self.sensors, a, e.resets[0]
+            given = self._machine(a, begin), self.sensors, a, e.resets[0]
             first = causes_of_change(*given)
             causes[name] = () if first is None else (first,)
             lacking[what] = str(e)
@@ -128,10 +130,21 @@ class Waves:
         except DataError as e:
             lacking[what] = str(e)
             return None
-        how = side, self.apu.generator.machine, self.sensors, a
-        causes[name], odd = told(machine_causes(*how))
-        doubts += (d.of(name) for d in (*machine_doubts(*how, causes[name]), *odd))
+        causes[name], odd = told(machine_causes(side, self._machine(a, begin), self.sensors, a))
+        how = side, self.apu.generator.machine, self.sensors, a, causes[name]
+        doubts += (d.of(name) for d in (*machine_doubts(*how), *odd))
         return side
+
+    def _machine(self, samples: Mapping[str, np.ndarray], begin: float) -> MachineParameters:
+        """Return the machine with the field resistance that it shows before any change.
+
+        Where both windings are hot, a short circuit would be taken for one of the field otherwise,
+        whose hypothesis alone has its resistance free.
+        """
+        known = self.apu.generator.machine
+        if self.how["unknowns"]["machine.r_fd"].how == "known":
+            return known
+        return with_field(known, samples, max(begin, float(samples["t"][0])))
 
     def samples(self, notes: list[str], begin: float = -math.inf) -> dict[str, np.ndarray]:
         """Return what the electrical filter takes, single wild samples left out.

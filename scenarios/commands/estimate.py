@@ -150,20 +150,32 @@ def _joint(args: argparse.Namespace) -> int:
     if show:
         print("estimating ...", file=sys.stderr)
     e = jointrun.estimate(truth, args.seed, sensors=sensors, folder=folder)
-    report = jointrun.report(e) | given.assumed(args)
+    views = jointrun.by_machine(e)
+    reports = {k: jointrun.report(view) for k, view in views.items()}
+    report = jointrun.of_all(reports) | given.assumed(args)
     notices.tell(report["warnings"] or [])
     named = described(e, f"estimate: {s.title or s.name}")
     made = [results.save(named, folder / f"estimate_{s.name}.nc")]
     text = jsontext.dumps(report)
     made.append(write_text(folder / "estimate.json", text + "\n"))
     if drawn is not None:
-        figure = jointrun.figure(jointrun.saved(e, every=1))
-        made += drawn.save(figure, folder / f"estimate_{s.name}")
+        for k, view in views.items():
+            figure = jointrun.figure(jointrun.saved(view, every=1), k)
+            of = f"_generator{k}" if k else ""
+            made += drawn.save(figure, folder / f"estimate_{s.name}{of}")
     if args.json:
         print(text)
         return 0
     print(f"{s.name}, seed {args.seed}: estimate +- half width of the 95 % band\n")
-    print(jointrun.table(report), "", *jointrun.words(report), sep="\n")
+    shared = reports[min(reports)]
+    if 0 in reports:
+        print(jointrun.table(shared), "", *jointrun.words(shared), sep="\n")
+    else:
+        said = jointrun.shared_words(shared)
+        print(jointrun.table(shared, jointrun.COMMON), "", *said, sep="\n")
+        for k, own in reports.items():
+            text = jointrun.table(own, jointrun.SEVERITIES)
+            print(f"\ngenerator {k}", text, *jointrun.machine_words(own), sep="\n")
     print(f"\n{jointrun.made_words(report)}")
     if not args.quiet:
         given.written(made)

@@ -40,11 +40,23 @@ from scenarios.studies.registration import series
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["draw", "estimate", "report", "saved", "table", "truth", "words"]
+__all__ = [
+    "by_machine",
+    "draw",
+    "estimate",
+    "machine_words",
+    "of_all",
+    "report",
+    "saved",
+    "shared_words",
+    "table",
+    "truth",
+    "words",
+]
 
 TEXT = Template("""
 @made
-Ambient {day}; load of each generator {loads}; truth by {solver}, exchange {exchange} every {ms:g}
+Ambient {day}; {loads}; truth by {solver}, exchange {exchange} every {ms:g}
 ms; apu-casadi {version}.
 
 @none
@@ -113,6 +125,7 @@ Scenario {scenario}, seed {seed}; gain errors drawn for all sensors.
 FINE = 0.005  # s; exchange step of the truth
 WAVEFORM = 1e-4  # s; sampling of the electrical sensors
 Z95 = 1.96
+_ENDS = ("", "_sigma", "_true")
 _TOLD = (
     "ambient",
     "loads",
@@ -124,7 +137,9 @@ _TOLD = (
 )
 """What an estimate takes over from the truth, as it was recorded."""
 HEALTH_WORDS = {n: f"{h.component} {h.quantity}" for n, h in HEALTH_FACTORS.items()}
-SHOWN = ("N", *HEALTH, "h_a", "h_b", "h_c", "P_total")
+SEVERITIES = ("h_a", "h_b", "h_c")
+SHOWN = ("N", *HEALTH, *SEVERITIES, "P_total")
+COMMON = ("N", *HEALTH, "P_total")
 
 
 def truth(
@@ -244,6 +259,37 @@ def _at(t: np.ndarray, when: float) -> int:
     return int(np.searchsorted(t, when + 1e-9)) - 1
 
 
+def by_machine(e: xr.Dataset) -> dict[int, xr.Dataset]:
+    """Return the estimate with the severities of each generator alone, by its number.
+
+    Where all carry the same and one stands for them there is one entry, of number 0.
+    """
+    if SEVERITIES[0] in e:
+        return {0: e}
+    first = f"{SEVERITIES[0]}_"
+    names = [str(n) for n in e if str(n).startswith(first)]
+    numbers = [int(n.removeprefix(first)) for n in names if n.removeprefix(first).isdigit()]
+    found = {}
+    for k in sorted(numbers):
+        own = {f"{n}_{k}": n for n in ("faulty_phase", "ttsc_probability")}
+        own |= {f"{n}_{k}{end}": f"{n}{end}" for n in SEVERITIES for end in _ENDS}
+        found[k] = e.rename(own)
+    return found
+
+
+def of_all(reports: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the report of all generators, from those of :func:`by_machine`, ready for JSON.
+
+    Where they differ, what each has of its own is a list: ``generators``.
+    """
+    shared = dict(reports[min(reports)])
+    if 0 in reports:
+        return shared
+    own = ("phases", "short_circuit", "cross_talk")
+    each = [{"generator": k, **{n: r[n] for n in own}} for k, r in reports.items()]
+    return {n: v for n, v in shared.items() if n not in own} | {"generators": each}
+
+
 def report(e: xr.Dataset) -> dict[str, Any]:
     """Return what the estimate says, by phase, ready for JSON.
 
@@ -294,7 +340,12 @@ def made_words(r: Mapping[str, Any]) -> str:
 
     if not (r.get("ambient") and r.get("loads")):
         return ""
-    loads = ", ".join(f"{x['load']} from {x['t']:g} s" for x in r["loads"])
+    differ = any(x.get("generator") for x in r["loads"])
+    each = [(f"generator {k}" if (k := x.get("generator")) else "each") for x in r["loads"]]
+    told = [f"{x['load']} from {x['t']:g} s" for x in r["loads"]]
+    if differ:
+        told = [f"{of} {what}" for of, what in zip(each, told, strict=True)]
+    loads = f"load of {'' if differ else 'each generator '}{', '.join(told)}"
     by = {"solver": None, "exchange": None, "dt": 0.0} | (r.get("truth_solver") or {})
     version = r["apu_casadi_version"]
     values = {"solver": str(by["solver"]), "exchange": str(by["exchange"]), "ms": 1e3 * by["dt"]}
@@ -373,7 +424,7 @@ def _cross_talk(e: xr.Dataset) -> dict[str, Any]:
     return out
 
 
-def table(r: Mapping[str, Any]) -> str:
+def table(r: Mapping[str, Any], names: tuple[str, ...] = SHOWN) -> str:
     """Return the phases side by side: truth, estimate with its 95 % half width."""
     forms: dict[str, tuple[str, float, str]] = {
         "N": ("shaft speed N [r/min]", 30 / math.pi, ".1f"),
@@ -383,7 +434,7 @@ def table(r: Mapping[str, Any]) -> str:
     }
     head = ["at the end of", *(p["name"] for p in r["phases"])]
     lines = [["  t [s]", *(f"{p['end']:g}" for p in r["phases"])]]
-    for n in SHOWN:
+    for n in names:
         label, scale, form = forms[n]
         cells, true = [], []
         for p in r["phases"]:
@@ -394,7 +445,9 @@ def table(r: Mapping[str, Any]) -> str:
             )
             true.append(f"{scale * v['true']:{form}}")
         lines += [[label, *cells], ["  true", *true]]
-    lines.append(["short circuit found in phase", *(p["faulty_phase"] or "-" for p in r["phases"])])
+    if SEVERITIES[0] in names:
+        found = [p["faulty_phase"] or "-" for p in r["phases"]]
+        lines.append(["short circuit found in phase", *found])
     width = [max(len(x[i]) for x in (head, *lines)) for i in range(len(head))]
 
     def row(cells: list[str]) -> str:
@@ -402,15 +455,29 @@ def table(r: Mapping[str, Any]) -> str:
         return f"{cells[0]:<{width[0]}}  " + "  ".join(rest)
 
     text = [row(head), "-" * len(row(head)), *(row(x) for x in lines)]
-    if any(not v["inside"] for p in r["phases"] for v in p["values"].values()):
+    if any(not p["values"][n]["inside"] for p in r["phases"] for n in names):
         text.append("* the truth lies outside the 95 % band (one in twenty should)")
     return "\n".join(x.rstrip() for x in text)
 
 
 def words(r: Mapping[str, Any]) -> list[str]:
     """Return what was found, in sentences."""
-    health, talk = r["health"], r["cross_talk"]
-    out = _short_circuit_words(r["short_circuit"])
+    health, doubts = _health_words(r), _doubt_words(r)
+    return [*_short_circuit_words(r["short_circuit"]), *health, *_cross_talk_words(r), *doubts]
+
+
+def machine_words(r: Mapping[str, Any]) -> list[str]:
+    """Return what :func:`words` says of the one generator of a report of :func:`by_machine`."""
+    return [*_short_circuit_words(r["short_circuit"]), *_cross_talk_words(r)]
+
+
+def shared_words(r: Mapping[str, Any]) -> list[str]:
+    """Return what :func:`words` says of the gas path and of all generators together."""
+    return [*_health_words(r), *_doubt_words(r)]
+
+
+def _health_words(r: Mapping[str, Any]) -> list[str]:
+    health, out = r["health"], []
     for c in health["changes"]:
         late = c["found_after"]
         block = "change missed" if late is None else "change found"
@@ -419,6 +486,11 @@ def words(r: Mapping[str, Any]) -> list[str]:
         out.append(TEXT.text("other", times=", ".join(f"{a:g}" for a in health["other_alarms"])))
     elif health["changes"]:
         out.append(TEXT.text("no other"))
+    return out
+
+
+def _cross_talk_words(r: Mapping[str, Any]) -> list[str]:
+    talk, out = r["cross_talk"], []
     for c in talk["short_circuit_on_health"]:
         n = max(HEALTH, key=lambda n: abs(c["change"][n]) / c["sigma"][n])
         values = {"change": 100 * c["change"][n], "sigma": 100 * c["sigma"][n]}
@@ -427,7 +499,11 @@ def words(r: Mapping[str, Any]) -> list[str]:
     for c in talk["health_on_h"]:
         n = max(c["change"], key=lambda n: abs(c["change"][n]))
         out.append(TEXT.text("h moved", name=n, of_n=c["change"][n], sigma_n=c["sigma"][n], **c))
-    out += [f"{s[:1].upper()}{s[1:]}." for s in compared_words(r.get("compared"))]
+    return out
+
+
+def _doubt_words(r: Mapping[str, Any]) -> list[str]:
+    out = [f"{s[:1].upper()}{s[1:]}." for s in compared_words(r.get("compared"))]
     out += [TEXT.text("doubt", why=d) for d in r.get("doubts", ())]
     parts = in_words(r.get("belief", {})) if r.get("doubts") else ""
     return [*out, TEXT.text("parts", parts=parts)] if parts else out
@@ -463,12 +539,18 @@ def draw(kept: Mapping[str, Any], path: Path, *, dpi: int | None = None) -> Path
     return files.save_figure(figure(kept), path, **({} if dpi is None else {"dpi": dpi}))
 
 
-def figure(kept: Mapping[str, Any]) -> Any:
-    """Return the matplotlib figure of :func:`saved` numbers: truth, estimate and band."""
+def figure(kept: Mapping[str, Any], number: int = 0) -> Any:
+    """Return the matplotlib figure of :func:`saved` numbers: truth, estimate and band.
+
+    Args:
+        kept: the numbers.
+        number: of the generator whose severities they are; 0 where one stands for all.
+    """
     from scenarios.figures.jointestimateplot import plot_joint_estimate
 
     r = kept["report"]
     curves = {n: series(v) for n, v in kept["curves"].items()}
     phases = [(p["name"], p["start"]) for p in r["phases"]]
-    note = TEXT.text("caption", **r) + " " + made_words(r)
+    of = f"Severities of generator {number}. " if number else ""
+    note = of + TEXT.text("caption", **r) + " " + made_words(r)
     return plot_joint_estimate(kept["t"], curves, phases=phases, alarms=kept["alarms"], note=note)

@@ -56,6 +56,7 @@ __all__ = [
     "View",
     "electrical_side",
     "loosened",
+    "with_field",
 ]
 
 PEAK = {"v": 325.0, "i": 461.0, "V_fd": 40.0, "i_fd": 590.0}  # at rated load, V and A
@@ -339,7 +340,7 @@ def electrical_side(
     machine, unknowns = apu.generator.machine, usual(unknowns, gain_errors)
     machine = dataclasses.replace(machine, eta_sg=machine.eta_sg / (1 + efficiency_error))
     if of_parameter(unknowns, "machine.r_fd").how != "known":
-        machine = _with_field(machine, measured, float(t[0]))
+        machine = with_field(machine, measured, float(t[0]))
     filters = _Filters(machine, sensors, measured, t, unknowns, gain_errors, step, backend)
     three, begin, K = filters.of(PHASES), float(t[0]), t.size
     eta = of_parameter(unknowns, EFFICIENCY).sigma
@@ -391,7 +392,7 @@ def _widen(severities: np.ndarray, beliefs: Beliefs, phase: np.ndarray, r_s: flo
     severities[1] = np.hypot(severities[1], r_s * severities[0])
 
 
-def _with_field(
+def with_field(
     machine: MachineParameters, measured: Mapping[str, np.ndarray], begin: float
 ) -> MachineParameters:
     """Return the machine with the field resistance that its voltage and current show.

@@ -151,17 +151,19 @@ def motion(of: Moving, walk: float, first: int) -> Motion:
     behind, most = np.zeros_like(of.h), np.full(of.h.shape, MOTION_SEEN)
     spans = np.zeros(of.t.size, dtype=int)
     for span in GROWTH_SPANS:
-        k = np.arange(max(first, span), of.t.size)
-        j = k - span
+        start = max(first, span)
+        if start >= of.t.size:
+            continue
+        k, j = slice(start, None), slice(start - span, of.t.size - span)  # views, not copies
         # weights over the samples j < i <= k; the mean is that over j <= i < k
         h, s0, s1, s2 = (x[:, k] - x[:, j] for x in sums)
         rise = span * of.h[:, k] - (h + of.h[:, j] - of.h[:, k])
-        spread = np.maximum(s2 - 2 * j * s1 + j**2 * s0, np.finfo(float).tiny)
+        spread = np.maximum(s2 - 2 * n[j] * s1 + n[j] ** 2 * s0, np.finfo(float).tiny)
         z2 = rise**2 / spread
         more = z2 > most[:, k]
-        most[:, k] = np.where(more, z2, most[:, k])
-        behind[:, k] = np.where(more, span * rise * of.variance[:, k] / spread, behind[:, k])
-        spans[k] = np.where((z2 > GROWTH_LEVEL).any(0) & (spans[k] == 0), span, spans[k])
+        np.copyto(most[:, k], z2, where=more)
+        np.copyto(behind[:, k], span * rise * of.variance[:, k] / spread, where=more)
+        np.copyto(spans[k], span, where=(z2 > GROWTH_LEVEL).any(0) & (spans[k] == 0))
     sure = np.flatnonzero(spans)
     if not sure.size:
         return Motion(None, 0, 0.0, behind)
