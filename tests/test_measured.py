@@ -168,8 +168,9 @@ def test_a_code_among_samples(value, words):
 
 def test_what_looks_wrong_is_told():
     """A transducer that clips, a channel that stands still while others move, all in kA."""
-    clipped = np.clip(I["i_a"], -250, 250)
-    data = read_recording({"t": t, "i_a": clipped, "i_b": I["i_b"]})
+    noisy = {n: v + np.random.default_rng(1).normal(0, 1, v.shape) for n, v in I.items()}
+    clipped = np.clip(noisy["i_a"], -250, 250)
+    data = read_recording({"t": t, "i_a": clipped, "i_b": noisy["i_b"]})
     assert next(n for n in data.notes if "clipped?" in n).startswith("arrays, column i_a: ")
     assert not any("i_b" in n for n in data.notes)
     noise = np.random.default_rng(1).standard_normal((2, 100))

@@ -103,7 +103,9 @@ def test_clipped_currents_of_few_samples_a_period():
     found = sequences(t, np.where(np.abs(slow) < 9.6, slow, np.nan))
     assert np.abs(found.unbalance).max() < 5 * found.sigma.max()
     digits = np.round(np.sin(2 * np.pi * 399.2 * t) * 300)  # no clipping: the top digit of a wave
-    assert not clipped(digits)
+    fast = np.sin(2 * np.pi * 399.2 * np.arange(5000) / 1e4) * 200
+    assert not clipped(digits) and not clipped(np.round(fast / 5) * 5)  # in runs, for all that
+    assert clipped(np.clip(np.round(fast / 5) * 5, -180, 180))
 
 
 # ------------------------------------------------------------------------------ channels

@@ -330,7 +330,7 @@ def test_offsets_are_states_estimated_or_considered(many):
     filt = gas_path_filter(GG, many.gas_path)
     assert {"bias_T5", "bias_T41", "T5", "T3", "EGT", "gain_EGT"} <= {*filt.model.x.names}
     assert "bias_P3" not in filt.model.x and "gain_f_gen" not in filt.model.x
-    assert filt.model.consider == ("bias_T41",)
+    assert filt.model.consider == ("bias_T41", "gain_J")
     assert (filt.sigma["bias_T5"], filt.sigma["bias_T41"]) == (3.0, 5.0)
     x = dict.fromkeys(filt.model.x.names, 0.0)
     x |= dict.fromkeys(HEALTH, 1.0) | {"N": GG.parameters.N, "T5": 900.0, "bias_T5": 7.0}

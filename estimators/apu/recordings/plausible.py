@@ -265,25 +265,30 @@ def stuck(values: np.ndarray, others: Sequence[np.ndarray]) -> tuple[int, int] |
     return (a - 1, a + n - 1) if moving and all(moving) else None
 
 
-PILED = (
-    8  # samples at the end of the range over those at the next value, of a transducer that clips
-)
+#: Samples at the end of the range over those at the next value, of a transducer that clips; and
+#: where digits are in runs. Of the highest two digits of a sinusoid the upper one has 2.4 times as
+#: many, 1/(sqrt(2) - 1).
+PILED, DIGITS = 8, 3
 
 
 def clipped(values: np.ndarray) -> int:
     """Return how many samples stand at the largest or lowest one, as a transducer clips.
 
-    They stand there in runs, or, of few samples a period, so often that digits do not explain it:
-    of the highest two digits of a sinusoid the upper one has 1/(sqrt(2) - 1) = 2.4 times as many.
+    They stand there so often that digits do not explain it.
     """
-    runs, piled, same = 0, 0, 1e-9 * float(np.nanmax(values) - np.nanmin(values))
+    count, same = 0, 1e-9 * float(np.nanmax(values) - np.nanmin(values))
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    steps = steps[steps > same]
+    # in digits all steps are whole ones
+    whole = steps / steps.min() if steps.size else steps
+    digits = bool(steps.size) and bool((abs(whole - np.round(whole)) < 1e-3).all())
     for end, sign in ((np.nanmax(values), 1), (np.nanmin(values), -1)):
         at = sign * (end - values) <= same
-        runs += int((at[1:] & at[:-1]).sum())
         rest = sign * values[~at & np.isfinite(values)]
         beside = int((rest >= rest.max() - same).sum()) if rest.size else 0
-        piled += int(at.sum()) if beside and at.sum() > PILED * beside else 0
-    count = max(runs, piled)
+        runs = int((at[1:] & at[:-1]).sum())
+        most = PILED if 4 * runs <= at.sum() else DIGITS if digits else 0
+        count += int(at.sum()) if beside and at.sum() > most * beside else 0
     return count if count >= 4 and count > 0.002 * values.size else 0
 
 
