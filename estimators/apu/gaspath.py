@@ -361,11 +361,9 @@ def gas_path_filter(
             deviation as prior; True: all but N and PW; False: none, they are believed.
         model_error: relative standard deviation of what maps and gas data are off; added to the
             gain errors, of which it cannot be told.
-        inertia: relative standard deviation of the inertia; None: known.
-            Without measured power there is nothing to estimate it from.
+        inertia: relative standard deviation of the inertia; None: known, as without measured power.
         consider_inertia: it is considered, not estimated: errors in measured power and fuel move
-            no rotor, and from a long steady recording an estimate learns them as inertia (a third
-            of it in 40 s).
+            no rotor, and an estimate takes them for inertia (a third of it in 40 steady seconds).
         eta: relative standard deviation of the generators' efficiency, as the state ``gain_PW``: PW
             as measured is 1 + gain_PW times PW; None: the efficiency is known.
         consider_eta: the efficiency is considered, not estimated.

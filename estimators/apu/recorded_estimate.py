@@ -213,40 +213,24 @@ def estimate(
     still = channels_still(m, table, ready.coarse)
     m = without_still(m, still, table)
     doubts = list[str]([*ready.doubts, *(s.doubt for s in still)])
-    sides: dict[int, ElectricalSide] = {}
-    found: dict[str, Sequences] = {}
     causes: dict[str, tuple[Causes, ...]] = {}
     gas, lacking = _beforehand(m, table, only)
     begin = float(m.streams("Wf")["Wf"][0][0]) if gas else -math.inf
+    sides: dict[int, ElectricalSide] = {}
+    found: dict[str, Sequences] = {}
     for k in machines_in(m) if only != "gaspath" and m.electrical else ():
         own = electrical_sensors.machine(k)
         waves = Waves(m.machine(k), k, unit_of(apu, k), own, how)
         found |= waves.sequences(lacking)
         if (side := waves.side(begin, lacking, doubts, notes, causes)) is not None:
             sides[k] = side
-    found_by, e = None, None
+    found_by = None
     fused_by = fusable(apu, sides, m.streams("Wf")["Wf"][0], notes) if gas else {}
     if gas:
-        given = ambient or {}, notes, doubts, backend, start
-        path = _GasPath(m, apu, table, *given)
-        try:
-            found_by = path.run(fused_by, electrical_sensors)
-        except EstimationError as error:
-            lacking[GAS] = f"{error}"
-            doubts.append(lost(error).of(GAS))
-            causes[GAS] = tuple(still_causes(still))
-    if found_by is not None:
-        filt, tracked = found_by
-        drifts = creep(filt, tracked, step=ROBUST, backend=backend)
-        found_of, odd = _causes_of(filt, tracked)
-        causes[GAS] = (*still_causes(still), *found_of)
-        doubts += about([*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd], GAS)
-        if drifts is not None:
-            wide = drifts.widened(tracked.result, drifts=not fused_by)
-            tracked = dataclasses.replace(tracked, result=wide)
-        e, found_by = gas_dataset(filt, tracked), (filt, tracked)
-        if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
-            notes.append("so few readings hardly show whether the model holds")
+        path = _GasPath(m, apu, table, ambient or {}, notes, doubts, backend, start)
+        found_by, odd = _followed(path, fused_by, electrical_sensors, sides, lacking)
+        causes[GAS] = (*still_causes(still), *odd)
+    e = None if found_by is None else gas_dataset(*found_by)
     balanced = None if only == "electrical" else _balanced(m, apu, table, start, doubts, causes)
     compared, alike = compared_sides(sides)[1:]
     doubts += alike
@@ -260,6 +244,35 @@ def estimate(
     end: Any = found_by and found_by[1].result, found_by, sides, causes, compared, belief, balanced
     machines = {k: side_dataset(s) for k, s in sides.items()}
     return RecordedEstimate(e, machines, found, bool(fused_by), lacking, *texts, *end)
+
+
+def _followed(
+    path: _GasPath,
+    fused_by: Mapping[int, ElectricalSide],
+    electrical_sensors: SensorSet,
+    sides: Mapping[int, ElectricalSide],
+    lacking: dict[str, str],
+) -> tuple[tuple[GasPathFilter, Tracked] | None, tuple[Causes, ...]]:
+    """Return the gas path's estimate, what creeps in its band, and the causes of its changes.
+
+    What is doubtful is appended to the path's doubts, why there is none to ``lacking``.
+    """
+    try:
+        filt, tracked = path.run(fused_by, electrical_sensors)
+    except EstimationError as error:
+        lacking[GAS] = f"{error}"
+        path.doubts.append(lost(error).of(GAS))
+        return None, ()
+    drifts = creep(filt, tracked, step=ROBUST, backend=path.backend)
+    causes, odd = _causes_of(filt, tracked)
+    doubts = [*gas_doubts(filt, tracked, [*sides.values()], drifts), *odd]
+    path.doubts.extend(about(doubts, GAS))
+    if drifts is not None:
+        wide = drifts.widened(tracked.result, drifts=not fused_by)
+        tracked = dataclasses.replace(tracked, result=wide)
+    if int(tracked.result.measured.sum()) < FEWEST * len(filt.model.y):
+        path.notes.append("so few readings hardly show whether the model holds")
+    return (filt, tracked), causes
 
 
 def _causes_of(filt: GasPathFilter, tracked: Tracked) -> tuple[tuple[Causes, ...], list[Doubt]]:
