@@ -65,6 +65,12 @@ def test_from_memory_in_three_lines():
         "dates": (WAVES.set_index(LATER), {}),
         "series": (pd.Series(I["i_a"], index=pd.to_timedelta(t, "s"), name="i_a [A]"), {}),
         "dataset": (xr.Dataset({n: ("time", v) for n, v in I.items()}, {"time": t}), {}),
+        "units in names": (
+            pd.DataFrame(
+                {f"{n} [mA]": 1e3 * v for n, v in I.items()}, index=pd.Index(t, name="t [s]")
+            ).to_xarray(),
+            {},
+        ),
         "array": (xr.DataArray(I["i_a"] / 1e3, {"time": t}, name="i_a", attrs={"units": "kA"}), {}),
     }
     for what, (source, how) in made.items():
