@@ -201,6 +201,8 @@ def dataset_columns(
         except Exception as e:  # attributes that are none, of any type
             raise DataError(f"{path}, variable {name}: {type(e).__name__}: {e}") from None
         unit = v.attrs.get("units")
-        called = (str(name), unit) if unit is not None else header(str(name))  # "T3 [K]"
-        out.append(typed(path, *called, values, tell))
+        called = str(name)
+        if unit is None:
+            called, unit = header(called)  # "T3 [K]"
+        out.append(typed(path, called, unit, values, tell))
     return out, others
