@@ -345,12 +345,16 @@ class MeanStep(Rebuilt):
         if self.constant:
             tables = [cached_table(ss, u, given, w_rated, h=dt * share / 4) for _, share in PANELS]
             series, self.harmonics = [t.even.ravel() for t in tables], 0
+            turn = None  # panels are shares of the step
         else:
-            coarse, fine = (2 * math.pi / n for n in STRIDES)
-            tables = [cached_table(ss, u, given, w_rated, angle=coarse)]
-            severe = harmonics >= FINE or _ripple(ss, tables[0]) > SEVERE
-            if severe:
-                tables = [cached_table(ss, u, given, w_rated, angle=fine)]
+            coarse, fine = STRIDES
+
+            def table_of(strides: int) -> Table:
+                return cached_table(ss, u, given, w_rated, angle=2 * math.pi / strides)
+
+            severe = harmonics >= FINE or _ripple(ss, table_of(coarse)) > SEVERE
+            turn = turn_of(dt, w_rated, fine if severe else coarse)
+            tables = [table_of(turn.strides)]
             least = max(harmonics, tables[0].harmonics)
             fit = (FINE,) if severe else HARMONICS
             self.harmonics = next((k for k in fit if k >= least), 0)
@@ -363,9 +367,6 @@ class MeanStep(Rebuilt):
             series = [part.ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
         self.parameters = np.concatenate([*series, self._range])
-        turn = None  # panels are shares of the step
-        if not self.constant:
-            turn = turn_of(dt, w_rated, STRIDES[self.harmonics >= FINE])
         self.layout = (ss.shared, self.quad, turn, self.harmonics)
         self.advance = _function(*self.layout)
         drive = DRIVE_TOL["constant" if self.constant else "periodic"]

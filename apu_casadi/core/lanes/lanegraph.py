@@ -72,7 +72,6 @@ class _Places:
 
     def __init__(self, graph: _Graph) -> None:
         self.most = 0  # work in all
-        self._graph = graph
         self._at: dict[int, int] = {}  # where a vector stands, by CasADi's number of it
         self._taken: dict[int, tuple[int, int]] = {}  # first: (end, last instruction that reads)
         self._need: dict[int, tuple[int, int]] = {}  # by number: size, last instruction

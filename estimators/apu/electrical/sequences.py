@@ -130,10 +130,15 @@ def _share(t: np.ndarray, x: np.ndarray, f: float) -> float:
     there = np.isfinite(x)
     if there.all():
         return math.sqrt(2 / x.size)
-    w = 2 * math.pi * f * (t - t[0])
-    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+    basis = _sinusoid(t, f)
     each = [np.linalg.pinv(basis[r].T @ basis[r], hermitian=True) for r in there]
     return math.sqrt(sum(c[0, 0] + c[1, 1] for c in each) / 2) / 3
+
+
+def _sinusoid(t: np.ndarray, f: float) -> np.ndarray:
+    """Return the basis of a phasor and a constant at instants t, s, of frequency f, Hz: (K, 3)."""
+    w = 2 * math.pi * f * (t - t[0])
+    return np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
 
 
 def _even(t: np.ndarray, x: np.ndarray, f: float) -> bool:
@@ -142,8 +147,7 @@ def _even(t: np.ndarray, x: np.ndarray, f: float) -> bool:
     Of few samples a period, 400 Hz at 1 kHz, those that are clipped are always at the same angles;
     what is left beside them is chosen by its noise and may fit any sinusoid.
     """
-    w = 2 * math.pi * f * (t - t[0])
-    basis = np.column_stack([np.cos(w), -np.sin(w), np.ones_like(w)])
+    basis = _sinusoid(t, f)
     each = [basis[r] for r in np.isfinite(x)]
     if min(np.linalg.matrix_rank(b) for b in each) < basis.shape[1]:
         return False
