@@ -32,6 +32,7 @@ from apu_casadi.machine.propagation import hoisted, leap
 from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import (
     NODES,
+    NODES_BY_ANGLE,
     Table,
     cached_table,
     nominal_entries,
@@ -397,7 +398,7 @@ class MeanStep(Rebuilt):
             parts = [np.tile(even, len(PANELS) * NODES)]
         else:
             terms = self.harmonics + 2, self.harmonics
-            parts = [np.tile(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
+            parts = [np.tile(e, NODES_BY_ANGLE * n) for e, n in zip((even, odd), terms, strict=True)]
         return np.concatenate([*parts, np.zeros(2)])
 
     def expect(self, jump: float) -> None:

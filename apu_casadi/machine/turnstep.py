@@ -25,7 +25,7 @@ from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import exciter_step, hoisted
 from apu_casadi.machine.settling import settled
-from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
+from apu_casadi.machine.transition import EXTRA, NODES_BY_ANGLE, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through
 
 #: Strides in a turn, where coefficients are periodic: 14 in a period of what ripples, or 28 where a
@@ -99,11 +99,11 @@ def _matrices(
     for odd, entries in enumerate((kinds.even.size, kinds.odd.size)):
         terms = 2 * (harmonics // 2 + (not odd))
         size = terms * entries
-        own = ca.reshape(series[first : first + NODES * size], size, NODES)
-        now = ca.mtimes(own, _powers(s, NODES))
+        own = ca.reshape(series[first : first + NODES_BY_ANGLE * size], size, NODES_BY_ANGLE)
+        now = ca.mtimes(own, _powers(s, NODES_BY_ANGLE))
         turned = _turned(terms // 2, half, odd=bool(odd))(theta0)
         values.append(ca.mtimes(ca.reshape(now, entries, terms), turned))
-        first += NODES * size
+        first += NODES_BY_ANGLE * size
     order = np.argsort(np.append(kinds.even, kinds.odd)).tolist()
     made = []
     for even, odd in zip(*(ca.horzsplit(v) for v in values), strict=True):
@@ -538,7 +538,7 @@ def periodic_step(
     at, kinds = split(ss), parity(ss, 1)
     n = len(at.linear)
     trigs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
-    size = NODES * 2 * (trigs[0] * kinds.even.size + trigs[1] * kinds.odd.size)
+    size = NODES_BY_ANGLE * 2 * (trigs[0] * kinds.even.size + trigs[1] * kinds.odd.size)
     X0, U, TH = (ca.MX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True))
     parameters, DT = ca.MX.sym("series", size + 2), ca.MX.sym("dt")
     w, V_ref = U[ss.u.index("w_r")], U[ss.u.index("V_ref")]
