@@ -424,7 +424,8 @@ def test_sigterm_ends_a_campaign_as_ctrl_c_does(tmp_path):
     assert not (tmp_path / campaigns.DATASET).exists()
     subprocess.run(line, check=True)
     again = results.load(tmp_path / campaigns.DATASET)
-    assert same(again, run_campaign(random_faults(6), workers=1))
+    whole = run_campaign(random_faults(6), workers=1)
+    assert same(again, cf.described(whole, "campaign of 6 runs"))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Loads and faults that change in time, propagated with interpolated tables, against CVODES."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from apu_casadi.core.profiles.points import Points
 from apu_casadi.core.profiles.profile import at, varying
 from apu_casadi.core.profiles.shapes import Growth, Ramp
 from apu_casadi.machine import transition
-from apu_casadi.machine.course import Course, Piece
+from apu_casadi.machine.course import TERMS, Course, Piece
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -64,7 +65,7 @@ def followed(load, fault, begin, steps=6, waves=False):
     off, seen = {}, 0.0
     for k in range(steps):
         fast, now = course.numbers(t[k : k + 1], t[k - 1] if k else None)
-        fast.put(now.vector[:, 0], now.theta[:, 0])
+        fast.put(now.vector, now.theta[:, 0])
         here, there = at(load, t[k]), at(fault, t[k])
         u, theta = GEN.inputs(here, V_ref=V_ref, w_r=W), GEN.fault_vector(here, there)
         given = now.u[:, 0].copy()
@@ -129,11 +130,12 @@ def test_what_changes_too_fast_or_in_structure_is_left_to_others():
     fast = varying(SeriesLoad.from_power, Ramp(100e3, 200e3, over=0.1), 0.9)
     course = course_of(fast, None, end=2.0)
     course.numbers(np.array([0.05]))
+    assert course.numbers(np.array([0.05, 0.07]))[1].u.shape[1] == 1  # the second is a jump
     with pytest.raises(NotApplicable, match=r"change by .* of the transition matrices in a step"):
-        course.numbers(np.array([0.05, 0.07]))
-    with pytest.raises(NotApplicable, match="in a step"):
-        course.numbers(np.array([0.05]), 0.03)
+        course.numbers(np.array([0.07]), 0.05)
     assert course.numbers(np.array([1.0]), 0.98)[1].u.shape[1] == 1  # constant at the end
+    with pytest.raises(NotApplicable, match="in a step"):  # across the bend before it
+        course.numbers(np.array([0.11]), 0.09)
     going = varying(Ttsc, Ramp(0.05, 0.0, over=10.0), 20.0)
     gone = course_of(KW100, going, end=20.0)
     with pytest.raises(NotApplicable, match="turns into generator_resistive_healthy"):
@@ -142,31 +144,36 @@ def test_what_changes_too_fast_or_in_structure_is_left_to_others():
 
 
 def test_numbers_of_many_steps_are_those_of_each():
-    """Columns, also across the pieces of a bent course."""
+    """Columns of as many steps as lie before a bend of the course."""
     bent = varying(SeriesLoad.from_power, Ramp(100e3, 101e3, over=5.0, after=1.0))
     course = course_of(bent, None, end=60.0)
-    t = 0.9 + DT * (np.arange(10) + 0.5)
-    _, many = course.numbers(t)
-    for k in range(10):
-        one = course.numbers(t[k : k + 1])[1]
-        for a, b in zip(one, many, strict=True):
+    t = 0.9 + DT * (np.arange(40) + 0.5)
+    _, before = course.numbers(t)
+    assert before.u.shape[1] == 5 == before.basis.shape[1]
+    assert math.isclose(before.u[2, 0], KW100.R[0], rel_tol=1e-9)
+    fast, many = course.numbers(t[5:], t[4])
+    assert many.u.shape[1] == 35
+    for k in range(35):
+        one = course.numbers(t[5 + k : 6 + k])[1]
+        off = np.abs(many.terms @ many.basis[:, k] - one.vector)
+        assert (off * fast.units).max() < 1e-11
+        for a, b in zip(one[2:], many[2:], strict=True):
             assert_allclose(a[:, 0], b[:, k], rtol=1e-13)
-    assert math.isclose(many.u[2, 0], KW100.R[0], rel_tol=1e-9)
 
 
-def test_numbers_in_blocks_are_those_of_all_steps():
-    """Polynomials of a low degree over a part of an interval, or none, are told to 1e-12."""
+def test_polynomials_of_a_low_degree_are_told_to_their_error():
+    """Over a part of an interval, or none; else there are none."""
     x = np.linspace(-1.0, 1.0, 9)
     made = np.polynomial.chebyshev.chebfit(x, np.array([np.exp(x), 2.0 + np.sin(3 * x)]).T, 8)
     piece = Piece(SimpleNamespace(), 10.0, 5.0, made, np.ones(2), *np.zeros((2, 2)))
     s = np.linspace(11.0, 11.02, 7)
-    near = piece.near(s[0], s[-1])
-    assert near.powers.shape == (5, 2)
-    assert_allclose(near.at(s), piece.at(s), rtol=1e-12)
-    assert piece.near(6.0, 14.0) is piece
-    alike = piece.near(11.0, 11.0)
-    assert alike.powers.shape == (1, 2)
-    assert_allclose(alike.at(s[:1]), piece.at(s[:1]), rtol=0)
+    terms, basis = piece.near(s, 2)
+    assert terms.shape == (2, TERMS)
+    assert basis.shape == (TERMS, 7)
+    assert_allclose((terms @ basis).T, piece.at(s, [0, 1]), rtol=1e-11)
+    assert piece.near(np.linspace(6.0, 14.0, 7), 2) is None
+    terms, basis = piece.near(np.array([11.0, 11.0]), 1)
+    assert_allclose((terms @ basis).T, piece.at(np.array([11.0, 11.0]), [0]), rtol=0)
 
 
 def test_tables_are_made_once_for_all_runs(monkeypatch):
@@ -186,12 +193,15 @@ def test_tables_are_made_once_for_all_runs(monkeypatch):
         assert (len(made) > before) == bool(least)
 
 
-def test_pieces_of_unequal_harmonics_go_on_by_single_steps(monkeypatch):
-    """Two pieces of one layout whose tables have more or fewer harmonics: no block of both."""
-    fast = SimpleNamespace(layout=("same",), smooth=1.0, spike=1.0)
+def test_steps_end_with_the_piece_that_their_tables_are_of(monkeypatch):
+    """Two pieces of one layout whose tables have more or fewer harmonics: no steps of both."""
+    fast = SimpleNamespace(layout=("same",), smooth=1.0, spike=1.0, vector=np.zeros(3))
+    fast.expect, fast.theta = lambda _: None, np.zeros(0)
     pieces = {k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), *np.zeros((3, 2))) for k in (0, 1)}
+    pieces = {k: replace(p, weights=np.zeros(5 + k)) for k, p in pieces.items()}
     course = object.__new__(Course)
-    course._only, course.ss = None, SimpleNamespace(name="model")
+    course._only, course._likely, course.fault = None, 99, None
+    course.ss = SimpleNamespace(name="model", x=[], u=[0])
     monkeypatch.setattr(course, "_piece", lambda s: pieces[int(s)], raising=False)
-    with pytest.raises(NotApplicable, match="model: the structure changes on the way"):
-        course.numbers(np.array([0.9, 1.1]))
+    t = np.array([0.8, 0.9, 1.1, 1.2])
+    assert [course.numbers(part)[1].basis.shape[1] for part in (t, t[2:])] == [2, 2]

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,31 +35,50 @@ from apu_casadi.machine.propagation import Propagator
 DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
 TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
 DEEPEST = 16  # times that an interval may be halved
+TERMS = 4  # of polynomials that steps are given, each for as many steps as it fits ...
+_EQUAL = 1e-11  # ... to this error, as of ``TOL``
+_INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 #: Products of numbers up to which BLAS does not start threads; with them, waiting takes longer.
 _ONE_THREAD = 250_000
-_NEAR = (2, 4)  # degrees of polynomials over a small part of an interval, the first enough ...
-_EQUAL = 1e-12  # ... and their largest error, as of ``TOL``
-_INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 
 F = TypeVar("F", MeanStep, Propagator)
-#: Where the next block's vectors are to be written, (numbers, steps) column by column; None: apart.
-Into: TypeAlias = Callable[[], np.ndarray | None]
 
 
 class Numbers(NamedTuple):
-    """What steps take, one column each.
+    """What steps take, one column each but for the first.
 
     Args:
-        vector: numbers of what propagates (:attr:`MeanStep.vector`), (numbers, steps).
+        terms: numbers of what propagates (:attr:`MeanStep.vector`) as polynomials,
+            (numbers, ``TERMS``).
+        basis: their terms in each step, (``TERMS``, steps).
         u: inputs, (nu, steps); speed, reference and noise among them do not count.
         theta: parameters as compiled functions take them, (ntheta, steps).
         severity: of the fault, in the order of its ``severities``, (severities, steps).
     """
 
-    vector: np.ndarray
+    terms: np.ndarray
+    basis: np.ndarray
     u: np.ndarray
     theta: np.ndarray
     severity: np.ndarray
+
+    @property
+    def vector(self) -> np.ndarray:
+        """Numbers of what propagates in the first step."""
+        return np.asarray(self.terms @ self.basis[:, 0])
+
+    @classmethod
+    def alike(cls, vector: np.ndarray, steps: int, *each: np.ndarray) -> Numbers:
+        """Return those of steps that are all alike: u, theta and severity are given."""
+        columns = (np.repeat(a[:, None], steps, axis=1) for a in each)
+        return cls(*_constant(vector, steps), *columns)
+
+
+def _constant(vector: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``terms`` and ``basis`` of numbers that do not change."""
+    terms, basis = np.zeros((vector.size, TERMS), order="F"), np.zeros((TERMS, steps))
+    terms[:, 0], basis[0] = vector, 1.0
+    return terms, basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,34 +101,16 @@ class Piece(Generic[F]):
     weights: np.ndarray
     nodes: np.ndarray
     rates: np.ndarray
-    buffers: dict[tuple[int, int], np.ndarray] = field(default_factory=dict, repr=False)
 
-    def at(self, s: np.ndarray) -> np.ndarray:
-        """Return all numbers at values of the coordinate, (numbers, steps).
+    def __contains__(self, s: float) -> bool:
+        return abs(s - self.middle) <= self.half * (1 + 2 * _INSIDE)
 
-        The next call for as many steps overwrites them: new memory costs as much as the sums.
-        """
-        basis = self.basis(s)
-        return self.summed(basis, self.room(s.size, self.powers.shape[1]).T).T
-
-    def room(self, steps: int, numbers: int) -> np.ndarray:
-        """Return memory that is used again, (numbers, steps), column by column."""
-        key = steps, numbers
-        if key not in self.buffers:
-            self.buffers[key] = np.empty(key)
-        return self.buffers[key].T
-
-    def summed(self, basis: np.ndarray, made: np.ndarray) -> np.ndarray:
-        """Sum the first numbers by polynomials at some values into ``made``, (steps, numbers)."""
-        size = max(1, _ONE_THREAD // basis.size)
-        for k in range(0, made.shape[1], size):
-            part = made[:, k : k + size]
-            np.matmul(basis, self.powers[:, k : k + part.shape[1]], out=part)
-        return made
-
-    def some(self, s: np.ndarray, columns: list[int]) -> np.ndarray:
+    def at(self, s: np.ndarray, columns: slice | list[int]) -> np.ndarray:
         """Return some of the numbers at values of the coordinate, (steps, columns)."""
-        made: np.ndarray = self.basis(s) @ self.powers[:, columns]
+        basis, powers = self.basis(s), self.powers[:, columns]
+        made, size = np.empty((s.size, powers.shape[1])), max(1, _ONE_THREAD // basis.size)
+        for k in range(0, made.shape[1], size):
+            np.matmul(basis, powers[:, k : k + size], out=made[:, k : k + size])
         return made
 
     def basis(self, s: np.ndarray) -> np.ndarray:
@@ -118,28 +119,25 @@ class Piece(Generic[F]):
         made: np.ndarray = np.cos(np.arccos(x)[:, None] * np.arange(self.powers.shape[0]))
         return made
 
-    def near(self, low: float, high: float) -> Piece[F]:
-        """Return polynomials of a low degree over a part of the interval, or itself.
+    def near(self, s: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the first numbers at values of the coordinate by polynomials of a low degree.
 
-        They take less sums, for many values that lie near each other, and must be equal to
-        ``_EQUAL``.
+        Returns:
+            ``terms`` and ``basis`` of :class:`Numbers`; None where these are not equal to
+            ``_EQUAL``.
         """
+        low, high = float(s.min()), float(s.max())
         middle, half = (low + high) / 2, (high - low) / 2
+        numbers = slice(0, count)
         if not half > 0:
-            powers = self.at(np.array([middle])).T.copy()
-            return replace(self, middle=middle, half=1.0, powers=powers, buffers={})
-        between = np.array([-0.8, 0.3])
-        for degree in _NEAR:
-            if self.powers.shape[0] <= degree + 1:
-                return self
-            nodes = _lobatto(degree)
-            values = self.at(middle + half * np.append(nodes, between)).T
-            fit = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree))
-            powers = fit @ values[: degree + 1]
-            here = np.polynomial.chebyshev.chebvander(between, degree) @ powers
-            if (np.abs(here - values[degree + 1 :]) * self.weights).max() <= _EQUAL:
-                return replace(self, middle=middle, half=half, powers=powers, buffers={})
-        return self
+            return _constant(self.at(s[:1], numbers)[0], s.size)
+        values = self.at(middle + half * _NEAR, numbers)
+        terms = _FIT @ values[:TERMS]
+        off = np.abs(_CHECK @ terms - values[TERMS:]) * self.weights[numbers]
+        if off.max() > _EQUAL:
+            return None
+        basis = np.polynomial.chebyshev.chebvander((s - middle) / half, TERMS - 1)
+        return terms.T, basis.T
 
 
 class Course(Generic[F]):
@@ -182,6 +180,7 @@ class Course(Generic[F]):
             bends: set[float] = {t for x in parts for t in x.corners(end)}
             self._ends = [begin, *sorted(t for t in bends if t > begin), end]
         self._pieces: dict[tuple[float, float], Piece[F] | str | None] = {}
+        self._likely = 1 << 20  # steps that one polynomial may well fit
 
     # -- the coordinate -------------------------------------------------------------------------
 
@@ -198,106 +197,85 @@ class Course(Generic[F]):
     # -- numbers --------------------------------------------------------------------------------
 
     def numbers(self, t: np.ndarray, before: float | None = None) -> tuple[F, Numbers]:
-        """Return what propagates over steps whose middles are ``t``, s, and its numbers.
-
-        The next call overwrites the numbers.  Arguments and errors as of :meth:`blocks`.
-        """
-        fast, blocks = self.blocks(t, before, t.size, apart)
-        return fast, next(blocks)
-
-    def blocks(
-        self, t: np.ndarray, before: float | None, width: int, into: Into
-    ) -> tuple[F, Iterator[Numbers]]:
-        """Return what propagates over steps, and its numbers in blocks.
+        """Return what propagates over the first of some steps, as many as go together.
 
         Args:
             t: middles of the steps, s.
             before: the middle of the step before them, if the first goes on from it.
-            width: steps in a block, whose numbers the next one overwrites.
-            into: see ``Into``.
+
+        Returns:
+            What propagates, and its numbers in as many steps as polynomials of ``TERMS`` terms fit;
+            they have the first at least.
 
         Raises:
-            NotApplicable: the numbers change too fast from step to step, have no polynomial, or
-                those of the steps differ in structure.
+            NotApplicable: the numbers change too fast from step to step, or have no polynomial.
         """
         s = self._coordinate(np.asarray(t, dtype=float))
-        pieces = [self._piece(float(v)) for v in (s.min(), s.max())]
-        alone = pieces[0] is pieces[1]
-        pieces = pieces[:1] if alone else [self._piece(float(v)) for v in s]
-        fast, size = pieces[0].fast, pieces[0].powers.shape[1]
-        # as many harmonics of the rotor angle, too, which a layout need not tell
-        if any(p.fast.layout != fast.layout or p.powers.shape[1] != size for p in pieces[1:]):
-            raise NotApplicable(f"{self.ss.name}: the structure changes on the way")
-        first = s[0] if before is None else self._coordinate(np.array([before]))[0]
-        jump = self._jump(pieces, s, float(first))
-        if jump > fast.smooth:
+        piece = self._piece(float(s[0]))
+        if not (float(s.min()) in piece and float(s.max()) in piece):
+            s = s[: next(k for k, v in enumerate(s) if k and float(v) not in piece)]
+        a, fast = piece.fast.vector.size, piece.fast
+        count = most = min(s.size, self._likely)
+        while (near := piece.near(s[:count], a)) is None:
+            count = (count + 1) // 2
+        self._likely = max(2 * count, self._likely if count == most else 0)
+        first = s[0] if before is None else float(self._coordinate(np.array([before]))[0])
+        s = s[: self._smooth(piece, s[:count], first)]
+        rest = piece.at(s, slice(a, None)).T
+        b, c = len(self.ss.u), len(self.ss.u) + fast.theta.size
+        terms, basis = near[0], near[1][:, : s.size]
+        return fast, Numbers(terms, basis, rest[:b], rest[b:c], rest[c:])
+
+    def _smooth(self, piece: Piece[F], s: np.ndarray, first: float) -> int:
+        """Return how many steps change smoothly enough, of which ``first`` is before.
+
+        Raises:
+            NotApplicable: not even the first.
+        """
+        fast, own = piece.fast, piece
+        if first not in piece:
+            try:
+                own = self._piece(first)
+            except NotApplicable:  # a model of its own, or none
+                own = piece
+        jumps, spikes = self._jumps(own, piece, s, first), self._spikes(own, piece, s, first)
+        rough = np.flatnonzero((jumps > fast.smooth) | (spikes > fast.spike))
+        count = int(rough[0]) if rough.size else s.size
+        if not count and jumps[0] > fast.smooth:
             raise NotApplicable(
-                f"{self.ss.name}: load or fault change by {jump:.1e} of the transition matrices "
-                f"in a step, {fast.smooth:g} at most"
+                f"{self.ss.name}: load or fault change by {jumps[0]:.1e} of the transition "
+                f"matrices in a step, {fast.smooth:g} at most"
             )
-        fast.expect(jump)
-        spike = self._spike(pieces, s, float(first))
-        if spike > fast.spike:
+        if not count:
             raise NotApplicable(
-                f"{self.ss.name}: the fault's resistance changes by a voltage of {spike:.1e} of "
-                f"the phase's in a step, {fast.spike:g} at most"
+                f"{self.ss.name}: the fault's resistance changes by a voltage of {spikes[0]:.1e} "
+                f"of the phase's in a step, {fast.spike:g} at most"
             )
-        if alone:
-            one = pieces[0].near(float(s.min()), float(s.max())) if s.size > width else pieces[0]
-            pieces = [one] * s.size
-        return fast, self._blocks(pieces, s, width, into)
+        fast.expect(float(jumps[:count].max()))
+        return count
 
-    def _blocks(
-        self, pieces: list[Piece[F]], s: np.ndarray, width: int, into: Into
-    ) -> Iterator[Numbers]:
-        """Yield the numbers of steps, each of its piece."""
-        fast, first = pieces[0].fast, pieces[0]
-        a = fast.vector.size
-        b, c = (n - a for n in (a + len(self.ss.u), a + len(self.ss.u) + fast.theta.size))
-        alone = all(p is first for p in pieces)
-        if alone:  # all but the long vectors at once
-            basis = first.basis(s)
-            rest = (basis @ first.powers[:, a:]).T
-        for k in range(0, s.size, width):
-            at = slice(k, k + width)
-            if alone:
-                room = into()
-                vector = first.room(s[at].size, a) if room is None else room
-                first.summed(basis[at], vector.T)
-                more = rest[:, at]
-            else:
-                each = zip(pieces[at], s[at, None], strict=True)
-                values = np.concatenate([p.at(v).copy() for p, v in each], axis=1)
-                vector, more = values[:a], values[a:]
-            yield Numbers(vector, more[:b], more[b:c], more[c:])
+    @staticmethod
+    def _jumps(before: Piece[F], piece: Piece[F], s: np.ndarray, first: float) -> np.ndarray:
+        """Return bounds of the largest change of a transition matrix in each step."""
+        moved = np.abs(np.diff(s, prepend=first))
+        rates = np.interp(s, piece.nodes, piece.rates)
+        rates[0] = max(rates[0], np.interp(first, before.nodes, before.rates))
+        return np.asarray(rates * moved)
 
-    def _jump(self, pieces: list[Piece[F]], s: np.ndarray, first: float) -> float:
-        """Return a bound of the largest change of a transition matrix from step to step."""
-        moved = s.copy()
-        moved[0] -= first
-        moved[1:] -= s[:-1]
-        rates = (np.interp(s, p.nodes, p.rates) for p in (pieces[0], pieces[-1]))
-        return float((np.maximum(*rates) * np.abs(moved)).max())
-
-    def _spike(self, pieces: list[Piece[F]], s: np.ndarray, first: float) -> float:
-        """Return the largest jump of a fault loop's voltage from step to step, of the phase's.
+    def _spikes(self, before: Piece[F], piece: Piece[F], s: np.ndarray, first: float) -> np.ndarray:
+        """Return the jump of a fault loop's voltage in each step, of the phase's.
 
         Where the loop's current is a state of its own the terminal voltage shows it, until the
         current has followed: within L/R, which no sample of the exciter's input resolves.
         """
         if "i_fault" not in self.ss.x or not isinstance(self.fault, Varying):
-            return 0.0
+            return np.zeros(s.size)
         names = list(self._made(self.fault, float(s[0])).severity)
         columns = [names.index(n) - len(names) for n in ("mu", "k_rf")]
-        at = np.append(first, s)
-        if len(pieces) == 1:
-            rows = pieces[0].some(at, columns)
-        else:
-            each = pieces[:1] + pieces
-            rows = np.array([p.some(v, columns)[0] for p, v in zip(each, at[:, None], strict=True)])
-        mu, k_rf = rows.T
+        rows = [before.at(np.array([first]), columns), piece.at(s, columns)]
+        mu, k_rf = np.concatenate(rows).T
         R = k_rf + 1 - mu  # of r_s: the fault's, and that of the turns
-        return float((mu[1:] * np.abs(np.diff(R)) / R[1:]).max())
+        return np.asarray(mu[1:] * np.abs(np.diff(R)) / R[1:])
 
     def _piece(self, s: float) -> Piece[F]:
         """Return the polynomials around a value of the coordinate, made when first asked for."""
@@ -370,10 +348,13 @@ class Course(Generic[F]):
         return made[x]
 
 
-def apart() -> None:
-    """Write the vectors of blocks to memory of their own; an ``Into``."""
-
-
 def _lobatto(degree: int) -> np.ndarray:
     """Chebyshev-Lobatto nodes of [-1, 1], increasing; those of twice the degree hold them."""
     return np.asarray(-np.cos(np.pi * np.arange(degree + 1) / degree))
+
+
+#: Places in [-1, 1] of values that a polynomial of ``TERMS`` terms goes through, and some between.
+_NODES, _BETWEEN = _lobatto(TERMS - 1), np.array([-0.8, 0.3])
+_NEAR = np.append(_NODES, _BETWEEN)
+_FIT = np.linalg.inv(np.polynomial.chebyshev.chebvander(_NODES, TERMS - 1))
+_CHECK = np.polynomial.chebyshev.chebvander(_BETWEEN, TERMS - 1)

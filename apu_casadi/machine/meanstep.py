@@ -398,7 +398,9 @@ class MeanStep(Rebuilt):
             parts = [np.tile(even, len(PANELS) * NODES)]
         else:
             terms = self.harmonics + 2, self.harmonics
-            parts = [np.tile(e, NODES_BY_ANGLE * n) for e, n in zip((even, odd), terms, strict=True)]
+            parts = [
+                np.tile(e, NODES_BY_ANGLE * n) for e, n in zip((even, odd), terms, strict=True)
+            ]
         return np.concatenate([*parts, np.zeros(2)])
 
     def expect(self, jump: float) -> None:

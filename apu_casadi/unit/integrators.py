@@ -13,9 +13,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import repeat
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import casadi as ca
@@ -29,7 +27,7 @@ from apu_casadi.core.signals import Signal, Signals
 from apu_casadi.core.simulation import stepper
 from apu_casadi.core.statespace import StateSpace
 from apu_casadi.machine.collocated import Collocated
-from apu_casadi.machine.course import Course, Into, Numbers, apart
+from apu_casadi.machine.course import Course, Numbers
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.meanstep import MeanStep
@@ -179,15 +177,11 @@ class Integrator:
         """Return what propagates, where many steps may be one function; else NotApplicable."""
         raise NotApplicable("exact propagation does not hold, or is not asked for")
 
-    def columns(
-        self, t: np.ndarray, before: float, width: int, into: Into
-    ) -> tuple[MeanStep | Propagator, Iterator[Numbers]]:
-        """Return what propagates over steps with these middles, s, and its numbers.
+    def numbers(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
+        """Return what propagates over the first of steps with these middles, and its numbers.
 
         Args:
             before: middle of the step before, s.
-            width: steps of which numbers come at once.
-            into: where they go.
         """
         raise NotApplicable("exact propagation does not hold, or is not asked for")
 
@@ -240,26 +234,21 @@ class _Exact(Integrator, Generic[F]):
     def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> F:
         raise NotImplementedError
 
-    def _numbers(
-        self, t: np.ndarray, before: float, width: int, into: Into
-    ) -> tuple[F, Iterator[Numbers]]:
-        """Return what propagates along the way over steps with these middles, s."""
+    def _numbers(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
+        """Return what propagates over the first of steps along the way, and its numbers."""
         assert self._way is not None
         if self._course is None:
             p, (load, fault, begin, end) = self.phase, self._way
             self._course = Course(p.gen, p.ss, load, fault, self._prepare, end, begin)
-        return self._course.blocks(t, before, width, into)
+        return self._course.numbers(t, before)
 
-    def columns(
-        self, t: np.ndarray, before: float, width: int, into: Into
-    ) -> tuple[F, Iterator[Numbers]]:
-        """Return what propagates over steps with these middles, s, and its numbers."""
+    def numbers(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
+        """Return what propagates over the first of steps with these middles, and its numbers."""
         if self._way is not None:
-            return self._numbers(t, before, width, into)
+            return self._numbers(t, before)
         fast, p = self.for_blocks(), self.phase
         severity = () if p.fault is None else tuple(p.fault.severity.values())
-        each = (fast.vector, p.u, fast.theta, np.array(severity))
-        return fast, repeat(Numbers(*(np.repeat(a[:, None], width, axis=1) for a in each)))
+        return fast, Numbers.alike(fast.vector, t.size, p.u, fast.theta, np.array(severity))
 
     def fast(self) -> F:
         """Return what propagates.
@@ -292,9 +281,8 @@ class _Exact(Integrator, Generic[F]):
             return self.fast()
         middle = step.t0 + step.h / 2
         before = middle - min(step.since, step.h)
-        fast, numbers = self._numbers(np.array([middle]), before, 1, apart)
-        now = next(numbers)
-        fast.put(now.vector[:, 0], now.theta[:, 0])
+        fast, now = self._numbers(np.array([middle]), before)
+        fast.put(now.vector, now.theta[:, 0])
         return fast
 
 
@@ -370,11 +358,9 @@ class Samples(_Exact[Propagator]):
         """Return what propagates, where the coefficients are constant."""
         return _constant(self.fast())
 
-    def columns(
-        self, t: np.ndarray, before: float, width: int, into: Into
-    ) -> tuple[Propagator, Iterator[Numbers]]:
+    def numbers(self, t: np.ndarray, before: float) -> tuple[Propagator, Numbers]:
         """Return what propagates over steps, where the coefficients are constant."""
-        fast, now = super().columns(t, before, width, into)
+        fast, now = super().numbers(t, before)
         return _constant(fast), now
 
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

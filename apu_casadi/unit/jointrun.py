@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -27,12 +27,13 @@ from apu_casadi.unit.apu import Apu, JointPoint
 from apu_casadi.unit.events import Event, FaultChange, Holding, Jump, LoadChange
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 from apu_casadi.unit.integrators import Settings
-from apu_casadi.unit.jointstep import BLOCK, LONG, BlockResult, UnitState
+from apu_casadi.unit.jointstep import BLOCK, COURSE, ROW, BlockResult, UnitState
 from apu_casadi.unit.machines import Inputs, Machines
 from apu_casadi.unit.machinestep import MachineMade
 from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Row
 
+_Way: TypeAlias = Callable[[int], tuple[int, Row]]  # from an instant on: steps, and what they gave
 STARTS = 16  # steady points of starts that are kept for a unit
 
 
@@ -196,18 +197,30 @@ class JointRun:
         if self._by_blocks:
             free = int(np.searchsorted(grid, until + SAME_INSTANT, side="right")) - 1
             free = min(free, int(self._odd[np.searchsorted(self._odd, k)])) - k
-            waves = self.settings.waveform_dt is not None
-            together = asking()  # a question then, which nothing may come before
-            most = BLOCK if waves or self.asked.strict or (together and self._changing) else LONG
-            first = min(free, most) // BLOCK * BLOCK
-            sizes = [first] if together else dict.fromkeys((first, BLOCK))
-            tries = [partial(self._blocks, steps=n) for n in sizes if 0 < n <= free]
-            if not (waves or self._changing):
-                tries.append(partial(self._one_by_one, steps=min(max(1, free), BLOCK - 1)))
+            waves, together = self.settings.waveform_dt is not None, asking()
+            tries = self._tries(free, waves=waves, together=together)
             ways[:0] = [partial(self._once, i, way) for i, way in enumerate(tries)]
         return first_able(ways, k)
 
-    def _once(self, way: int, call: Callable[[int], tuple[int, Row]], k: int) -> tuple[int, Row]:
+    def _tries(self, free: int, *, waves: bool, together: bool) -> list[_Way]:
+        """Return how to go on by blocks over free steps, most of them first.
+
+        In an ensemble each is a question, which nothing may come before.
+        """
+        block = COURSE if self._changing and not waves else BLOCK
+        most = block if waves or self.asked.strict or (together and self._changing) else ROW * block
+        first = min(free, most) // block * block
+        sizes = [first] if together else dict.fromkeys((first, block))
+        tries: list[_Way]
+        tries = [partial(self._blocks, steps=n, block=block) for n in sizes if 0 < n <= free]
+        few = min(max(1, free), block - 1)
+        if self._changing and not waves:
+            tries.append(partial(self._blocks, steps=1 if together else few, block=1))
+        elif not waves:
+            tries.append(partial(self._one_by_one, steps=few))
+        return tries
+
+    def _once(self, way: int, call: _Way, k: int) -> tuple[int, Row]:
         """Try a way from instant k, but not again when the question of a later one is answered."""
         if self._tried[0] != k:
             self._tried = k, set()
@@ -226,7 +239,7 @@ class JointRun:
         done, made = self.machines.one_by_one(state, self.u, self.theta, grid)
         return self._went_by(done, made, self.here.factors)
 
-    def _blocks(self, k: int, steps: int) -> tuple[int, Row]:
+    def _blocks(self, k: int, steps: int, block: int) -> tuple[int, Row]:
         grid, factors = self.asked.grid[k : k + steps + 1], self.here.factors
         state = UnitState(self.x, self.z, self.governor)
         if self._changing:
@@ -234,7 +247,7 @@ class JointRun:
                 self._columns = Columns(self.apu.gas_generator, self.now, self.here, self.shaft)
             middles = (grid[1:] + grid[:-1]) / 2
             unit, factors = self._columns(middles)
-            done, made = self.machines.follow(state, unit, grid, self._middle)
+            done, made = self.machines.follow(state, unit, grid, self._middle, block)
             steps = done.y.shape[1]
             self._middle = float(middles[steps - 1])
             if steps < middles.size:

@@ -30,13 +30,15 @@ from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.machine.collocated import Collocated
+from apu_casadi.machine.course import TERMS
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.exchange import PAPER, Link, governed_step
 
 BLOCK = 10  # exchange steps in one call
-LONG = 200  # at most in a row of calls, whose results are handed on together
+COURSE = 50  # where loads, faults or inputs change from step to step
+ROW = 20  # blocks in a row of calls at most, whose results are handed on together
 
 
 Fast: TypeAlias = Propagator | MeanStep | Collocated
@@ -90,7 +92,7 @@ class BlockResult(NamedTuple):
 
 
 class _Machine(NamedTuple):
-    """Symbols of one group of generators."""
+    """Symbols of one group of generators, the same in all steps or of each."""
 
     u: ca.MX
     theta: ca.MX
@@ -104,6 +106,16 @@ class _Machine(NamedTuple):
         sizes |= {"numbers": link.numbers.size, "series": fast.advance.numel_in(1), "dt": 1}
         return cls(*(ca.MX.sym(f"{name}_{k}", n) for name, n in sizes.items()))
 
+    def wide(self, steps: int) -> tuple[list[ca.MX], list[list[ca.MX]]]:
+        """Return symbols of many steps, polynomials for ``series``; and what each step takes."""
+        each = [ca.MX.sym(s.name(), s.numel(), steps) for s in self[:3]]
+        terms = ca.MX.sym(f"terms_{self.series.name()}", self.series.numel(), TERMS)
+        basis = ca.MX.sym(f"basis_{self.series.name()}", TERMS, steps)
+        columns = zip(*(ca.horzsplit(s) for s in (*each, basis)), strict=True)
+        return [*each, terms, basis, self.dt], [
+            [*own, ca.mtimes(terms, by), self.dt] for *own, by in columns
+        ]
+
 
 def block_function(
     machines: Sequence[Fast],
@@ -115,6 +127,9 @@ def block_function(
     wide: bool = False,
 ) -> ca.Function:
     """Build the block: (carry, u, theta, [u_sg, theta_sg, numbers, series, dt]) -> (last, y, ...).
+
+    Where it is wide, polynomials and their terms in each step stand for ``series``
+    (:class:`apu_casadi.machine.course.Numbers`).
 
     ``carry`` holds N, z, and the states of governor and generators.  Outputs and the residual of
     the cycle in each step are followed for each group of equal generators by means, by what is to
@@ -164,13 +179,15 @@ def block_function(
     outs = [after, y, r, *(out for _, each in made.machine for out in each)]
     step = ca.Function("joint_step", [carry, *held], outs)
 
-    given_to = [*held]
+    given_to, each = held, [held] * steps
     if wide:
-        steady = [id(g.dt) for g in given]
-        given_to = [s if id(s) in steady else ca.MX.sym(s.name(), s.numel(), steps) for s in held]
+        own_of = [g.wide(steps) for g in given]
+        unit = [ca.MX.sym(s.name(), s.numel(), steps) for s in (u, theta)]
+        given_to = [*unit, *(s for symbols, _ in own_of for s in symbols)]
+        columns = zip(*(ca.horzsplit(s) for s in unit), *(e for _, e in own_of), strict=True)
+        each = [[*now[:2], *(s for own in now[2:] for s in own)] for now in columns]
     now, rows = carry, []
-    for k in range(steps):
-        these = [s[:, k] if s.size2() > 1 else s for s in given_to]
+    for these in each:
         now, *row = step(now, *these)
         rows.append(row)
     last = [now, *(ca.horzcat(*column) for column in zip(*rows, strict=True))]
@@ -190,7 +207,7 @@ class JointBlock(Rebuilt):
 
     apu: Apu
     machines: Sequence[Fast]
-    _likely = LONG // BLOCK  # blocks in a row that may well be right
+    _likely = ROW  # blocks in a row that may well be right
 
     def __init__(
         self,
@@ -289,10 +306,13 @@ class JointBlock(Rebuilt):
         out = [c[0] if len(c) == 1 else np.concatenate(c, axis=1) for c in zip(*made, strict=True)]
         return self._right(np.stack(lasts, axis=1), out)
 
-    def tables(self, group: int) -> np.ndarray:
-        """Return the memory that the next call takes the tables of a group from."""
-        made: np.ndarray = self._call.inputs[3 + len(_Machine._fields) * group + 3]
-        return made
+    def terms(self, group: int, values: np.ndarray) -> np.ndarray:
+        """Return the polynomials of a group where the calls of a wide block need not copy them."""
+        if asking():
+            return values
+        room: np.ndarray = self._call.inputs[3 + (len(_Machine._fields) + 1) * group + 3]
+        room[...] = values
+        return room
 
     def _parted(self, carry: np.ndarray, out: Sequence[np.ndarray]) -> BlockResult:
         """Return the parts of the state at the end of blocks, and of their outputs."""
@@ -347,7 +367,7 @@ def _caller(
         name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
         function = block_function(machines, family.step, link, name, steps=steps, wide=wide)
         # single steps by tables are a tenth of a block
-        small = 1 if any(isinstance(m, Collocated) for m in machines) else BLOCK // steps
+        small = 1 if any(isinstance(m, Collocated) for m in machines) else max(1, BLOCK // steps)
         one = Gradual(function, level=3, copy=False, by=points_in_lanes)
         return Together(function, function, one, small=small)
 

@@ -8,13 +8,11 @@ exchange steps where all can, else by single steps, each with the integrator tha
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.lanes.together import asking
 from apu_casadi.core.runloop import SAME_INSTANT
 from apu_casadi.unit.apu import Apu, JointPoint, groups
 from apu_casadi.unit.departures import Departure
@@ -124,7 +122,7 @@ class Machines:
     def _forget(self) -> None:
         self._block: JointBlock | None = None
         self._no_block = ""
-        self._wide: tuple[list[Any], JointBlock] | None = None
+        self._wide: dict[int, tuple[list[Any], JointBlock]] = {}  # by steps in a block
         self._one: tuple[list[Any], JointBlock] | None = None
 
     def samples(self, grid: np.ndarray) -> int:
@@ -251,50 +249,51 @@ class Machines:
             raise NotApplicable("the steps of a block are whole exchange steps")
 
     def follow(
-        self, state: UnitState, unit: Inputs, grid: np.ndarray, before: float
+        self, state: UnitState, unit: Inputs, grid: np.ndarray, before: float, steps: int
     ) -> tuple[BlockResult, list[MachineMade]]:
         """Advance the whole unit over blocks whose inputs have a column for each step.
 
         Args:
             before: the middle of the step before the block, s.
+            steps: in each block.
 
         Raises:
             NotApplicable: that is not possible here.
         """
         self._check_block(grid)
         middles = (grid[1:] + grid[:-1]) / 2
-        into = [partial(self._room, k) for k in range(len(self.groups))]
-        each = zip(self.groups, into, strict=True)
-        fast, numbers = zip(*(g.columns(middles, before, to) for g, to in each), strict=True)
-        layouts = [one.layout for one in fast]
-        if self._wide is None or self._wide[0] != layouts:
-            links = [g.link for g in self.groups]
-            self._wide = layouts, JointBlock(self.apu, fast, links, wide=True)
-        self._wide[1].machines = fast  # of the same layouts, with what is expected of them now
-        severity: list[list[np.ndarray]] = [[] for _ in self.groups]
+        fast, numbers = zip(*(g.numbers_over(middles, before) for g in self.groups), strict=True)
+        blocks = min(now.basis.shape[1] for now in numbers) // steps
+        if not blocks:
+            raise NotApplicable("numbers of fewer steps than a block has go together")
+        wide, n = self._wide_block(fast, steps), blocks * steps
+        links = [np.repeat(g.link.numbers[:, None], n, axis=1) for g in self.groups]
+        terms = [wide.terms(k, now.terms) for k, now in enumerate(numbers)]
 
         def held() -> Iterator[list[Any]]:
-            for k, own in zip(
-                range(0, middles.size, BLOCK), zip(*numbers, strict=False), strict=False
-            ):
-                at = slice(k, k + BLOCK)
+            for at in (slice(k, k + steps) for k in range(0, n, steps)):
                 given: list[Any] = [unit.u[:, at], unit.theta[:, at]]
-                for g, one, now, kept in zip(self.groups, fast, own, severity, strict=True):
-                    link = g.numbers_of_link
-                    link[0] = unit.N_ref[at]
-                    kept.append(now.severity)
-                    given += [now.u, now.theta, link, now.vector, one.dt]
+                for one, now, link, own in zip(fast, numbers, links, terms, strict=True):
+                    link[0, at] = unit.N_ref[at]
+                    columns = [a[:, at] for a in (now.u, now.theta, link)]
+                    given += [*columns, own, now.basis[:, at], one.dt]
                 yield given
 
-        done = self._wide[1].followed(state, [g.x for g in self.groups], held())
+        done = wide.followed(state, [g.x for g in self.groups], held())
         n = done.y.shape[1]
-        severe = [np.concatenate(kept, axis=1)[:, :n] for kept in severity]
-        pairs = zip(self.groups, done.machines, severe, strict=True)
-        return done, [g.went_on(one, grid[: n + 1], own) for g, one, own in pairs]
+        each = zip(self.groups, done.machines, numbers, strict=True)
+        return done, [g.went_on(one, grid[: n + 1], now.severity[:, :n]) for g, one, now in each]
 
-    def _room(self, group: int) -> np.ndarray | None:
-        """Return where the next block takes the tables of a group from; None where it is asked."""
-        return None if asking() or self._wide is None else self._wide[1].tables(group)
+    def _wide_block(self, fast: Sequence[Any], steps: int) -> JointBlock:
+        """Return the block of so many steps for what propagates the groups."""
+        layouts = [one.layout for one in fast]
+        if steps not in self._wide or self._wide[steps][0] != layouts:
+            how: dict[str, Any] = {"steps": steps, "wide": True}
+            links = [g.link for g in self.groups]
+            self._wide[steps] = layouts, JointBlock(self.apu, fast, links, **how)
+        block = self._wide[steps][1]
+        block.machines = fast  # of the same layouts, with what is expected of them now
+        return block
 
     def rows(self, made: Sequence[MachineMade]) -> list[Of]:
         """What is to be recorded of what the groups made."""

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import itertools
 import math
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,7 +17,7 @@ from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.profiles.profile import Varying
 from apu_casadi.core.runloop import SAME_INSTANT, first_able
 from apu_casadi.machine.collocated import Collocated
-from apu_casadi.machine.course import Into, Numbers
+from apu_casadi.machine.course import Numbers
 from apu_casadi.machine.generator import Generator, GeneratorPoint, Spike
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import who
@@ -35,7 +33,7 @@ from apu_casadi.unit.integrators import (
     Way,
     integrators,
 )
-from apu_casadi.unit.jointstep import BLOCK, MachineBlock
+from apu_casadi.unit.jointstep import MachineBlock
 from apu_casadi.unit.stepmeans import RawMeans, StepMeans
 
 if TYPE_CHECKING:
@@ -120,7 +118,7 @@ class MachineStep:
         rest = tuple(k for k in self.numbers if k not in numbers)
         for part, its in ((self, rest), (other, numbers)):
             part.numbers, part._of_all = its, False
-            part.link, part._linked = dataclasses.replace(self.link, pairs=len(its) / 2), None
+            part.link = dataclasses.replace(self.link, pairs=len(its) / 2)
         return other
 
     def _enter(self, phase: Phase) -> None:
@@ -128,7 +126,6 @@ class MachineStep:
         self._integrators = integrators(phase, self.settings, self.means, self._way)
         self._at, self._V_ref_at = phase.ss.u.indices(["w_r", "V_ref"])
         self._same: tuple[MeanStep | Propagator, Numbers] | None = None
-        self._linked: np.ndarray | None = None
 
     def follow(self, load: Any, fault: Any, begin: float, end: float) -> None:
         """Take what load and fault are made of, from now until others come, s."""
@@ -213,35 +210,22 @@ class MachineStep:
             raise NotApplicable("waveforms, or an integrator that was asked for")
         return found.over(h)
 
-    def columns(
-        self, t: np.ndarray, before: float, into: Into
-    ) -> tuple[MeanStep | Propagator, Iterator[Numbers]]:
-        """Return what propagates over the steps of blocks, and what it takes in each.
+    def numbers_over(self, t: np.ndarray, before: float) -> tuple[MeanStep | Propagator, Numbers]:
+        """Return what propagates over the first of some steps, as many as go together.
 
         Args:
             t, before: middles of the steps and of the one before, s.
-            into: where numbers that change go.
 
         Raises:
             NotApplicable: exact propagation does not hold, or numbers change too fast.
         """
-        if self._same is None:
-            fast, blocks = self._integrators[0].columns(t, before, BLOCK, into)
-            if self._way is not None:
-                return fast, map(self._regulated, blocks)
-            self._same = fast, self._regulated(next(blocks))
-        return self._same[0], itertools.repeat(self._same[1])
-
-    def _regulated(self, now: Numbers) -> Numbers:
+        if self._same is not None and self._same[1].basis.shape[1] >= t.size:
+            return self._same
+        fast, now = self._integrators[0].numbers(t, before)
         now.u[self._V_ref_at] = self.V_ref
-        return now
-
-    @property
-    def numbers_of_link(self) -> np.ndarray:
-        """Numbers of the gearbox and the governor in a column for each step of a block."""
-        if self._linked is None:
-            self._linked = np.repeat(self.link.numbers[:, None], BLOCK, axis=1)
-        return self._linked
+        if self._way is None:
+            self._same = fast, now
+        return fast, now
 
     def went_by_one(
         self, fast: MeanStep | Propagator | Collocated, done: MachineBlock, grid: np.ndarray
@@ -265,10 +249,9 @@ class MachineStep:
         fast = self._integrators[0]
         t, w = fast.waves(done.waves, grid)
         self.propagated += grid.size - 1
-        w_r = np.repeat(done.w_r[::BLOCK], BLOCK)  # at the beginning of each block
-        self.w_r = float(w_r[-1])
+        self.w_r = float(done.w_r[-1])
         h, symmetric = self.settings.dt, self.phase.symmetric
-        means = RawMeans.of(fast.quad, symmetric, done.means, h, w_r, grid[1:])
+        means = RawMeans.of(fast.quad, symmetric, done.means, h, done.w_r, grid[1:])
         self.x = done.x
         fault = self.phase.fault
         changing = self._way is not None and fault is not None and len(severity)
