@@ -28,11 +28,10 @@ from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import hoisted, leap
+from apu_casadi.machine.propagation import hoisted, leap, seen_at_start
 from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import (
     NODES,
-    NODES_BY_ANGLE,
     Table,
     cached_table,
     nominal_entries,
@@ -43,7 +42,7 @@ from apu_casadi.machine.turnstep import STRIDES, Turn, periodic_step, turn_of
 
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
 #: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
-PANELS = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
+PANELS = ((1, 1 / 160), (1, 1 / 40), (6, (1 - 1 / 160 - 1 / 40) / 6))
 #: Longest time, first intervals, in which the stator may settle behind the load and not be sampled.
 LAYER = 0.5
 HARMONICS = (12, 20, 30)  # of the rotor angle that a function takes; the first that fits
@@ -218,13 +217,19 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     nx, nu, nt, n_P = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1).even.size
     X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
     dt = ca.MX.sym("dt")
-    series = ca.MX.sym("series", len(PANELS) * 4 * n_P)
+    series = ca.MX.sym("series", len(PANELS) * NODES * n_P)
     ranges = ca.MX.sym("range", 2)  # of the speed
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
     s = (w - ranges[0]) / ranges[1]
-    powers = ca.vertcat(1, s, s**2, s**3)
+    powers = ca.vertcat(1, *(s**k for k in range(1, NODES)))
     step, V_of = leap(ss, 1, True)
-    sizes = zip("xVPut", (nx, 3, n_P, nu, nt), strict=True)
+    # the first samples lie so far apart; so much of it is the first one's weight
+    h_first, weight = dt * PANELS[0][1] / 4, 14 / 45
+    x_k, area = settled(ss, True)(X0, U, TH, LAYER * h_first)
+    seen = V_of(x_k + area * (2 / h_first), U, TH)[0]
+    V_k = seen_at_start(ss, (seen, V_of(x_k, U, TH)[1]), x_k, U, TH)
+    samples = [x_k + area / (weight * h_first)]
+    sizes = zip("xVPut", (nx, V_k.numel(), n_P, nu, nt), strict=True)
     x, V, P, u, th = (ca.SX.sym(k, n) for k, n in sizes)
     h = ca.SX.sym("h")
     xk, Vk, states = x, V, []
@@ -233,13 +238,9 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
         states.append(xk)
     outputs = [ca.horzcat(*states), Vk]
     panel, before = hoisted("panel", [x, V, P], ca.vertcat(u, th, h), outputs)
-    # the first samples lie so far apart; so much of it is the first one's weight
-    h_first, weight = dt * PANELS[0][1] / 4, 14 / 45
-    x_k, area = settled(ss, True)(X0, U, TH, LAYER * h_first)
-    seen = V_of(x_k + area * (2 / h_first), U, TH)[0]
-    V_k, samples = ca.vertcat(seen, V_of(x_k, U, TH)[1], 0), [x_k + area / (weight * h_first)]
     for k, (number, share) in enumerate(PANELS):
-        P_k = ca.mtimes(ca.reshape(series[k * 4 * n_P : (k + 1) * 4 * n_P], n_P, 4), powers)
+        own = series[k * NODES * n_P : (k + 1) * NODES * n_P]
+        P_k = ca.mtimes(ca.reshape(own, n_P, NODES), powers)
         d = before(ca.vertcat(U, TH, dt * share / 4))
         for _ in range(number):
             four, V_k = panel(x_k, V_k, P_k, d)
@@ -398,9 +399,7 @@ class MeanStep(Rebuilt):
             parts = [np.tile(even, len(PANELS) * NODES)]
         else:
             terms = self.harmonics + 2, self.harmonics
-            parts = [
-                np.tile(e, NODES_BY_ANGLE * n) for e, n in zip((even, odd), terms, strict=True)
-            ]
+            parts = [np.tile(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]
         return np.concatenate([*parts, np.zeros(2)])
 
     def expect(self, jump: float) -> None:

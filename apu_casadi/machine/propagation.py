@@ -36,6 +36,7 @@ from apu_casadi.core.instructions import applied, rewritten
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.core.simulation import StepResult
+from apu_casadi.machine.exciterstep import exciter_of
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import V_RATED
@@ -97,33 +98,10 @@ def strides(n_out: int, h: float, constant: bool, fine: bool, sloped: bool = Tru
     return Strides(head, m, (n_out - head) // m)
 
 
-@kept
-def exciter_step(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
-    """The exciter's drive and its step, of the states that are neither windings nor angle.
-
-    First: (slow, V_t, V_ref, theta) -> (E, E', E'', E''').  Second, by the classical Runge-Kutta
-    method: (slow, V_t at start, middle and end, V_ref, theta, length in s) -> slow at the end.
-    """
-    at = split(ss).slow
-    slow, V = ca.SX.sym("slow", len(at)), ca.SX.sym("V", 3)
-    V_ref, H, th = ca.SX.sym("V_ref"), ca.SX.sym("H"), ca.SX.sym("t", len(ss.theta))
-
-    def rates(slow: Any, V_t: Any) -> Any:
-        x = ca.SX.zeros(len(ss.x))
-        x[at] = slow
-        return ss.exciter(x, V_t, V_ref, th)
-
-    k1 = rates(slow, V[0])
-    E = at.index(ss.x.index("E_fd"))
-    derivatives = [slow[E]]
-    for _ in range(EXTRA - 2):
-        derivatives.append(ca.jtimes(derivatives[-1], slow, k1))
-    drive = ca.Function("drive", [slow, V[0], V_ref, th], [ca.vertcat(*derivatives)])
-    k2 = rates(slow + H / 2 * k1, V[1])
-    k3 = rates(slow + H / 2 * k2, V[1])
-    k4 = rates(slow + H * k3, V[2])
-    end = slow + H / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return drive, ca.Function("exciter", [slow, V, V_ref, th, H], [end])
+def seen_at_start(ss: GeneratorModel, V: tuple[Any, Any], x: Any, u: Any, theta: Any) -> Any:
+    """What the first of :func:`leap` takes as ``V``, of the terminal voltage and its rate."""
+    slow, V_ref = x[split(ss).slow], u[ss.u.index("V_ref")]
+    return ca.vertcat(*V, 0, exciter_of(ss).exponentials(slow, V_ref, theta))
 
 
 @kept
@@ -133,7 +111,8 @@ def leap(
     """One step of the exciter over m samples, and the terminal voltage with its rate.
 
     First: (x, V, P, u, theta, h) -> (x at the m samples, V at the end); V holds the terminal
-    voltage, its rate, and the largest error of the drive so far; P the even and then the odd
+    voltage, its rate, the largest error of the drive so far, and the exponentials of
+    :class:`Exciter`; P the even and then the odd
     entries of the transition matrices (:class:`Parity`), the even ones only where ``constant``.
     These are matrices over one sample, two samples and so on, or, ``chained``, from each sample to
     the next.  Second: (x, u, theta) -> (V_t, dV_t/dt).
@@ -147,9 +126,8 @@ def leap(
         V_t, V_dot = ca.substitute([V_t, V_dot], [x[s.angle]], [ca.SX(0)])
     V_of = ca.Function("V_of", [x, u, th], [V_t, V_dot])
 
-    drive, exciter = exciter_step(ss)
-    kinds = parity(ss, m)
-    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
+    exciter, kinds = exciter_of(ss), parity(ss, m)
+    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3 + exciter.exps)
     P = ca.SX.sym("P", kinds.even.size + (0 if constant else kinds.odd.size))
     size = n * (n + EXTRA)
     entries = ca.SX(m * size, 1)  # without harmonics the odd ones are zero
@@ -157,8 +135,8 @@ def leap(
     if not constant:
         entries[kinds.odd] = P[kinds.even.size :]
     u_d = ss.u.unpack(u)
-    slow = x[s.slow]
-    E = ca.vertsplit(drive(slow, V[0], u_d["V_ref"], th))
+    slow, e, held = x[s.slow], V[3:], (u_d["V_ref"], th)
+    E = ca.vertsplit(exciter.at((slow, V[0], *held), e)[1])
 
     def E_at(t: Any, derivative: int = 0) -> Any:
         return sum(e * t**i / math.factorial(i) for i, e in enumerate(E[derivative:]))
@@ -194,12 +172,13 @@ def leap(
         V1, V1_dot = V_of(end, u, th)[0], ca.SX.nan()  # the rate is not needed
         V0, Vm = V[0], V_of(samples[m // 2 - 1], u, th)[0]
     E_taken = end[s.drive]
-    end[s.slow] = exciter(slow, ca.vertcat(V0, Vm, V1), u_d["V_ref"], th, H)
-    miss = ca.fmax(V[2], ca.fabs(end[s.drive] - E_taken))
+    k1, _ = exciter.at((slow, V0, *held), e)
+    end[s.slow], e, far = exciter.step((slow, k1, e), (Vm, V1), held, H)
+    miss = ca.fmax(V[2], ca.fabs(end[s.drive] - E_taken)) + far
     one = ca.Function(
         "leap",
         [x, V, P, u, th, h],
-        [ca.horzcat(*samples[:-1], end), ca.vertcat(V1, V1_dot, miss)],
+        [ca.horzcat(*samples[:-1], end), ca.vertcat(V1, V1_dot, miss, e)],
         {"cse": True},
     )
     return one, V_of
@@ -210,18 +189,19 @@ def _fold(
     steps: int,
     n_P: Sequence[int],
     constant: bool,
-    sizes: tuple[int, int, int],
+    sizes: tuple[int, int, int, int],
 ) -> ca.Function:
     """``steps`` steps of the exciter: (start, P) -> (start of the next, x at all samples).
 
     ``start`` holds x, V and what stays; ``P`` is one matrix of even entries where ``constant``,
-    else one of even and one of odd ones, with ``n_P`` rows.  A few steps are unrolled, which
+    else one of even and one of odd ones, with ``n_P`` rows; ``sizes`` are those of x, V, u and
+    theta.  A few steps are unrolled, which
     spares copies.
     """
-    nx, nu, nt = sizes
+    nx, nV, nu, nt = sizes
     size = next(k for k in (5, 4, 2, 1) if steps % k == 0)
     x, u, th = ca.SX.sym("x", nx), ca.SX.sym("u", nu), ca.SX.sym("t", nt)
-    h, V = ca.SX.sym("h"), ca.SX.sym("V", 3)
+    h, V = ca.SX.sym("h"), ca.SX.sym("V", nV)
     P = [ca.SX.sym("P", n, 1 if constant else size) for n in n_P]
     xk, Vk, states = x, V, []
     for k in range(size):
@@ -240,11 +220,12 @@ def _fold(
         {"cse": True},
     )
     run = group.mapaccum("run", steps // size, 1)
-    S = ca.MX.sym("S", nx + 3 + nu + nt + 1)
+    own = nx + nV
+    S = ca.MX.sym("S", own + nu + nt + 1)
     PP = [ca.MX.sym("P", n, 1 if constant else steps) for n in n_P]
-    start = ca.vertcat(S[: nx + 3], before(S[nx + 3 :]))
+    start = ca.vertcat(S[:own], before(S[own:]))
     last, X_all = run(ca.vertcat(start, *PP)) if constant else run(start, *PP)
-    end = ca.vertcat(last[: nx + 3, steps // size - 1], S[nx + 3 :])
+    end = ca.vertcat(last[:own, steps // size - 1], S[own:])
     return ca.Function("fold", [S, *PP], [end, X_all])
 
 
@@ -314,16 +295,17 @@ def _advance(
     single, V_of = leap(ss, 1, constant)
     # a fault's current beside an inductive load settles within microseconds of a new speed
     first_x = settled(ss, False)(X0, U, TH, H / 4)[0] if "i_fault" in ss.linear else X0
-    S = ca.vertcat(X0, *V_of(first_x, U, TH), 0, U, TH, H)
+    V0 = seen_at_start(ss, V_of(first_x, U, TH), X0, U, TH)
+    S, sizes = ca.vertcat(X0, V0, U, TH, H), (nx, V0.numel(), nu, nt)
     parts = []
     if plan.head:
-        fold = _fold(single, plan.head, rows[1], constant, (nx, nu, nt))
+        fold = _fold(single, plan.head, rows[1], constant, sizes)
         first = [p[:n, : (1 if constant else plan.head)] for p, n in zip(PP, rows[1], strict=True)]
         S, X = fold(S, *first)
         parts.append(X)
     if plan.many:
         long, _ = leap(ss, plan.m, constant)
-        fold = _fold(long, plan.many, rows[plan.m], constant, (nx, nu, nt))
+        fold = _fold(long, plan.many, rows[plan.m], constant, sizes)
         S, X = fold(S, *(p if constant else p[:, plan.head :] for p in PP))
         parts.append(X)
     X_all, miss = ca.horzcat(*parts), S[nx + 2]
@@ -385,7 +367,7 @@ def _at_any_speed(function: ca.Function, at: int, n_out: int, entries: int) -> c
     series, dt = ca.MX.sym("series", NODES * entries + 2), ca.MX.sym("dt")
     w = U[at]
     s = (w - series[-2]) / series[-1]
-    powers = ca.vertcat(1, s, s**2, s**3)
+    powers = ca.vertcat(1, *(s**k for k in range(1, NODES)))
     P = ca.mtimes(ca.reshape(series[:-2], entries, NODES), powers)
     out = function(X0, P, U, TH, dt / n_out)
     return ca.Function(f"{function.name()}_series", [X0, series, U, TH, dt], list(out))

@@ -43,10 +43,9 @@ LEFT = 1 / 256
 HARMONICS = (16, 32, 64)  # harmonics resolved, in turn; a series that still goes on is refused
 EXTRA = 5  # columns of P beside the windings': E, its first three derivatives, and what is constant
 SPEED_RANGE = 0.06  # half width, relative to rated, over which P is interpolated in speed
-NODES = 4  # Chebyshev nodes in speed ...
-#: ... and of leaps of a given angle, which add up: with four, beside a load of power factor 0.9, to
-#: 1e-6 in the means; with five to 1e-8.
-NODES_BY_ANGLE = 5
+#: Chebyshev nodes in speed.  Errors of the leaps of a step add up: with four of them the means
+#: beside a load of power factor 0.9 erred by 1e-6, with five by 1e-8.
+NODES = 5
 COMPILE_FROM = 2000  # transition matrices; of so many there may be many more
 FEWEST = 8  # of them at once: trials are of few angles
 TABLES = (
@@ -378,10 +377,9 @@ class Table:
 
     def at(self, w: float) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients at speed w, rad/s: even and odd, shape (terms, entries)."""
-        nodes = self.even.shape[0]
-        powers = ((w - self.centre) / self.half) ** np.arange(nodes)
+        powers = ((w - self.centre) / self.half) ** np.arange(NODES)
         even, odd = (
-            (powers @ part.reshape(nodes, -1)).reshape(part.shape[1:])
+            (powers @ part.reshape(NODES, -1)).reshape(part.shape[1:])
             for part in (self.even, self.odd)
         )
         return even, odd
@@ -392,7 +390,7 @@ class Table:
             return self
         whole = []
         for part, pairs in ((self.even, harmonics // 2 + 1), (self.odd, (harmonics + 1) // 2)):
-            full = np.zeros((part.shape[0], 2 * pairs, part.shape[2]))
+            full = np.zeros((NODES, 2 * pairs, part.shape[2]))
             full[:, : part.shape[1]] = part
             whole.append(full)
         return replace(self, even=whole[0], odd=whole[1], harmonics=harmonics)
@@ -429,9 +427,8 @@ def transition_table(
     """
     n = len(ss.linear)
     centre, half = w_rated, SPEED_RANGE * w_rated
-    count = NODES if angle is None else NODES_BY_ANGLE
-    nodes = centre + half * np.cos(np.pi * (2 * np.arange(count) + 1) / (2 * count))
-    to_powers = np.linalg.inv(np.vander((nodes - centre) / half, count, increasing=True))
+    nodes = centre + half * np.cos(np.pi * (2 * np.arange(NODES) + 1) / (2 * NODES))
+    to_powers = np.linalg.inv(np.vander((nodes - centre) / half, NODES, increasing=True))
     M_of = _scaled(ss, u, theta)
     constant, kinds = symmetry(ss, u, theta, w_rated), parity(ss, leaps)
 
@@ -439,7 +436,7 @@ def transition_table(
         return angle / w if angle is not None else np.full(w.shape, h)
 
     if constant:
-        M = M_of(np.zeros(count), nodes)
+        M = M_of(np.zeros(NODES), nodes)
 
     def trial(steps: int, stages: int) -> np.ndarray:
         """Transition matrices that tell whether the steps suffice."""
@@ -455,12 +452,12 @@ def transition_table(
 
     def sampled(angles: np.ndarray) -> np.ndarray:
         """Entries in nominal units, column by column, leap after leap: (nodes, angles, entries)."""
-        a, w = np.tile(angles, count), np.repeat(nodes, angles.size)
+        a, w = np.tile(angles, NODES), np.repeat(nodes, angles.size)
         if constant:
             P = _constant_transition(M, length(nodes), steps, leaps).swapaxes(0, 1)
         else:
             P = np.stack(_transition(ss, (u, theta), a, w, length(w), steps, leaps, stages), axis=1)
-        return P.transpose(0, 1, 3, 2).reshape(count, angles.size, -1)
+        return P.transpose(0, 1, 3, 2).reshape(NODES, angles.size, -1)
 
     units = np.tile((1 / _scale(ss)[:n]).T.ravel(), leaps)
 
@@ -471,7 +468,7 @@ def transition_table(
 
     if constant:
         P = sampled(np.zeros(1))
-        none = np.zeros((count, 0, kinds.odd.size))
+        none = np.zeros((NODES, 0, kinds.odd.size))
         return Table(centre, half, powers(P[:, :, kinds.even], kinds.even), none, 0, error)
     F, highest = _fourier(sampled, kinds, what)
 
@@ -481,7 +478,7 @@ def transition_table(
         if first == 0:
             pairs[:, 0] /= 2
         # an isolated neutral without a fault has no odd entries: no shape follows from their number
-        return powers(pairs.reshape(count, 2 * pairs.shape[1], which.size), which)
+        return powers(pairs.reshape(NODES, 2 * pairs.shape[1], which.size), which)
 
     even, odd = series(0, kinds.even), series(1, kinds.odd)
     return Table(centre, half, even, odd, highest, error)

@@ -20,12 +20,12 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
-from apu_casadi.core.instructions import applied, rewritten
 from apu_casadi.core.means import Term, harmonic, window
+from apu_casadi.machine.exciterstep import Exciter, exciter_of, exciter_step
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import exciter_step, hoisted
+from apu_casadi.machine.propagation import hoisted
 from apu_casadi.machine.settling import settled
-from apu_casadi.machine.transition import EXTRA, NODES_BY_ANGLE, SPEED_RANGE, Parity, parity, split
+from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through
 
 #: Strides in a turn, where coefficients are periodic: 14 in a period of what ripples, or 28 where a
@@ -99,11 +99,11 @@ def _matrices(
     for odd, entries in enumerate((kinds.even.size, kinds.odd.size)):
         terms = 2 * (harmonics // 2 + (not odd))
         size = terms * entries
-        own = ca.reshape(series[first : first + NODES_BY_ANGLE * size], size, NODES_BY_ANGLE)
-        now = ca.mtimes(own, _powers(s, NODES_BY_ANGLE))
+        own = ca.reshape(series[first : first + NODES * size], size, NODES)
+        now = ca.mtimes(own, _powers(s, NODES))
         turned = _turned(terms // 2, half, odd=bool(odd))(theta0)
         values.append(ca.mtimes(ca.reshape(now, entries, terms), turned))
-        first += NODES_BY_ANGLE * size
+        first += NODES * size
     order = np.argsort(np.append(kinds.even, kinds.odd)).tolist()
     made = []
     for even, odd in zip(*(ca.horzsplit(v) for v in values), strict=True):
@@ -281,82 +281,6 @@ class _Seen:
         return ca.Function("means", given, [ca.vertcat(*found)], {"cse": True})(sums, angles)
 
 
-_NEARBY = 0.02  # argument with which six terms of the exponential's series err by 1e-13
-
-
-def _given_exps(f: ca.Function) -> tuple[ca.Function, ca.Function]:
-    """Write an SX function of (slow, V_t, ...) with the values of its exponentials as an input.
-
-    Those of other inputs alone stay as they are.
-
-    Returns:
-        Function(*inputs, exponentials) -> outputs, and Function(*inputs, exponentials) -> their
-        arguments.
-    """
-    inputs, exps, arguments = f.sx_in(), [ca.SX(0, 1)], [ca.SX(0, 1)]
-
-    def operation(_: int, op: int, parts: list[Any], vary: list[bool]) -> Any:
-        if op != ca.OP_EXP or not vary[0]:
-            return applied(op, parts)
-        exps.append(ca.SX.sym("e"))
-        arguments.extend(parts)
-        return exps[-1]
-
-    results = rewritten(f, inputs, operation, varying=(0, 1))
-    e = ca.vertcat(*exps)
-    given = [*inputs, e]
-    return ca.Function("given", given, results), ca.Function("of", given, [ca.vertcat(*arguments)])
-
-
-class _Exciter:
-    """The exciter between the samples, without an exponential in its chain of steps.
-
-    Its saturation moves by little from one step to the next, so that a few terms of a series are
-    as good, and do not keep the next step waiting.
-
-    Attributes:
-        exps: exponentials in it.
-        started: Function (states, V_t, V_ref, theta) -> rates, E with its derivatives, and
-            exponentials.
-
-    Raises:
-        NotApplicable: an exponential is of something that is not linear in the states.
-    """
-
-    def __init__(self, ss: GeneratorModel) -> None:
-        at = split(ss)
-        slow, V, V_ref = ca.SX.sym("slow", len(at.slow)), ca.SX.sym("V"), ca.SX.sym("V_ref")
-        th, full = ca.SX.sym("t", len(ss.theta)), ca.SX.zeros(len(ss.x))
-        full[at.slow] = slow
-        given = [slow, V, V_ref, th]
-        both = [ss.exciter(full, V, V_ref, th), exciter_step(ss)[0](*given)]
-        self._of, arguments = _given_exps(ca.Function("both", given, both, {"cse": True}))
-        self.exps: int = self._of.numel_in(len(given))
-        e = ca.SX.sym("e", self.exps)
-        own = arguments(*given, e)
-        slopes = ca.jacobian(own, slow)
-        others = any(ca.which_depends(own, ca.vertcat(V, e), 1, True))
-        if others or any(ca.which_depends(ca.vec(ca.densify(slopes)), slow, 1, True)):
-            raise NotApplicable(f"{ss.name}: the exciter's exponential is not of its states alone")
-        self._slopes = ca.Function("slopes", [V_ref, th], [slopes])
-        made = [*self._of(*given, ca.exp(own)), ca.exp(own)]
-        self.started = ca.Function("started", given, made, {"cse": True})
-
-    def near(self, moved: Any, e: Any, V_ref: Any, th: Any) -> tuple[Any, Any]:
-        """Exponentials where the states have moved by so much, and whether that is near enough."""
-        if not self.exps:
-            return e, 1.0
-        by = self._slopes(V_ref, th) @ moved
-        square = by * by  # in this order few terms wait for others
-        high = (0.5 + by * (1 / 6)) + square * (1 / 24 + by * (1 / 120))
-        return e * ((1.0 + by) + square * high), ca.mmax(ca.fabs(by)) <= _NEARBY
-
-    def at(self, now: Sequence[Any], e: Any) -> tuple[Any, Any]:
-        """Rates of the states, and E with its derivatives, at (states, V_t, V_ref, theta)."""
-        made: tuple[Any, Any] = self._of(*now, e)
-        return made
-
-
 class _Voltage:
     """The terminal voltage as the rms of a space vector that is linear in x and E.
 
@@ -386,7 +310,7 @@ class _Voltage:
 
 
 def _between(
-    ss: GeneratorModel, exciter: _Exciter, voltage: _Voltage
+    ss: GeneratorModel, exciter: Exciter, voltage: _Voltage
 ) -> tuple[ca.Function, ca.Function]:
     """What stands between the products of two steps of the exciter.
 
@@ -406,19 +330,14 @@ def _between(
     E = [(_later(ca.SX((j + 1) * h)) @ z[n:])[0] for j in range(PACE)]
     V = [ca.sqrt(ca.sumsqr(r[n:]) + rest) for r in rows]
 
-    # the classical Runge-Kutta method.  Under a fault the terminal voltage ripples with twice the
-    # frequency: in the middle a straight line would cut that by 1 %
-    H, middle, rates = PACE * h, V[PACE // 2 - 1], [k1]
-    for share, V_now in ((0.5, middle), (0.5, middle), (1.0, V[-1])):
-        moved = (share * H) * rates[-1]
-        e_now, _ = exciter.near(moved, e, V_ref, th)
-        rates.append(exciter.at((slow + moved, V_now, V_ref, th), e_now)[0])
-    _, k2, k3, k4 = rates
-    moved = (H / 6) * (k1 + 2 * (k2 + k3)) + (H / 6) * k4
-    after, (e_after, near) = slow + moved, exciter.near(moved, e, V_ref, th)
-    k_after, drive = exciter.at((after, V[-1], V_ref, th), e_after)
-    end = after[at.slow.index(at.drive)]
-    miss_after = ca.fmax(miss, ca.fabs(end - E[-1])) + (1 - near)
+    # Under a fault the terminal voltage ripples with twice the frequency: in the middle a straight
+    # line would cut that by 1 %
+    held = V_ref, th
+    V_two = V[PACE // 2 - 1], V[-1]
+    after, e_after, far = exciter.step((slow, k1, e), V_two, held, PACE * h)
+    k_after, drive = exciter.at((after, V[-1], *held), e_after)
+    end = exciter.drive(after)
+    miss_after = ca.fmax(miss, ca.fabs(end - E[-1])) + far
     samples = [ca.vertcat(*own) for own in zip(x, [*E[:-1], end], V, strict=True)]
     outputs = [
         ca.vertcat(x[-1], drive, 1),
@@ -538,7 +457,7 @@ def periodic_step(
     at, kinds = split(ss), parity(ss, 1)
     n = len(at.linear)
     trigs = harmonics // 2 + 1, harmonics // 2  # of cosine and sine, even and odd
-    size = NODES_BY_ANGLE * 2 * (trigs[0] * kinds.even.size + trigs[1] * kinds.odd.size)
+    size = NODES * 2 * (trigs[0] * kinds.even.size + trigs[1] * kinds.odd.size)
     X0, U, TH = (ca.MX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True))
     parameters, DT = ca.MX.sym("series", size + 2), ca.MX.sym("dt")
     w, V_ref = U[ss.u.index("w_r")], U[ss.u.index("V_ref")]
@@ -554,7 +473,7 @@ def periodic_step(
     first = ca.vertcat(plain[0], light[0])
     x_now, terms, V_now = seen.start(X0, U, TH, h, relative[0], first)
 
-    exciter, voltage = _Exciter(ss), _Voltage(ss)
+    exciter, voltage = exciter_of(ss), _Voltage(ss)
     between, before = _between(ss, exciter, voltage)
     held = ca.repmat(ca.vertcat(U, TH), 1, half)
     fixed = ca.vertcat(held[:, :pairs], ca.repmat(h, 1, pairs), angles[:-1:PACE])
