@@ -140,7 +140,8 @@ def test_what_changes_too_fast_or_in_structure_is_left_to_others():
     gone = course_of(KW100, going, end=20.0)
     with pytest.raises(NotApplicable, match="turns into generator_resistive_healthy"):
         gone.numbers(np.array([15.0]))
-    assert gone.numbers(np.array([5.0]))[1].severity[0] == pytest.approx(0.025, rel=1e-8)
+    severity = gone.numbers(np.array([5.0]))[1].severity[0]
+    assert severity == pytest.approx(0.025, rel=1e-7)  # at the end of a piece
 
 
 def test_numbers_of_many_steps_are_those_of_each():

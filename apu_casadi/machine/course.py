@@ -34,7 +34,8 @@ from apu_casadi.machine.propagation import Propagator
 
 DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
 TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
-DEEPEST = 16  # times that an interval may be halved
+DEEPEST = 16  # times that an interval may be halved ...
+PARTED = 3  # ... and so that the mild part of a growing fault need not pay for the severe one
 TERMS = 4  # of polynomials that steps are given, each for as many steps as it fits ...
 _EQUAL = 1e-11  # ... to this error, as of ``TOL``
 _INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
@@ -180,6 +181,7 @@ class Course(Generic[F]):
             bends: set[float] = {t for x in parts for t in x.corners(end)}
             self._ends = [begin, *sorted(t for t in bends if t > begin), end]
         self._pieces: dict[tuple[float, float], Piece[F] | str | None] = {}
+        self._least = 0  # harmonics of the rotor angle, which decide on strides
         self._likely = 1 << 20  # steps that one polynomial may well fit
 
     # -- the coordinate -------------------------------------------------------------------------
@@ -220,7 +222,12 @@ class Course(Generic[F]):
             count = (count + 1) // 2
         self._likely = max(2 * count, self._likely if count == most else 0)
         first = s[0] if before is None else float(self._coordinate(np.array([before]))[0])
-        s = s[: self._smooth(piece, s[:count], first)]
+        smooth = self._smooth(piece, s[:count], first)
+        if not smooth:  # for these strides
+            self._least = fast.finer
+            self._pieces.clear()
+            return self.numbers(t, before)
+        s = s[:smooth]
         rest = piece.at(s, slice(a, None)).T
         b, c = len(self.ss.u), len(self.ss.u) + fast.theta.size
         terms, basis = near[0], near[1][:, : s.size]
@@ -230,7 +237,7 @@ class Course(Generic[F]):
         """Return how many steps change smoothly enough, of which ``first`` is before.
 
         Raises:
-            NotApplicable: not even the first.
+            NotApplicable: not even the first, however fine the strides.
         """
         fast, own = piece.fast, piece
         if first not in piece:
@@ -241,6 +248,8 @@ class Course(Generic[F]):
         jumps, spikes = self._jumps(own, piece, s, first), self._spikes(own, piece, s, first)
         rough = np.flatnonzero((jumps > fast.smooth) | (spikes > fast.spike))
         count = int(rough[0]) if rough.size else s.size
+        if not count and jumps[0] > fast.smooth and fast.finer:
+            return 0
         if not count and jumps[0] > fast.smooth:
             raise NotApplicable(
                 f"{self.ss.name}: load or fault change by {jumps[0]:.1e} of the transition "
@@ -282,10 +291,10 @@ class Course(Generic[F]):
         ends = self._ends
         k = min(max(bisect.bisect_right(ends, s), 1), len(ends) - 1)
         a, b = ends[k - 1], ends[k]
-        for _ in range(DEEPEST):
+        for depth in range(DEEPEST):
             if (a, b) not in self._pieces:
                 try:
-                    self._pieces[a, b] = self._fitted(a, b)
+                    self._pieces[a, b] = self._fitted(a, b, parted=depth < PARTED)
                 except ApuError as error:  # also of a load or fault that cannot be there
                     self._pieces[a, b] = str(error)
             found = self._pieces[a, b]
@@ -297,8 +306,11 @@ class Course(Generic[F]):
             a, b = (a, middle) if s < middle else (middle, b)
         raise NotApplicable(f"{self.ss.name}: no polynomial through its numbers converges")
 
-    def _fitted(self, a: float, b: float) -> Piece[F] | None:
-        """Return the polynomials of [a, b]; None where none of ``DEGREES`` is enough."""
+    def _fitted(self, a: float, b: float, *, parted: bool) -> Piece[F] | None:
+        """Return the polynomials of [a, b]; None where none of ``DEGREES`` is enough.
+
+        Or, where it may be ``parted``, where tables differ in the harmonics that they need.
+        """
         middle, half = (a + b) / 2, (b - a) / 2
         reach, made = half * (1 - _INSIDE), dict[float, tuple[F, np.ndarray]]()
         for degree in DEGREES:
@@ -307,9 +319,12 @@ class Course(Generic[F]):
             if degree >= 8:  # two of them tell enough: one has the largest error of its kind
                 between = between[[0, degree // 2]]
             wanted = [float(x) for x in (*nodes, *between)]
-            tables = [self._table(middle + reach * x, made, x) for x in wanted]
+            least: dict[str, int] = {"harmonics": self._least}
+            tables = [self._table(middle + reach * x, made, x, **least) for x in wanted]
             harmonics = max(t[0].harmonics for t in tables)
             if any(t[0].harmonics != harmonics for t in tables):
+                if parted:
+                    return None
                 made.clear()
                 tables = [
                     self._table(middle + reach * x, made, x, harmonics=harmonics) for x in wanted

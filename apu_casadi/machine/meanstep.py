@@ -9,14 +9,14 @@ knows what ripples.
   speed has just changed.  Polynomials through them times the harmonics are integrated in closed
   form (Filon's method).
 * Periodic coefficients (fault, unbalanced load): :mod:`apu_casadi.machine.turnstep`, with strides
-  half as long beside a severe fault.
+  as long as the severity of the fault allows (``LEVELS``).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -38,25 +38,45 @@ from apu_casadi.machine.transition import (
     parity,
     symmetry,
 )
-from apu_casadi.machine.turnstep import STRIDES, Turn, periodic_step, turn_of
+from apu_casadi.machine.turnstep import Turn, periodic_step, turn_of
 
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
 #: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
-PANELS = ((1, 1 / 160), (1, 1 / 40), (6, (1 - 1 / 160 - 1 / 40) / 6))
+PANELS = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
 #: Longest time, first intervals, in which the stator may settle behind the load and not be sampled.
 LAYER = 0.5
-HARMONICS = (12, 20, 30)  # of the rotor angle that a function takes; the first that fits
-FINE = 32  # with the finer strides
-#: Harmonics of a transition matrix from the fourth on, nominal units, from which strides are finer:
-#: a resistive load of 10, 100 or 225 kW with h = 0.0015, 0.005 or 0.012, an inductive one of 100 kW
-#: with 0.002.  Below, means err by less than 1e-6 with the coarse ones, which take half the time.
-SEVERE = 1e-2
+
+
+class Level(NamedTuple):
+    """What suffices beside faults and unbalanced loads whose power has so many harmonics.
+
+    Args:
+        strides: in a turn.
+        harmonics: of the rotor angle that a function takes; the first that fits.
+        ripple: largest harmonics of a transition matrix from the fourth on, nominal units.
+        smooth: largest change of transition matrices from step to step, nominal units, of loads and
+            faults that change in time: what follows such a jump falls between the samples.
+    """
+
+    strides: int
+    harmonics: tuple[int, ...]
+    ripple: float
+    smooth: float
+
+
+#: No number of harmonics is of two levels.  The first reaches to h = 0.0016 beside a resistive load
+#: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.005 and 0.0015.  Up to there means err by
+#: 4e-7 at most where the speed moves by 1 % a second, by 1e-7 with the second's strides.
+LEVELS = (
+    Level(20, (12,), 1e-3, 1e-4),
+    Level(28, (14, 20, 30), 1e-2, 2e-3),
+    Level(56, (32,), math.inf, 2e-3),
+)
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
-#: Largest change of transition matrices from step to step, nominal units, of loads and faults that
-#: change in time: what follows such a jump falls between the samples, and means err by 1e-6 of it.
-SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
+#: ``Level.smooth`` where coefficients are constant.
+SMOOTH = 3e-4
 #: Largest error of the mean voltage, relative, that a jump of the load or the fault at the start of
 #: a step makes the regulator see; loads and faults that change in time have one in every step.
 JUMP_TOL = 3e-7
@@ -306,7 +326,7 @@ class MeanStep(Rebuilt):
 
     Raises:
         NotApplicable: the model is not linear in its windings, a series does not converge or has
-            more than ``HARMONICS``, or the step is so short that samples cannot be spared.
+            more than fit, or the step is so short that samples cannot be spared.
     """
 
     ss: GeneratorModel
@@ -319,6 +339,7 @@ class MeanStep(Rebuilt):
     layout: tuple[Any, ...]
     advance: Any
     limits: np.ndarray
+    _own: Level
 
     outputs: tuple[str, ...] = ()
     n_out = 0
@@ -349,22 +370,9 @@ class MeanStep(Rebuilt):
             series, self.harmonics = [t.even.ravel() for t in tables], 0
             turn = None  # panels are shares of the step
         else:
-            coarse, fine = STRIDES
-
-            def table_of(strides: int) -> Table:
-                return cached_table(ss, u, given, w_rated, angle=2 * math.pi / strides)
-
-            severe = harmonics >= FINE or _ripple(ss, table_of(coarse)) > SEVERE
-            turn = turn_of(dt, w_rated, fine if severe else coarse)
-            tables = [table_of(turn.strides)]
-            least = max(harmonics, tables[0].harmonics)
-            fit = (FINE,) if severe else HARMONICS
-            self.harmonics = next((k for k in fit if k >= least), 0)
-            if not self.harmonics:
-                raise NotApplicable(
-                    f"{ss.name}: {tables[0].harmonics} harmonics of the rotor angle, {fit[-1]} fit"
-                )
-            table = tables[0].filled(self.harmonics)
+            table, self._own, self.harmonics = self._level(gen, u, given, harmonics)
+            turn = turn_of(dt, w_rated, self._own.strides)
+            tables, table = [table], table.filled(self.harmonics)
             # entries, then terms, then powers
             series = [part.ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
@@ -376,12 +384,35 @@ class MeanStep(Rebuilt):
         self._iw = ss.u.index("w_r")
         self._compiled: Gradual | None = None
 
+    def _level(
+        self, gen: Generator, u: np.ndarray, theta: np.ndarray, harmonics: int
+    ) -> tuple[Table, Level, int]:
+        """Return table and harmonics of the first level that suffices."""
+        ss, w, found = self.ss, gen.machine.w_rated, 0
+        for level in LEVELS:
+            if harmonics > level.harmonics[-1]:
+                continue
+            table = cached_table(ss, u, theta, w, angle=2 * math.pi / level.strides)
+            found = max(harmonics, table.harmonics)
+            fit = next((k for k in level.harmonics if k >= found), 0)
+            if fit and _ripple(ss, table) <= level.ripple:
+                return table, level, fit
+        raise NotApplicable(
+            f"{ss.name}: {found} harmonics of the rotor angle, {LEVELS[-1].harmonics[-1]} fit"
+        )
+
     # -- other numbers of the same structure (:mod:`apu_casadi.machine.course`) -----------------
 
     @property
     def smooth(self) -> float:
         """Largest change of transition matrices from step to step, nominal units."""
-        return SMOOTH["constant" if self.constant else "periodic"]
+        return SMOOTH if self.constant else self._own.smooth
+
+    @property
+    def finer(self) -> int:
+        """Harmonics with which larger ones are resolved; 0 where there are none."""
+        finer = [] if self.constant else [k for k in LEVELS if k.smooth > self._own.smooth]
+        return finer[0].harmonics[0] if finer else 0
 
     #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
     spike: ClassVar[float] = 1e-4

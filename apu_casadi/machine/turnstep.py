@@ -28,21 +28,19 @@ from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through
 
-#: Strides in a turn, where coefficients are periodic: 14 in a period of what ripples, or 28 where a
-#: fault is severe: its power has more than ten harmonics in a turn.
-STRIDES = (28, 56)
-PACE = 2  # of them in a step of the exciter; with 4, its high gain sees the sampling of the ripple
-#: Longest time, strides, in which the stator may settle behind the load and not be sampled.
-LAYER = 0.35
+PACE = 2  # strides in a step of the exciter; with 4, its high gain sees the sampling of the ripple
+#: Longest time, in strides and in turns, in which the stator may settle behind the load and not be
+#: sampled: longer strides do not make slower what a new speed leaves behind.
+LAYER = 0.35, 1 / 80
 _BACK = 8  # samples whose polynomial leads back to the start
-_AROUND = 10  # samples around the end of the step that its polynomial goes through
-_NEAR = _AROUND // 2
 
 
 class Rule(NamedTuple):
-    """Samples before and after an end of the step that its share of the means is made of.
+    """How the end of a step is made of the samples around it.
 
-    And degrees in time of the harmonics of half a turn in them.  With polynomials through ten
+    Its share of the means is made of some samples before and after it, exactly for harmonics of
+    half a turn that change with time as polynomials of the given degrees.  The state comes from a
+    polynomial through so many samples around it.  With polynomials through ten
     samples means beside a severe fault err by 4e-4; with 28 strides by 2e-4, with 56 by 3e-6.  More
     samples do not help: over more than a turn amplitudes are no polynomials of such degrees.
     """
@@ -50,13 +48,15 @@ class Rule(NamedTuple):
     before: int
     after: int
     degrees: Mapping[int, int]
+    around: int
 
 
 #: By the number of strides.
 _RULES = {
-    28: Rule(30, 5, {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}),
+    20: Rule(21, 4, {0: 3, 1: 2, 2: 2, 3: 1, 4: 0}, 16),
+    28: Rule(30, 5, {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}, 10),
     56: Rule(60, 10, {0: 3, 1: 3, 2: 2, 3: 2, **dict.fromkeys(range(4, 8), 1),
-                      **dict.fromkeys(range(8, 14), 0)}),
+                      **dict.fromkeys(range(8, 14), 0)}, 10),
 }  # fmt: skip
 
 
@@ -133,6 +133,16 @@ class Turn(NamedTuple):
         return self.strides // 2
 
     @property
+    def around(self) -> int:
+        """Samples around the end of the step that its polynomial goes through."""
+        return _RULES[self.strides].around
+
+    @property
+    def near(self) -> int:
+        """Half of them."""
+        return self.around // 2
+
+    @property
     def pairs(self) -> int:
         """Steps of the exciter in half a turn."""
         return self.half // PACE
@@ -152,8 +162,9 @@ def turn_of(dt: float, w_rated: float, each: int) -> Turn:
         each: strides in a turn.
     """
     strides = dt * w_rated * each / (2 * math.pi)
-    halves = math.ceil(((1 + SPEED_RANGE) * strides + _NEAR) / (each // 2))
-    return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - _AROUND, each)
+    around = _RULES[each].around
+    halves = math.ceil(((1 + SPEED_RANGE) * strides + around // 2) / (each // 2))
+    return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - around, each)
 
 
 def _slice(values: Any, count: int, at: Any) -> ca.MX:
@@ -169,7 +180,7 @@ class _End:
         r: length of the step in strides.
 
     Attributes:
-        J: last sample before the end; ``_AROUND`` samples go from ``J + 1 - _NEAR`` on.
+        J: last sample before the end; ``turn.around`` samples go from ``J + 1 - turn.near`` on.
         full, fewer: polynomial through these at the end, and through two fewer.
         start: where the exciter's last, shorter step starts.
         middle: polynomial in its middle, of the samples around ``J_middle``.
@@ -178,18 +189,20 @@ class _End:
     def __init__(self, turn: Turn, r: Any) -> None:
         self.turn = turn
         self.J, s = self._placed(r)
-        poly = through(1 - _NEAR, _AROUND)
-        self.full = ca.mtimes(ca.DM(poly), _powers(s, _AROUND))
-        fewer = np.pad(through(2 - _NEAR, _AROUND - 2), ((1, 1), (0, 0)))
-        self.fewer = ca.mtimes(ca.DM(fewer), _powers(s, _AROUND - 2))
+        near, around = turn.near, turn.around
+        poly = through(1 - near, around)
+        self.full = ca.mtimes(ca.DM(poly), _powers(s, around))
+        fewer = np.pad(through(2 - near, around - 2), ((1, 1), (0, 0)))
+        self.fewer = ca.mtimes(ca.DM(fewer), _powers(s, around - 2))
         self.start = PACE * ca.floor(self.J / PACE)
         self.J_middle, s_middle = self._placed((self.start + r) / 2)
-        self.middle = ca.mtimes(ca.DM(poly), _powers(s_middle, _AROUND))
+        self.middle = ca.mtimes(ca.DM(poly), _powers(s_middle, around))
         self._s = s
 
     def _placed(self, r: Any) -> tuple[Any, Any]:
         """Sample before an instant, one that there is also at speeds without a table; the rest."""
-        J = ca.fmin(ca.fmax(ca.floor(r), self.turn.first + _NEAR), self.turn.samples - 1 - _NEAR)
+        near = self.turn.near
+        J = ca.fmin(ca.fmax(ca.floor(r), self.turn.first + near), self.turn.samples - 1 - near)
         return J, r - J
 
     def means(self) -> Any:
@@ -200,7 +213,7 @@ class _End:
         # less what the intervals from J on would give to a sample near it, and what the last does
         after = np.append(np.cumsum(whole[:0:-1])[::-1], 0.0) - 1.0
         last = ca.mtimes(ca.DM(partial), _powers(self._s - 0.5, partial.shape[1])) + ca.DM(after)
-        n, earliest = self.turn.samples, self.turn.first + _AROUND
+        n, earliest = self.turn.samples, self.turn.first + self.turn.around
         begin = earliest + 1 - rule.before
         beyond = n - begin - count
         ends = ca.vertcat(ca.DM.zeros(beyond), last, -ca.DM.ones(beyond))
@@ -239,7 +252,8 @@ class _Seen:
         #: (x, u, theta, length of a stride, weight of a first sample in it, weights as of others)
         #: -> (x as it settles, terms, terminal voltage), both with what passes by before
         h, weight = ca.SX.sym("h"), ca.SX.sym("weight")
-        after, area = settled(ss, False)(x, u, th, LAYER * h)
+        layer = min(LAYER[0], LAYER[1] * turn.strides)
+        after, area = settled(ss, False)(x, u, th, layer * h)
         first, _ = at_sample(after + area / (weight * h), u, th, weights)
         _, V_seen = at_sample(after + area * (6 / (PACE * h)), u, th, weights)
         made = [after, first, V_seen]
@@ -395,15 +409,16 @@ def _seen_of_a_jump(V_now: Any, V: Sequence[Any], length: Any) -> Any:
 
     It takes the voltage of the first instant for true over a sixth of its first step; a jump of the
     load or the fault moves it for microseconds.  What it would be without is told by the samples
-    after it, but for their ripple, and by those half a turn apart, which ripple alike, but for what
-    settles within a turn: it is off by no more than either says.
+    after it less those half a turn later, which ripple alike, and by samples half a turn apart, but
+    for what settles within a turn: it is off by no more than either says.
 
     Args:
         V_now: at the first instant.
         V: those at the samples of the first half turns, (1, half) each.
         length: of the step, in strides.
     """
-    near = ca.mtimes(V[0][:_BACK], ca.DM(through(1, _BACK)[:, 0]))
+    moved = V[0][:_BACK] - V[1][:_BACK]
+    near = V[0][-1] + ca.mtimes(moved, ca.DM(through(1, _BACK)[:, 0]))
     a, b, c = (v[-1] for v in V[:3])
     off = (ca.fabs(1 - v / V_now) for v in (near, 3 * a - 3 * b + c))
     return ca.fmin(*off) * PACE / (6 * length)
@@ -428,15 +443,16 @@ def _at_end(ss: GeneratorModel, chain: _Chain, end: _End) -> tuple[Any, Any, lis
     rows, n_S = n + 2, chain.starts[0].numel() // pairs
     tail = ca.vertcat(*(ca.vec(v) for v in chain.samples[first:]))
     begin = 1 + half * first  # number of the first sample of the tail
+    near, count_around = end.turn.near, end.turn.around
 
     def around(J: Any) -> Any:
-        place = (J + 1 - _NEAR - begin) * rows
-        return ca.reshape(_slice(tail, rows * _AROUND, place), rows, _AROUND)
+        place = (J + 1 - near - begin) * rows
+        return ca.reshape(_slice(tail, rows * count_around, place), rows, count_around)
 
     # the phases as they are after so many half turns
     count = half * (end.turn.halves - first)
     signs = ca.DM((-1.0) ** (first + np.arange(count) // half))
-    turned = _slice(ca.MX(signs), _AROUND, end.J + 1 - _NEAR - begin)
+    turned = _slice(ca.MX(signs), count_around, end.J + 1 - near - begin)
     weights = ca.horzcat(end.full, end.fewer)
     keep = np.append(parity(ss, 1).sign[:n], [1.0, 1.0]) > 0
     samples = around(end.J)
