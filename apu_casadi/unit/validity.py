@@ -26,11 +26,11 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import mul
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from apu_casadi.core.errors import (
     ApuWarning,
@@ -363,7 +363,7 @@ class FollowedRotor:
         return M, rows[0]
 
     def _move(self, h: float) -> np.ndarray:
-        """Exact step of (n, x) over h, and the demand at its end: factors of n, x, d and 1."""
+        """Exact step of (n, x) over h: factors of n, x, d and 1."""
         if h in self._moves:
             return self._moves[h]
         M, m = self._matrix, self.state.size
@@ -378,28 +378,53 @@ class FollowedRotor:
             E = E @ E
         if len(self._moves) > 64:
             self._moves.clear()
-        self._moves[h] = np.vstack([E[:m], self._demand @ E])
+        self._moves[h] = E[:m]
         return self._moves[h]
 
     def _driven(self, h: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Return the speeds after steps of lengths h by their disturbances."""
-        low, high = self.link.governor.Wf_min, self.link.governor.Wf_max
-        speeds = list[float]()
-        now, state = float(self._demand @ [*self.state, 0.0, 1.0]), self.state.tolist()
-        steps = np.round(h, 12).tolist()  # equal but for rounding: one exponential
-        last, move = math.nan, list[list[float]]()
-        for step, dist in zip(steps, d.tolist(), strict=True):
-            if step != last:
-                last, move = step, self._move(step).tolist()
-            v = (*state, dist, 1.0)  # so few numbers are quicker without arrays
-            *after, then = [sum(map(mul, row, v)) for row in move]
-            if not (low < now < high and low < then < high):
-                after = self._by_parts(np.array(state), step, dist).tolist()
-                then = float(self._demand @ [*after, dist, 1.0])
-            now, state = then, after
-            speeds.append(state[0])
-        self.state = np.array(state)
-        return np.array(speeds)
+        speeds, k, span = np.empty(h.size), 0, h.size
+        steps = np.round(h, 12)  # equal but for rounding: one exponential
+        ends = np.append(np.flatnonzero(np.diff(steps)) + 1, steps.size)
+        now = float(self._demand @ [*self.state, 0.0, 1.0])
+        while k < h.size:
+            end = min(k + span, int(ends[np.searchsorted(ends, k, side="right")]))
+            states, demand = self._unlimited(float(steps[k]), d[k:end])
+            limited = ~self._free(np.append(now, demand)[:-1]) | ~self._free(demand)
+            count = int(limited.argmax()) if limited.any() else end - k
+            span = 2 * span
+            if count:
+                speeds[k : k + count] = states[:count, 0]
+                self.state, now, k = states[count - 1], float(demand[count - 1]), k + count
+            else:
+                step, dist = float(steps[k]), float(d[k])
+                self.state = self._by_parts(self.state, step, dist)
+                now = float(self._demand @ [*self.state, dist, 1.0])
+                speeds[k], k, span = self.state[0], k + 1, 1
+        return speeds
+
+    def _free(self, demand: np.ndarray) -> np.ndarray:
+        """Whether demands of fuel, kg/s, lie between the limits."""
+        governor = self.link.governor
+        return np.asarray((demand > governor.Wf_min) & (demand < governor.Wf_max))
+
+    def _unlimited(self, step: float, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States after steps without limits, (steps, states), and the demand at their ends.
+
+        They follow from one another: a triangular system of equations with as many bands as two
+        states have entries, whose solution does not depend on how many steps it has.
+        """
+        move, m = self._move(step), self.state.size
+        A, by_d, rest = move[:, :m], move[:, m], move[:, m + 1]
+        bands = np.zeros((2 * m, m * (d.size + 1)))
+        for p in range(m):
+            for q in range(m):
+                bands[m + p - q, q::m] = -A[p, q]
+        given = np.vstack([self.state, d[:, None] * by_d + rest])
+        solved, _ = dtbtrs(bands, given.reshape(-1, 1), uplo="L", diag="U")
+        states = solved.reshape(-1, m)[1:]
+        demand = states @ self._demand[:m] + d * self._demand[m] + self._demand[m + 1]
+        return states, np.asarray(demand)
 
     def _by_parts(self, state: np.ndarray, h: float, dist: float) -> np.ndarray:
         def rates(s: np.ndarray) -> np.ndarray:
