@@ -27,6 +27,8 @@ from apu_casadi.machine.machinedata import (
 from apu_casadi.machine.periodic import Turn
 from apu_casadi.machine.wrsg import Windings, saturation
 
+SETTLING = 20  # rounds in which a regulated voltage settles, if it does
+
 
 @dataclass(frozen=True, eq=False)
 class GeneratorPoint(Parametric):
@@ -138,6 +140,12 @@ class AtRest:
                 f"w_r = {w_r:.5g} rad/s: even at {low:.4g} V the regulator would need "
                 f"V_R = {self.at(load, w_r, low)[1].V_R:.4g}, ceiling {e.V_R_max:g}"
             )
+        V = high
+        for _ in range(SETTLING):  # with so high a gain it settles, by a hundred times a round
+            off = excess(V) * rated
+            if abs(off) <= 1e-15 * rated:
+                return V
+            V = min(max(V - off, low), high)
         return _root(excess, low, high)
 
     def excited(self, load: Load, w_r: float, V_fd: float) -> float:

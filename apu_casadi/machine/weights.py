@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.polynomial import Chebyshev, Polynomial, legendre
+from numpy.polynomial import chebyshev, legendre
 
 _TERMS = (
     17  # of polynomials over an interval, in which the fastest harmonic turns by 2.7 rad: 1e-15
@@ -77,12 +77,14 @@ def rippling(
     first = sum(integral(k, k + 1.0) for k in range(1 - before, 0))
     x = (1 + np.cos(math.pi * (np.arange(_TERMS) + 0.5) / _TERMS)) / 2
     values = np.array([integral(0.0, float(v)) for v in x])
-    rows = []
-    for column in values.T:
-        fit = Chebyshev.fit(x, column, _TERMS - 1, domain=[0, 1])
-        own = fit.convert(kind=Polynomial, domain=[0, 1], window=[-0.5, 0.5]).coef
-        rows.append(np.pad(own, (0, _TERMS - own.size)))
-    return np.asarray(first), np.array(rows)
+    by_chebyshev = np.linalg.solve(chebyshev.chebvander(2 * x - 1, _TERMS - 1), values)
+    to_powers = np.array([_padded(chebyshev.cheb2poly(row)) for row in np.eye(_TERMS)])
+    rows = by_chebyshev.T @ to_powers * 2.0 ** np.arange(_TERMS)
+    return np.asarray(first), np.asarray(rows)
+
+
+def _padded(powers: np.ndarray) -> np.ndarray:
+    return np.pad(powers, (0, _TERMS - powers.size))
 
 
 def gregory(n: int) -> np.ndarray:

@@ -263,7 +263,7 @@ class Machines:
         self._check_block(grid)
         middles = (grid[1:] + grid[:-1]) / 2
         fast, numbers = zip(*(g.numbers_over(middles, before) for g in self.groups), strict=True)
-        blocks = min(now.basis.shape[1] for now in numbers) // steps
+        blocks = min(middles.size, *(now.basis.shape[1] for now in numbers)) // steps
         if not blocks:
             raise NotApplicable("numbers of fewer steps than a block has go together")
         wide, n = self._wide_block(fast, steps), blocks * steps

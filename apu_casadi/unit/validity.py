@@ -26,11 +26,11 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import mul
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-from scipy.linalg.lapack import dtbtrs
 
 from apu_casadi.core.errors import (
     ApuWarning,
@@ -409,22 +409,16 @@ class FollowedRotor:
         return np.asarray((demand > governor.Wf_min) & (demand < governor.Wf_max))
 
     def _unlimited(self, step: float, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States after steps without limits, (steps, states), and the demand at their ends.
-
-        They follow from one another: a triangular system of equations with as many bands as two
-        states have entries, whose solution does not depend on how many steps it has.
-        """
+        """States after steps without limits, (steps, states), and the demand at their ends."""
         move, m = self._move(step), self.state.size
-        A, by_d, rest = move[:, :m], move[:, m], move[:, m + 1]
-        bands = np.zeros((2 * m, m * (d.size + 1)))
-        for p in range(m):
-            for q in range(m):
-                bands[m + p - q, q::m] = -A[p, q]
-        given = np.vstack([self.state, d[:, None] * by_d + rest])
-        solved, _ = dtbtrs(bands, given.reshape(-1, 1), uplo="L", diag="U")
-        states = solved.reshape(-1, m)[1:]
-        demand = states @ self._demand[:m] + d * self._demand[m] + self._demand[m + 1]
-        return states, np.asarray(demand)
+        rows, state, states = move[:, :m].tolist(), self.state.tolist(), list[list[float]]()
+        for given in (d[:, None] * move[:, m] + move[:, m + 1]).tolist():
+            # so few numbers are quicker without arrays
+            state = [g + sum(map(mul, row, state)) for g, row in zip(given, rows, strict=True)]
+            states.append(state)
+        made = np.array(states)
+        demand = made @ self._demand[:m] + d * self._demand[m] + self._demand[m + 1]
+        return made, np.asarray(demand)
 
     def _by_parts(self, state: np.ndarray, h: float, dist: float) -> np.ndarray:
         def rates(s: np.ndarray) -> np.ndarray:

@@ -32,14 +32,12 @@ law.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import BSpline
 
 from apu_casadi.core.errors import MapError
 from apu_casadi.core.parameters import Parameters, par
@@ -71,6 +69,27 @@ class MapPoint(NamedTuple):
     off: Any
 
 
+def b_splines(knots: np.ndarray, sites: np.ndarray, order: int = 0) -> np.ndarray:
+    """Return the cubic B-splines on some knots, or a derivative of them, at sites.
+
+    By CasADi's: to import SciPy's takes longer than all else that a trim needs.
+
+    Args:
+        knots: rising, with fourfold ends, (n + 4,).
+        sites: shape (m,).
+        order: of the derivative, two at most: CasADi 3.7 crashes at the third.
+
+    Returns:
+        Shape (m, n).
+    """
+    n, x = knots.size - 4, ca.MX.sym("x")
+    made = ca.bspline(x, ca.DM(np.eye(n).ravel()), [knots.tolist()], [3], n)
+    for _ in range(order):
+        made = ca.jacobian(made, x)
+    each = ca.Function("b_splines", [x], [ca.densify(made)]).map(sites.size)
+    return np.asarray(each(sites[None])).T
+
+
 def spline_operator(x: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np.ndarray]:
     """Return knots and the matrix from data to B-spline coefficients of a natural cubic spline.
 
@@ -87,9 +106,8 @@ def spline_operator(x: np.ndarray, lo: float, hi: float) -> tuple[np.ndarray, np
     """
     knots = np.concatenate([[lo] * 4, x, [hi] * 4])
     n = x.size
-    basis = BSpline(knots, np.eye(n + 4), 3)
     sites = np.array([lo, x[0], x[-1], hi])
-    A = np.vstack([basis(x), basis.derivative(2)(sites)])
+    A = np.vstack([b_splines(knots, x), b_splines(knots, sites, 2)])
     return knots, np.linalg.solve(A, np.eye(n + 4)[:, :n])
 
 
@@ -116,12 +134,10 @@ def level_operator(
     inner, outer = [x[0] - a / 2, x[-1] + b / 2], [x[0] - a, x[-1] + b]
     knots = np.concatenate([[lo] * 4, [outer[0], inner[0]], x, [inner[1], outer[1]], [hi] * 4])
     n = x.size
-    basis = BSpline(knots, np.eye(n + 8), 3)
-    slope, curvature = basis.derivative(1), basis.derivative(2)
-    common = [basis(x), curvature(np.array([lo, outer[0], x[0], x[-1], outer[1], hi]))]
-    made = []
-    for condition in (curvature(np.array(inner)), slope(np.array(outer))):
-        A = np.vstack([*common, condition])
+    level = np.array([lo, outer[0], x[0], x[-1], outer[1], hi])
+    common, made = [b_splines(knots, x), b_splines(knots, level, 2)], []
+    for sites, order in ((inner, 2), (outer, 1)):
+        A = np.vstack([*common, b_splines(knots, np.array(sites), order)])
         made.append(np.linalg.solve(A, np.eye(n + 8)[:, :n]))
     return knots, made[0], made[1]
 
@@ -143,10 +159,10 @@ def local_cubics(knots: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     breaks = knots[3:-3]
     width = np.diff(breaks).reshape(-1, *[1] * (C.ndim - 1))
-    spline = BSpline(knots, C, 3)
-    return breaks, np.stack(
-        [spline(breaks[:-1], nu=k) * width**k / math.factorial(k) for k in range(4)]
-    )
+    value, slope, bend = (np.tensordot(b_splines(knots, breaks, k), C, 1) for k in range(3))
+    rise = np.diff(bend, axis=0)  # the second derivative is straight in between
+    of_cell = [value[:-1], slope[:-1] * width, bend[:-1] * width**2 / 2, rise * width**2 / 6]
+    return breaks, np.stack(of_cell)
 
 
 def _held(x: Any, breaks: np.ndarray) -> Any:
