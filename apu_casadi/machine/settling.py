@@ -20,6 +20,7 @@ beside an inductive load, that current alone, with the stator among what is slow
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -36,6 +37,9 @@ ORDER = {True: 2, False: 3}
 #: Fastest mode, over 1/T, up to which it is done.  Beside an open phase (3e4) what the ripple of
 #: the others leaves in the derivatives is not small, and a step that begins settled was 5e-6 off.
 STIFF = 300.0
+#: Longest time, in strides, in which something passes by of which strides miss a part: a third as
+#: long, they integrate it to 1e-4.
+SLOWEST = 1.2
 
 
 @kept
@@ -50,16 +54,11 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
         ss: model variant, linear in its windings.
         constant: whether the coefficients do not depend on the rotor angle.
     """
-    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-    x, u, th, T = (ca.SX.sym(k, n) for k, n in zip("xuts", (nx, nu, nt, 1), strict=True))
-    stator = ss.x.indices([n for n in _STATOR if n in ss.linear])
-    f, rates = ss.f(x, u, th), ca.SX(nx, 1)
-    moving = [*ss.x.indices(ss.linear), ss.x.index("theta_e")]
-    rates[moving] = f[moving]  # the exciter does not move within microseconds
-    own = ca.densify(ca.jacobian(f[stator], x)[:, stator])
-    fastest = ca.mmax(ca.fabs(ca.diag(own))) * T
+    T = ca.SX.sym("T")
+    of_model, (x, u, th) = _Fast.of(ss, constant)
+    f, stator = of_model.f, ss.x.indices([n for n in _STATOR if n in ss.linear])
+    fastest = of_model.fastest(stator) * T
     light = ca.logic_and(ca.gt(fastest, 1.0), ca.lt(fastest, STIFF))
-    of_model = _Fast(ss, x, f, rates, ORDER[constant])
     if "i_fault" not in ss.linear:
         outputs = [ca.if_else(light, part, 0.0) for part in of_model.passing(stator, T)]
     else:
@@ -76,8 +75,38 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     return ca.Function("settled", [x, u, th, T], [x + outputs[0], outputs[1]], {"cse": True})
 
 
+@kept
+def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
+    """Function (x, x as it settles, u, theta, h) -> area that sums of samples h, s, apart miss.
+
+    What takes as long as a stride is too slow for :func:`settled`, and too fast for samples: of
+    exp(-t/T) they leave an area that depends on h/T alone.  Here it is that of states over time,
+    for periodic coefficients.  A ripple leaves some of it too, the same after half a turn.
+
+    Args:
+        left: n, a, b and c of :func:`apu_casadi.machine.weights.unresolved`.
+    """
+    of_model, (x, u, th) = _Fast.of(ss, False)
+    after, h, (n, *below) = ca.SX.sym("after", x.numel()), ca.SX.sym("h"), left
+    fast = ss.x.indices([k for k in (*_STATOR, "i_fault") if k in ss.linear])
+    J = of_model.jacobian(fast)
+    passes = of_model.unsettled(fast, SLOWEST * h, J)[0] + (after - x)[fast]
+    Z, eye = -h * J, ca.SX.eye(len(fast))
+    Z2 = ca.mtimes(Z, Z)
+    Z3 = ca.mtimes(Z2, Z)
+    divisor = eye + sum(k * power for k, power in zip(below, (Z, Z2, Z3), strict=True))
+    area = ca.SX.zeros(x.numel())
+    resolved = -n * h * ca.solve(divisor, ca.mtimes(Z3, passes))
+    area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
+    return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
+
+
 class _Fast(NamedTuple):
-    """A model's rates: f all of them, ``rates`` those of what moves within microseconds."""
+    """A model's rates: f all of them, ``rates`` those of what moves within microseconds.
+
+    Beside R-L loads diagonals of what follows from the jacobian pass through zero with the rotor
+    angle: not by them it is solved.
+    """
 
     ss: GeneratorModel
     x: Any
@@ -85,20 +114,48 @@ class _Fast(NamedTuple):
     rates: Any
     order: int
 
+    @classmethod
+    def of(cls, ss: GeneratorModel, constant: bool) -> tuple[_Fast, tuple[Any, Any, Any]]:
+        """Return it with its symbols: state, inputs and theta."""
+        x, u, th = (
+            ca.SX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True)
+        )
+        f, rates = ss.f(x, u, th), ca.SX(len(ss.x), 1)
+        moving = [*ss.x.indices(ss.linear), ss.x.index("theta_e")]
+        rates[moving] = f[moving]  # the exciter does not move within microseconds
+        return cls(ss, x, f, rates, ORDER[constant]), (x, u, th)
+
+    def jacobian(self, of: list[int]) -> Any:
+        """Return the rates' derivatives by some of the states themselves."""
+        return ca.densify(ca.jacobian(self.f[of], self.x)[:, of])
+
+    def fastest(self, of: list[int]) -> Any:
+        """Return the rate of the fastest of some states, 1/s."""
+        return ca.mmax(ca.fabs(ca.diag(self.jacobian(of))))
+
+    def unsettled(self, fast: list[int], T: Any, J: Any) -> tuple[Any, Any]:
+        """Return what of some entries of the state passes by within T, and its area.
+
+        Args:
+            J: their own jacobian.
+        """
+        n, d = len(fast), self.f[fast]
+        for _ in range(self.order - 1):
+            d = ca.jtimes(d, self.x, self.rates)
+        J_inv = inverse(n)(J)
+        G2 = ca.mtimes(J_inv, J_inv) / T**2
+        K = ca.solve(ca.SX.eye(n) + ca.mtimes(G2, G2), J_inv)
+        for _ in range(self.order):
+            d = ca.mtimes(K, d)
+        return d, -ca.mtimes(J_inv, d)
+
     def passing(self, fast: list[int], T: Any) -> list[Any]:
         """Return the change of the state until some of its entries have settled, and the area."""
-        x, f, n = self.x, self.f, len(fast)
+        x, f = self.x, self.f
         all_slow = self.ss.x.indices([n for n in (*_STATOR, *_ROTOR) if n in self.ss.linear])
         slow = [i for i in all_slow if i not in fast]
         J, coupled = (ca.densify(ca.jacobian(f[rows], x)[:, fast]) for rows in (fast, slow))
-        J_inv, d = inverse(n)(J), f[fast]
-        for _ in range(self.order - 1):
-            d = ca.jtimes(d, x, self.rates)
-        G2 = ca.mtimes(J_inv, J_inv) / T**2
-        K = ca.mtimes(inverse(n)(ca.SX.eye(n) + ca.mtimes(G2, G2)), J_inv)
-        for _ in range(self.order):
-            d = ca.mtimes(K, d)
-        D = -ca.mtimes(K, d)
+        d, D = self.unsettled(fast, T, J)
         change, area = ca.SX.zeros(x.numel()), ca.SX.zeros(x.numel())
         change[fast], area[fast] = -d, D
         # what passes by in the stator moves the rotor's flux linkages for good
