@@ -24,10 +24,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from apu_casadi.core.sharing import kept
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.transition import inverse
+from apu_casadi.machine.weights import end_weights, unresolved
 
 _STATOR = ("lam_sq", "lam_sd", "lam_s0")
 _ROTOR = ("lam_fd", "lam_kd", "lam_kq")
@@ -99,6 +101,33 @@ def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
     resolved = -n * h * ca.solve(divisor, ca.mtimes(Z3, passes))
     area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
     return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
+
+
+#: What single samples leave of a voltage that passes by: they take it as a cubic, by values and
+#: rates at both ends.
+_HERMITE = unresolved(np.array([0.5, 1.0, 1.0]), 1 / 12)
+UNEVEN = np.append(end_weights(10), [1.0, 1.0])  # of the first samples in means
+
+
+def begun(
+    ss: GeneratorModel, V_of: ca.Function, x: Any, held: tuple[Any, Any], h: Any
+) -> tuple[Any, tuple[Any, Any]]:
+    """What means, and what the exciter, take for the first sample of a step by single samples.
+
+    Behind the resistance of a light load, or of a fault beside an inductive one, what a new speed
+    or a new severity leaves settles within microseconds: it counts by its area.
+
+    Args:
+        x, held, h: state, inputs and theta, length of a sample.
+
+    Returns:
+        A state, and terminal voltage with its rate.
+    """
+    settles, area = settled(ss, False)(x, *held, h / 4)
+    late = [missed(ss, k)(x, settles, *held, h) for k in (unresolved(UNEVEN), _HERMITE)]
+    of_means = settles + (area + late[0]) / (float(UNEVEN[0]) * h)
+    V_seen = V_of(settles + (area + late[1]) * (2 / h), *held)[0]
+    return of_means, (V_seen, V_of(settles, *held)[1])
 
 
 class _Fast(NamedTuple):
