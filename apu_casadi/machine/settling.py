@@ -28,7 +28,6 @@ import numpy as np
 
 from apu_casadi.core.sharing import kept
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.transition import inverse
 from apu_casadi.machine.weights import end_weights, unresolved
 
 _STATOR = ("lam_sq", "lam_sd", "lam_s0")
@@ -91,14 +90,14 @@ def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
     of_model, (x, u, th) = _Fast.of(ss, False)
     after, h, (n, *below) = ca.SX.sym("after", x.numel()), ca.SX.sym("h"), left
     fast = ss.x.indices([k for k in (*_STATOR, "i_fault") if k in ss.linear])
-    J = of_model.jacobian(fast)
-    passes = of_model.unsettled(fast, SLOWEST * h, J)[0] + (after - x)[fast]
-    Z, eye = -h * J, ca.SX.eye(len(fast))
+    units, eye = ss.x.nominals[fast], ca.SX.eye(len(fast))
+    passes = of_model.unsettled(fast, SLOWEST * h)[0] + (after - x)[fast] / units
+    Z = -h * of_model.jacobian(fast)
     Z2 = ca.mtimes(Z, Z)
     Z3 = ca.mtimes(Z2, Z)
     divisor = eye + sum(k * power for k, power in zip(below, (Z, Z2, Z3), strict=True))
     area = ca.SX.zeros(x.numel())
-    resolved = -n * h * ca.solve(divisor, ca.mtimes(Z3, passes))
+    resolved = -n * h * units * _solved(divisor, ca.mtimes(Z3, passes))
     area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
     return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
 
@@ -130,12 +129,13 @@ def begun(
     return of_means, (V_seen, V_of(settles, *held)[1])
 
 
-class _Fast(NamedTuple):
-    """A model's rates: f all of them, ``rates`` those of what moves within microseconds.
+def _solved(A: Any, b: Any) -> Any:
+    """Solve by A'A, of which no pivot vanishes: those of A, which turns with the rotor, may."""
+    return ca.solve(ca.mtimes(A.T, A), ca.mtimes(A.T, b))
 
-    Beside R-L loads diagonals of what follows from the jacobian pass through zero with the rotor
-    angle: not by them it is solved.
-    """
+
+class _Fast(NamedTuple):
+    """A model's rates: f all of them, ``rates`` those of what moves within microseconds."""
 
     ss: GeneratorModel
     x: Any
@@ -155,25 +155,26 @@ class _Fast(NamedTuple):
         return cls(ss, x, f, rates, ORDER[constant]), (x, u, th)
 
     def jacobian(self, of: list[int]) -> Any:
-        """Return the rates' derivatives by some of the states themselves."""
-        return ca.densify(ca.jacobian(self.f[of], self.x)[:, of])
+        """Return the rates' derivatives by some of the states themselves, nominal units, 1/s."""
+        units = self.ss.x.nominals[of]
+        return ca.densify(ca.jacobian(self.f[of], self.x)[:, of]) * (units / units[:, None])
 
     def fastest(self, of: list[int]) -> Any:
         """Return the rate of the fastest of some states, 1/s."""
         return ca.mmax(ca.fabs(ca.diag(self.jacobian(of))))
 
-    def unsettled(self, fast: list[int], T: Any, J: Any) -> tuple[Any, Any]:
+    def unsettled(self, fast: list[int], T: Any) -> tuple[Any, Any]:
         """Return what of some entries of the state passes by within T, and its area.
 
-        Args:
-            J: their own jacobian.
+        Both are in nominal units.
         """
-        n, d = len(fast), self.f[fast]
+        n, d, J = len(fast), self.f[fast], self.jacobian(fast)
         for _ in range(self.order - 1):
             d = ca.jtimes(d, self.x, self.rates)
-        J_inv = inverse(n)(J)
+        d = d / self.ss.x.nominals[fast]
+        J_inv = _solved(J, ca.SX.eye(n))
         G2 = ca.mtimes(J_inv, J_inv) / T**2
-        K = ca.solve(ca.SX.eye(n) + ca.mtimes(G2, G2), J_inv)
+        K = _solved(ca.SX.eye(n) + ca.mtimes(G2, G2), J_inv)
         for _ in range(self.order):
             d = ca.mtimes(K, d)
         return d, -ca.mtimes(J_inv, d)
@@ -183,8 +184,8 @@ class _Fast(NamedTuple):
         x, f = self.x, self.f
         all_slow = self.ss.x.indices([n for n in (*_STATOR, *_ROTOR) if n in self.ss.linear])
         slow = [i for i in all_slow if i not in fast]
-        J, coupled = (ca.densify(ca.jacobian(f[rows], x)[:, fast]) for rows in (fast, slow))
-        d, D = self.unsettled(fast, T, J)
+        coupled, units = ca.densify(ca.jacobian(f[slow], x)[:, fast]), self.ss.x.nominals[fast]
+        d, D = (units * part for part in self.unsettled(fast, T))
         change, area = ca.SX.zeros(x.numel()), ca.SX.zeros(x.numel())
         change[fast], area[fast] = -d, D
         # what passes by in the stator moves the rotor's flux linkages for good
