@@ -20,6 +20,7 @@ beside an inductive load, that current alone, with the stator among what is slow
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -97,7 +98,7 @@ def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
     Z3 = ca.mtimes(Z2, Z)
     divisor = eye + sum(k * power for k, power in zip(below, (Z, Z2, Z3), strict=True))
     area = ca.SX.zeros(x.numel())
-    resolved = -n * h * units * _solved(divisor, ca.mtimes(Z3, passes))
+    resolved = -n * h * units * ca.solve(divisor, ca.mtimes(Z3, passes))
     area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
     return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
 
@@ -127,11 +128,6 @@ def begun(
     of_means = settles + (area + late[0]) / (float(UNEVEN[0]) * h)
     V_seen = V_of(settles + (area + late[1]) * (2 / h), *held)[0]
     return of_means, (V_seen, V_of(settles, *held)[1])
-
-
-def _solved(A: Any, b: Any) -> Any:
-    """Solve by A'A, of which no pivot vanishes: those of A, which turns with the rotor, may."""
-    return ca.solve(ca.mtimes(A.T, A), ca.mtimes(A.T, b))
 
 
 class _Fast(NamedTuple):
@@ -172,12 +168,14 @@ class _Fast(NamedTuple):
         for _ in range(self.order - 1):
             d = ca.jtimes(d, self.x, self.rates)
         d = d / self.ss.x.nominals[fast]
-        J_inv = _solved(J, ca.SX.eye(n))
-        G2 = ca.mtimes(J_inv, J_inv) / T**2
-        K = _solved(ca.SX.eye(n) + ca.mtimes(G2, G2), J_inv)
+        # (1 + G^4)^-1 J^-1 by two quadratic factors, in nominal units: with fast and slow modes at
+        # once, the fourth power itself has too few digits for one of them
+        Y, eye = J * T, ca.SX.eye(n)
+        Y2, around = ca.mtimes(Y, Y), math.sqrt(2) * Y
+        K = T * ca.solve(Y2 + around + eye, ca.solve(Y2 - around + eye, ca.mtimes(Y2, Y)))
         for _ in range(self.order):
             d = ca.mtimes(K, d)
-        return d, -ca.mtimes(J_inv, d)
+        return d, -ca.solve(J, d)
 
     def passing(self, fast: list[int], T: Any) -> list[Any]:
         """Return the change of the state until some of its entries have settled, and the area."""
