@@ -6,6 +6,7 @@ file; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by a closed terminal.
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
@@ -37,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         from scenarios.shell import streams
 
         files.account(True)
+        if g.own:  # what models are made of stays: to look through it again and again takes 3 %
+            gc.set_threshold(100_000)
         try:
             with streams.tolerant():
                 return streams.finish(_guarded(argv, g), own=g.own)

@@ -407,7 +407,7 @@ def test_an_interrupted_command_says_what_is_kept(tmp_path, monkeypatch, capsys)
     assert f"3 of 7 runs are kept in {tmp_path}; the same command goes" in capsys.readouterr().err
 
 
-@pytest.mark.slow  # two campaigns over processes, each with the start of its interpreters
+@pytest.mark.ci  # two campaigns over processes, each with the start of its interpreters
 @pytest.mark.skipif(os.name == "nt", reason="no SIGTERM there")
 def test_sigterm_ends_a_campaign_as_ctrl_c_does(tmp_path):
     """Status, words, what is kept; and the same command gives what an undisturbed one gives."""

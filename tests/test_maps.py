@@ -19,6 +19,7 @@ from apu_casadi.gaspath.maps.scaledmaps import (
     MapCalibration,
     MapPoint,
     ScaledMap,
+    b_splines,
     map_function,
     off_function,
     scale_map,
@@ -205,6 +206,18 @@ def test_off_is_zero_inside_and_counts_spans_outside(table):
         np.array(f(table.N[0] - 0.5 * dN, table.beta[-1] + 0.25 * db)).ravel(), [0.5, -0.5, 0.25]
     )
     assert_allclose(np.array(f(table.N[1], table.beta[0] - 3 * db)).ravel(), [3, 0, -3])
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_b_splines_are_those_of_scipy(order):
+    """At knots, the ends among them, and between."""
+    from scipy.interpolate import BSpline
+
+    x = np.sort(np.random.default_rng(order).uniform(0.4, 1.1, 9))
+    knots = np.concatenate([[0.02] * 4, x, [2.3] * 4])
+    sites = np.concatenate([x, [0.02, 2.3], np.linspace(0.05, 2.2, 40)])
+    theirs = BSpline(knots, np.eye(knots.size - 4), 3)(sites, nu=order)
+    assert_allclose(b_splines(knots, sites, order), theirs, atol=1e-14 * np.abs(theirs).max())
 
 
 def test_spline_operator_makes_straight_ends():

@@ -110,7 +110,7 @@ LAYOUTS = {
     "unit in cells": (text().replace("36050.500", "36050.500 rpm"), "unit stands in the cells"),
     "keys above": ("Channels,6\nRate,50\n" + text(), "lines 1 to 2, above the column names"),
     "keys above, filled": ("Channels,6,,,,\nRate,50,,,,\n" + text(), "lines 1 to 2, above"),
-    "percent comments": ("% bench 3\n" + text(), "lines 1 to 1, above the column names"),
+    "percent comments": ("% bench 3\n" + text(), "line 1, above the column names"),
     "units above": ("rpm,kPa,degC,degC,kg/h,kW\n" + text(names=DATA), "line 1: taken as a row of"),
     "words, then units": (
         text(names=DATA).replace(

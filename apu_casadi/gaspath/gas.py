@@ -26,6 +26,7 @@ to 6000 K and continue smoothly below 200 K.
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
@@ -87,6 +88,17 @@ def _s_over_R(a: Any, T: Any) -> Any:
     """s0/R at standard pressure of one NASA-9 range; ``a[8]`` is the constant b2."""
     poly = T * (a[3] + T * (a[4] / 2 + T * (a[5] / 3 + T * a[6] / 4)))
     return -a[0] / (2 * T**2) - a[1] / T + a[2] * ca.log(T) + poly + a[8]
+
+
+@once
+def _by_range(formula: Callable[[Any, Any], Any]) -> ca.Function:
+    """Function (coefficients of both ranges, shape (2, 9); T) -> property on the range of T.
+
+    Models take it in as the expression that it is, much faster than Python writes it again.
+    """
+    c, T = ca.SX.sym("c", 2, 9), ca.SX.sym("T")
+    low, high = (formula(ca.horzsplit(c[k, :]), T) for k in (0, 1))
+    return ca.Function("by_range", [c, T], [ca.if_else(T < T_MID, low, high)])
 
 
 @once
@@ -202,12 +214,9 @@ class Gas(Parametric):
 
     def _mix(self, T: Any, FAR: Any, war: Any, formula: Any) -> Any:
         """Evaluate a property per kg of mixture on the range that T is in."""
-        a, w, b = self._pseudo
-        ranges = []
-        for k in (0, 1):
-            c = [a[k, j] + war * w[k, j] + FAR * b[k, j] for j in range(9)]
-            ranges.append(formula(c, T) / (1 + war + FAR))
-        return ca.if_else(T < T_MID, ranges[0], ranges[1])
+        a, w, b = (x if isinstance(x, ca.SX | ca.MX) else ca.DM(x) for x in self._pseudo)
+        (value,) = _by_range(formula).call([a + war * w + FAR * b, T], True, False)
+        return value / (1 + war + FAR)
 
     def R(self, FAR: Any = 0.0, war: Any = 0.0) -> Any:
         """Gas constant, J/(kg K)."""

@@ -68,7 +68,7 @@ class Level(NamedTuple):
 #: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.002 and 0.001, the third to 0.02 and
 #: 0.005.  Means of steps err by 7e-7 at most where one of them changes the speed by 0.3 %.
 LEVELS = (
-    Level(20, (12,), 1e-3, 1e-4),
+    Level(20, (12,), 1e-3, 4e-5),
     Level(28, (14, 20, 30), 5e-3, 2e-3),
     Level(56, (32,), 3.5e-2, 2e-3),
     Level(112, (34,), math.inf, 2e-3),

@@ -421,7 +421,9 @@ def _tell_left_out(h: _Head, above: list[Row], taken: list[Row | None]) -> None:
     left = [k for k, r in above if not any(t is not None and k == t[0] for t in taken)]
     names = taken[0]
     if left and names is not None and left[-1] < names[0]:
-        h.tell(f"{h.path}: lines {left[0]} to {left[-1]}, above the column names, are left out")
+        one = f"line {left[0]}, above the column names, is"
+        several = f"lines {left[0]} to {left[-1]}, above the column names, are"
+        h.tell(f"{h.path}: {one if len(left) == 1 else several} left out")
     elif left and taken[1] is None:
         raise DataError(
             f"{h.path}, line {left[-1]}: what stands between the column names of line "
