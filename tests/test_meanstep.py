@@ -102,7 +102,7 @@ def test_every_speed_of_the_range_and_other_lengths_of_step(fault):
         (SeriesLoad.from_power(10e3), Ttsc(0.05, 500.0)),
         (SeriesLoad.from_power(10e3, 0.85), Ttsc(0.05, 500.0)),
         (SeriesLoad.from_power(10e3), Ttsc(0.05, 49.0, 1.0)),
-        (KW100, Ttsc(0.05, 499.0)),
+        (KW100, Ttsc(0.05, 19.0)),
         (SeriesLoad.from_power(10e3, 0.8), Ttsc(0.05, 49.0)),
     ],
     ids=[
