@@ -68,7 +68,7 @@ class Level(NamedTuple):
 #: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.005 and 0.0015.  Up to there means err by
 #: 4e-7 at most where the speed moves by 1 % a second, by 1e-7 with the second's strides.
 LEVELS = (
-    Level(20, (12,), 1e-3, 1e-4),
+    Level(20, (12,), 1e-3, 4e-5),
     Level(28, (14, 20, 30), 1e-2, 2e-3),
     Level(56, (32,), math.inf, 2e-3),
 )

@@ -34,6 +34,7 @@ from apu_casadi.unit.noise import Noise
 from apu_casadi.unit.recorder import Row
 
 _Way: TypeAlias = Callable[[int], tuple[int, Row]]  # from an instant on: steps, and what they gave
+ROUGH = 20  # steps one by one after a block that could not be taken: what is rough stays so
 STARTS = 16  # steady points of starts that are kept for a unit
 
 
@@ -150,6 +151,7 @@ class JointRun:
         self._changing = self.now.changing
         self._middle = 0.0  # of the last step, s
         self._columns: Columns | None = None
+        self._rough = 0  # steps to be taken one by one before blocks are tried again
         gas, gg = self.point.gas, apu.gas_generator
         self.x, self.u, self.theta = gas.x, gas.u.copy(), gas.theta
         self.y, self.z = gg.output(self.x, self.u, self.theta, z0=gas.z)
@@ -207,17 +209,20 @@ class JointRun:
 
         In an ensemble each is a question, which nothing may come before.
         """
-        block = COURSE if self._changing and not waves else BLOCK
-        most = block if waves or self.asked.strict or (together and self._changing) else ROW * block
-        first = min(free, most) // block * block
-        sizes = [first] if together else dict.fromkeys((first, block))
-        tries: list[_Way]
-        tries = [partial(self._blocks, steps=n, block=block) for n in sizes if 0 < n <= free]
-        few = min(max(1, free), block - 1)
+        tries: list[_Way] = []
         if self._changing and not waves:
-            tries.append(partial(self._blocks, steps=1 if together else few, block=1))
-        elif not waves:
-            tries.append(partial(self._one_by_one, steps=few))
+            most = COURSE if together or self.asked.strict else ROW * COURSE
+            whole = min(free, most) // COURSE * COURSE
+            if whole and not self._rough:
+                tries.append(partial(self._blocks, steps=whole, block=COURSE))
+            few = 1 if together else min(max(1, free), self._rough or COURSE - 1)
+            return [*tries, partial(self._blocks, steps=few, block=1)]
+        strictly = waves or self.asked.strict or (together and self._changing)
+        first = min(free, BLOCK if strictly else ROW * BLOCK) // BLOCK * BLOCK
+        sizes = [first] if together else dict.fromkeys((first, BLOCK))
+        tries = [partial(self._blocks, steps=n, block=BLOCK) for n in sizes if 0 < n <= free]
+        if not waves:
+            tries.append(partial(self._one_by_one, steps=min(max(1, free), BLOCK - 1)))
         return tries
 
     def _once(self, way: int, call: _Way, k: int) -> tuple[int, Row]:
@@ -247,8 +252,10 @@ class JointRun:
                 self._columns = Columns(self.apu.gas_generator, self.now, self.here, self.shaft)
             middles = (grid[1:] + grid[:-1]) / 2
             unit, factors = self._columns(middles)
+            self._rough = ROUGH if block > 1 else self._rough  # unless it goes well
             done, made = self.machines.follow(state, unit, grid, self._middle, block)
             steps = done.y.shape[1]
+            self._rough = 0 if block > 1 else max(0, self._rough - steps)
             self._middle = float(middles[steps - 1])
             if steps < middles.size:
                 factors = {n: v[:steps] if np.ndim(v) else v for n, v in factors.items()}
