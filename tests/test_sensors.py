@@ -348,7 +348,7 @@ def test_offsets_are_states_estimated_or_considered(many):
     assert y["T41"] == pytest.approx(at["T41"], rel=1e-8)
 
 
-@pytest.mark.ci  # thirteen estimates
+@pytest.mark.ci  # sixteen estimates
 def test_declared_sensors_are_believed_and_right_and_undeclared_lags_are_not(drop, many):
     """NEES near 1 with lags, delay, offsets, digits and jitter declared; a lag left out shows."""
     found = [estimate(recorded(drop, many, s), sensors=many, backend="vm") for s in range(12)]
@@ -358,7 +358,9 @@ def test_declared_sensors_are_believed_and_right_and_undeclared_lags_are_not(dro
     assert not any(json.loads(e.gaspath.attrs["alarms"]) for e in found)
     instant = [dataclasses.replace(s, tau=0.0) for s in many.gas_path.sensors]
     fast = dataclasses.replace(many, gas_path=SensorSet(tuple(instant)))
-    assert not estimate(recorded(drop, many, 0), sensors=fast, backend="vm").believable
+    first = drop.sel(time=slice(0.0, 1.5))  # every alarm takes a second more for its causes
+    for seed in range(4):
+        assert not estimate(recorded(first, many, seed), sensors=fast, backend="vm").believable
 
 
 def test_a_considered_error_is_no_change(drop, tmp_path):
