@@ -14,8 +14,8 @@ from apu_casadi.core.means import Term, wanted
 from apu_casadi.core.profiles.points import Points
 from apu_casadi.core.profiles.profile import at, varying
 from apu_casadi.core.profiles.shapes import Growth, Ramp
-from apu_casadi.machine import transition
-from apu_casadi.machine.course import TERMS, Course, Piece
+from apu_casadi.machine import meanstep, transition
+from apu_casadi.machine.course import MOST_TERMS, TERMS, Course, Piece
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.loads.series import SeriesLoad
@@ -175,6 +175,32 @@ def test_polynomials_of_a_low_degree_are_told_to_their_error():
     assert piece.near(np.linspace(6.0, 14.0, 7), 2) is None
     terms, basis = piece.near(np.array([11.0, 11.0]), 1)
     assert_allclose((terms @ basis).T, piece.at(np.array([11.0, 11.0]), [0]), rtol=0)
+
+
+@pytest.mark.long
+def test_a_steep_piece_gives_its_own_polynomials():
+    """Short ones would fit two steps; as many as lie in the piece go together, to its error."""
+    steep = varying(Ttsc.of_h, 0.05, Growth(1e-5, 1e-3, over=1.0))
+    course = course_of(KW100, steep, end=2.0)
+    t = 0.02 + DT * (np.arange(20) + 0.5)
+    fast, many = course.numbers(t)
+    assert many.terms.shape[1] == MOST_TERMS and many.u.shape[1] == 20
+    for k in (0, 7, 19):
+        here = fast.units * (many.terms @ many.basis[:, k] - course.numbers(t[k : k + 1])[1].vector)
+        assert np.abs(here).max() < 1e-11
+
+
+@pytest.mark.long
+def test_strides_become_finer_once_where_a_step_was_refused():
+    """Beside a mild fault; and a course that is over soon takes the usual ones from the start."""
+    mild, usual = (k.harmonics for k in meanstep.LEVELS[:2])
+    slow = varying(Ttsc.of_h, 0.05, Growth(1e-5, 1e-4, over=200.0))
+    course, t = course_of(KW100, slow, end=200.0), np.array([100.0])
+    assert course.numbers(t)[0].harmonics in mild
+    assert course.refine() and course.numbers(t)[0].harmonics in usual
+    assert not course.refine()
+    soon = course_of(KW100, varying(Ttsc.of_h, 0.05, Growth(1e-5, 1e-4, over=20.0)), end=20.0)
+    assert soon.numbers(np.array([10.0]))[0].harmonics in usual
 
 
 def test_tables_are_made_once_for_all_runs(monkeypatch):

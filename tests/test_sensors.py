@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from apu_casadi import Apu, LoadChange, SeriesLoad, simulate_joint
+from apu_casadi import Apu, HealthChange, LoadChange, SeriesLoad, simulate_joint
 from apu_casadi.core.errors import DataError, ParameterError
 from apu_casadi.core.measuring import measure
 from apu_casadi.gaspath.gasgenerator import GasGenerator
@@ -17,7 +17,7 @@ from estimators.apu.fitting import EngineData, fit_engine
 from estimators.apu.gaspath import gas_path_filter, samples
 from estimators.apu.measuring import measure_run
 from estimators.apu.priorfile import Prior
-from estimators.apu.recorded_estimate import estimate
+from estimators.apu.recorded_estimate import JUMPS, estimate
 from estimators.apu.recordings.measured import read_recording
 from estimators.apu.recordings.plausible import PLAUSIBLE
 from estimators.apu.sensorfile import SensorFile, read_sensors
@@ -48,7 +48,11 @@ def slow(**tau):
 
 @pytest.fixture(scope="module")
 def drop():
-    """A joint run with a load drop at 1 s."""
+    """A joint run with a load drop at 1 s.
+
+    Every 20 ms the exchange would err by 5 % of the speed's excursion, with a fuel that is late by
+    a step: an error of the truth that a sensor of the speed by 1 rad/s shows.
+    """
     return simulate_joint(
         Apu(),
         duration=4.0,
@@ -56,6 +60,7 @@ def drop():
         events=[LoadChange(t=1.0, load=SeriesLoad.from_power(80e3))],
         waveform_dt=None,
         solver="propagator",
+        dt=5e-3,
     )
 
 
@@ -343,18 +348,70 @@ def test_offsets_are_states_estimated_or_considered(many):
     assert y["T41"] == pytest.approx(at["T41"], rel=1e-8)
 
 
-@pytest.mark.slow  # a minute: sixteen estimates
+@pytest.mark.ci  # sixteen estimates
 def test_declared_sensors_are_believed_and_right_and_undeclared_lags_are_not(drop, many):
     """NEES near 1 with lags, delay, offsets, digits and jitter declared; a lag left out shows."""
     found = [estimate(recorded(drop, many, s), sensors=many, backend="vm") for s in range(12)]
-    assert 0.5 < np.mean([of_health(e) for e in found]) < 1.6
-    assert sum(e.believable for e in found) >= 11
+    # 0.69 in 48 seeds, in the mean of which it is known to 0.08: the truth is the prior's mean
+    assert 0.4 < np.mean([of_health(e) for e in found]) < 1.2
+    assert all(e.believable for e in found), [e.doubts for e in found]
     assert not any(json.loads(e.gaspath.attrs["alarms"]) for e in found)
     instant = [dataclasses.replace(s, tau=0.0) for s in many.gas_path.sensors]
     fast = dataclasses.replace(many, gas_path=SensorSet(tuple(instant)))
+    first = drop.sel(time=slice(0.0, 1.5))  # every alarm takes a second more for its causes
     for seed in range(4):
-        e = estimate(recorded(drop, many, seed), sensors=fast, backend="vm")
-        assert not e.believable
+        assert not estimate(recorded(first, many, seed), sensors=fast, backend="vm").believable
+
+
+def test_a_considered_error_is_no_change(drop, tmp_path):
+    """What happened is judged by innovations that are white, not by those that hold the offset."""
+    path = tmp_path / "considered.toml"
+    path.write_text(CONSIDERED["T41"])
+    e = estimate(recorded(drop, read_sensors(path), 0), sensors=path, backend="vm")
+    filt, tracked = e.path
+    assert e.believable, e.doubts
+    assert tracked.alarms == ()
+    assert JUMPS.first(tracked.result, JUMPS.hold) is not None
+    assert JUMPS.first(tracked.deciding, JUMPS.hold) is None
+    # the estimate is still the filter's that does not estimate it, the other one's does
+    own, other = (r["bias_T41"][1] for r in (tracked.result, tracked.deciding))
+    assert np.allclose(own, 5.0, rtol=1e-12) and other[-1] < 4.9
+    assert filt.deciding.model.consider == ("gain_J",)
+    plain = gas_path_filter(GG)
+    assert plain.deciding is plain and plain.runs().deciding is None
+
+
+CONSIDERED = {
+    "T41": '[T41]\nbias = 5.0\nbias_as = "considered"\n',
+    "T5": '[T5]\nbias = 5.0\nbias_as = "considered"\n',
+    "P3": '[P3]\ngain = 0.01\ngain_as = "considered"\n',
+}
+
+
+@pytest.mark.ci  # twelve estimates
+@pytest.mark.parametrize("name", CONSIDERED)
+def test_considered_errors_are_no_doubt_and_a_fault_beside_them_is_found(drop, tmp_path, name):
+    """No alarm and no doubt of healthy units; a change of health is found when it comes."""
+    path = tmp_path / "considered.toml"
+    path.write_text(CONSIDERED[name])
+    sensors = read_sensors(path)
+    for seed in range(3):
+        e = estimate(recorded(drop, sensors, seed), sensors=path, backend="vm")
+        assert e.believable, e.doubts
+        assert e.path[1].alarms == ()
+    ill = simulate_joint(
+        Apu(),
+        duration=3.0,
+        load=SeriesLoad.from_power(200e3),
+        events=[HealthChange(t=1.5, factors={"f_eta_t": 0.97})],
+        waveform_dt=None,
+        solver="propagator",
+        dt=5e-3,
+    )
+    e = estimate(recorded(ill, sensors, 0), sensors=path, backend="vm")
+    (alarm,) = json.loads(e.gaspath.attrs["alarms"])
+    assert 1.5 < alarm < 2.0 and e.causes["gas path"][0].best == "gas path"
+    assert e.believable, e.doubts
 
 
 @pytest.mark.long

@@ -251,6 +251,7 @@ class Gradual:
         fun, level: as for :func:`compiled`.
         copy: as for :class:`Caller`.
         by: what compiles, called as :func:`compiled`, which it is by default.
+        often: calls that are enough.
     """
 
     def __init__(
@@ -260,7 +261,9 @@ class Gradual:
         level: int = 1,
         copy: bool = True,
         by: Callable[..., ca.Function] = compiled,
+        often: int = OFTEN,
     ) -> None:
+        self._often = often
         self._fun, self._level, self._copy, self._calls = fun, level, copy, 0
         self._by = by
         self._call = self._made(build=False)
@@ -275,9 +278,9 @@ class Gradual:
 
     def __call__(self, *arrays: np.ndarray | float) -> tuple[np.ndarray, ...]:
         """Evaluate."""
-        if self._calls < OFTEN:
+        if self._calls < self._often:
             self._calls += 1
-            if self._calls == OFTEN and self._call.fun is self._fun:
+            if self._calls == self._often and self._call.fun is self._fun:
                 self._call = self._made(build=True)
         return self._call(*arrays)
 

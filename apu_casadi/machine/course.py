@@ -34,10 +34,14 @@ from apu_casadi.machine.propagation import Propagator
 
 DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
 TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
-DEEPEST = 16  # times that an interval may be halved ...
-PARTED = 3  # ... and so that the mild part of a growing fault need not pay for the severe one
+DEEPEST = 16  # times that an interval may be halved
+#: s, from which on mild faults take longer strides, and a growing fault is parted where it becomes
+#: severe: their tables take as long as a minute of steps gains.
+LONG = 100.0
 TERMS = 4  # of polynomials that steps are given, each for as many steps as it fits ...
-_EQUAL = 1e-11  # ... to this error, as of ``TOL``
+_EQUAL = 1e-11  # ... to this error, as of ``TOL``; where these are fewer than ``FEWEST`` ...
+FEWEST = 20
+MOST_TERMS = DEGREES[-1] + 1  # ... those of the whole piece, which take longer
 _INSIDE = 1e-7  # share of an interval that nodes keep from its ends, where profiles may jump
 #: Products of numbers up to which BLAS does not start threads; with them, waiting takes longer.
 _ONE_THREAD = 250_000
@@ -49,9 +53,9 @@ class Numbers(NamedTuple):
     """What steps take, one column each but for the first.
 
     Args:
-        terms: numbers of what propagates (:attr:`MeanStep.vector`) as polynomials,
-            (numbers, ``TERMS``).
-        basis: their terms in each step, (``TERMS``, steps).
+        terms: numbers of what propagates (:attr:`MeanStep.vector`) as polynomials of ``TERMS`` or
+            of ``MOST_TERMS``, (numbers, terms).
+        basis: the terms in each step, (terms, steps).
         u: inputs, (nu, steps); speed, reference and noise among them do not count.
         theta: parameters as compiled functions take them, (ntheta, steps).
         severity: of the fault, in the order of its ``severities``, (severities, steps).
@@ -140,6 +144,13 @@ class Piece(Generic[F]):
         basis = np.polynomial.chebyshev.chebvander((s - middle) / half, TERMS - 1)
         return terms.T, basis.T
 
+    def whole(self, s: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same by the polynomials of the piece, filled up with zeros."""
+        terms, basis = np.zeros((MOST_TERMS, count)), np.zeros((s.size, MOST_TERMS))
+        degrees = self.powers.shape[0]
+        terms[:degrees], basis[:, :degrees] = self.powers[:, :count], self.basis(s)
+        return terms.T, basis.T
+
 
 class Course(Generic[F]):
     """A load and a fault on their way through a run, beside one model variant.
@@ -182,6 +193,7 @@ class Course(Generic[F]):
             self._ends = [begin, *sorted(t for t in bends if t > begin), end]
         self._pieces: dict[tuple[float, float], Piece[F] | str | None] = {}
         self._least = 0  # harmonics of the rotor angle, which decide on strides
+        self._long = end - begin > LONG
         self._likely = 1 << 20  # steps that one polynomial may well fit
 
     # -- the coordinate -------------------------------------------------------------------------
@@ -206,8 +218,8 @@ class Course(Generic[F]):
             before: the middle of the step before them, if the first goes on from it.
 
         Returns:
-            What propagates, and its numbers in as many steps as polynomials of ``TERMS`` terms fit;
-            they have the first at least.
+            What propagates, and its numbers in as many steps as its polynomials fit: the first at
+            least.
 
         Raises:
             NotApplicable: the numbers change too fast from step to step, or have no polynomial.
@@ -218,26 +230,36 @@ class Course(Generic[F]):
             s = s[: next(k for k, v in enumerate(s) if k and float(v) not in piece)]
         a, fast = piece.fast.vector.size, piece.fast
         count = most = min(s.size, self._likely)
-        while (near := piece.near(s[:count], a)) is None:
-            count = (count + 1) // 2
-        self._likely = max(2 * count, self._likely if count == most else 0)
+        while (near := piece.near(s[:count], a)) is None and count > FEWEST:
+            count = max(FEWEST, (count + 1) // 2)
+        if near is None:
+            count, near = s.size, piece.whole(s, a)
+        else:
+            self._likely = max(2 * count, self._likely if count == most else 0)
         first = s[0] if before is None else float(self._coordinate(np.array([before]))[0])
-        smooth = self._smooth(piece, s[:count], first)
-        if not smooth:  # for these strides
-            self._least = fast.finer
-            self._pieces.clear()
-            return self.numbers(t, before)
-        s = s[:smooth]
+        s = s[: self._smooth(piece, s[:count], first)]
         rest = piece.at(s, slice(a, None)).T
         b, c = len(self.ss.u), len(self.ss.u) + fast.theta.size
         terms, basis = near[0], near[1][:, : s.size]
         return fast, Numbers(terms, basis, rest[:b], rest[b:c], rest[c:])
 
+    def refine(self) -> bool:
+        """Take finer strides from now on, where a step was refused; return whether there are any.
+
+        Under a light load what follows a jump of the fault falls between the coarsest.
+        """
+        found = [p.fast.finer for p in self._pieces.values() if isinstance(p, Piece)]
+        if max(found, default=0) <= self._least:
+            return False
+        self._least = max(found)
+        self._pieces.clear()
+        return True
+
     def _smooth(self, piece: Piece[F], s: np.ndarray, first: float) -> int:
         """Return how many steps change smoothly enough, of which ``first`` is before.
 
         Raises:
-            NotApplicable: not even the first, however fine the strides.
+            NotApplicable: not even the first.
         """
         fast, own = piece.fast, piece
         if first not in piece:
@@ -248,8 +270,6 @@ class Course(Generic[F]):
         jumps, spikes = self._jumps(own, piece, s, first), self._spikes(own, piece, s, first)
         rough = np.flatnonzero((jumps > fast.smooth) | (spikes > fast.spike))
         count = int(rough[0]) if rough.size else s.size
-        if not count and jumps[0] > fast.smooth and fast.finer:
-            return 0
         if not count and jumps[0] > fast.smooth:
             raise NotApplicable(
                 f"{self.ss.name}: load or fault change by {jumps[0]:.1e} of the transition "
@@ -291,10 +311,10 @@ class Course(Generic[F]):
         ends = self._ends
         k = min(max(bisect.bisect_right(ends, s), 1), len(ends) - 1)
         a, b = ends[k - 1], ends[k]
-        for depth in range(DEEPEST):
+        for _ in range(DEEPEST):
             if (a, b) not in self._pieces:
                 try:
-                    self._pieces[a, b] = self._fitted(a, b, parted=depth < PARTED)
+                    self._pieces[a, b] = self._fitted(a, b)
                 except ApuError as error:  # also of a load or fault that cannot be there
                     self._pieces[a, b] = str(error)
             found = self._pieces[a, b]
@@ -306,13 +326,15 @@ class Course(Generic[F]):
             a, b = (a, middle) if s < middle else (middle, b)
         raise NotApplicable(f"{self.ss.name}: no polynomial through its numbers converges")
 
-    def _fitted(self, a: float, b: float, *, parted: bool) -> Piece[F] | None:
+    def _fitted(self, a: float, b: float) -> Piece[F] | None:
         """Return the polynomials of [a, b]; None where none of ``DEGREES`` is enough.
 
-        Or, where it may be ``parted``, where tables differ in the harmonics that they need.
+        Or where tables differ in the harmonics that they need, and the interval is long.
         """
         middle, half = (a + b) / 2, (b - a) / 2
         reach, made = half * (1 - _INSIDE), dict[float, tuple[F, np.ndarray]]()
+        if not self._long:
+            self._least = max(self._least, self._table(middle, {}, 0.0)[0].finer)
         for degree in DEGREES:
             nodes: np.ndarray = _lobatto(degree)
             between: np.ndarray = _lobatto(2 * degree)[1::2]
@@ -323,7 +345,7 @@ class Course(Generic[F]):
             tables = [self._table(middle + reach * x, made, x, **least) for x in wanted]
             harmonics = max(t[0].harmonics for t in tables)
             if any(t[0].harmonics != harmonics for t in tables):
-                if parted:
+                if self._only is None and b - a > 2 * LONG:
                     return None
                 made.clear()
                 tables = [

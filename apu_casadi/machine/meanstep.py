@@ -54,30 +54,29 @@ class Level(NamedTuple):
         strides: in a turn.
         harmonics: of the rotor angle that a function takes; the first that fits.
         ripple: largest harmonics of a transition matrix from the fourth on, nominal units.
-        smooth: largest change of transition matrices from step to step, nominal units, of loads and
-            faults that change in time: what follows such a jump falls between the samples.
     """
 
     strides: int
     harmonics: tuple[int, ...]
     ripple: float
-    smooth: float
 
 
 #: No number of harmonics is of two levels.  The first reaches to h = 0.0016 beside a resistive load
 #: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.002 and 0.001, the third to 0.02 and
-#: 0.005.  Means of steps err by 7e-7 at most where one of them changes the speed by 0.3 %.
+#: 0.005.  Means of steps err by 7e-7 at most where one of them changes the speed by 0.3 %, with the
+#: first's strides by 1.4e-6.
 LEVELS = (
-    Level(20, (12,), 1e-3, 4e-5),
-    Level(28, (14, 20, 30), 5e-3, 2e-3),
-    Level(56, (32,), 3.5e-2, 2e-3),
-    Level(112, (34,), math.inf, 2e-3),
+    Level(20, (12,), 1e-3),
+    Level(28, (14, 20, 30), 5e-3),
+    Level(56, (32,), 3.5e-2),
+    Level(112, (34,), math.inf),
 )
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
-#: ``Level.smooth`` where coefficients are constant.
-SMOOTH = 3e-4
+#: Largest change of transition matrices from step to step, nominal units, of loads and faults that
+#: change in time: what follows such a jump falls between the samples, and means err by 1e-6 of it.
+SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
 #: Largest error of the mean voltage, relative, that a jump of the load or the fault at the start of
 #: a step makes the regulator see; loads and faults that change in time have one in every step.
 JUMP_TOL = 3e-7
@@ -407,13 +406,13 @@ class MeanStep(Rebuilt):
     @property
     def smooth(self) -> float:
         """Largest change of transition matrices from step to step, nominal units."""
-        return SMOOTH if self.constant else self._own.smooth
+        return SMOOTH["constant" if self.constant else "periodic"]
 
     @property
     def finer(self) -> int:
-        """Harmonics with which larger ones are resolved; 0 where there are none."""
-        finer = [] if self.constant else [k for k in LEVELS if k.smooth > self._own.smooth]
-        return finer[0].harmonics[0] if finer else 0
+        """Harmonics with which steps that were refused may be taken; 0 where there are none."""
+        mild = not self.constant and self._own is LEVELS[0]
+        return LEVELS[1].harmonics[0] if mild else 0
 
     #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
     spike: ClassVar[float] = 1e-4

@@ -185,6 +185,10 @@ class Integrator:
         """
         raise NotApplicable("exact propagation does not hold, or is not asked for")
 
+    def refine(self) -> bool:
+        """Take finer strides from now on, where a step was refused; whether there are any."""
+        return False
+
     def waves(self, w: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return instants and waveforms of the steps of a block, of all its samples."""
         return NO_TIMES, NO_WAVES
@@ -249,6 +253,10 @@ class _Exact(Integrator, Generic[F]):
         fast, p = self.for_blocks(), self.phase
         severity = () if p.fault is None else tuple(p.fault.severity.values())
         return fast, Numbers.alike(fast.vector, t.size, p.u, fast.theta, np.array(severity))
+
+    def refine(self) -> bool:
+        """Take finer strides along the way; see :meth:`Course.refine`."""
+        return self._course is not None and self._course.refine()
 
     def fast(self) -> F:
         """Return what propagates.

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from apu_casadi.core.backend import Gradual, backend_in_use
+from apu_casadi.core.backend import OFTEN, Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.lanes.together import Together, asking
@@ -30,7 +30,6 @@ from apu_casadi.core.sharing import Rebuilt, keep
 from apu_casadi.gaspath.cyclefunctions import CycleFunctions
 from apu_casadi.gaspath.gasgenerator import RESIDUAL_TOL
 from apu_casadi.machine.collocated import Collocated
-from apu_casadi.machine.course import TERMS
 from apu_casadi.machine.meanstep import MeanStep
 from apu_casadi.machine.propagation import Propagator
 from apu_casadi.unit.apu import Apu
@@ -106,11 +105,15 @@ class _Machine(NamedTuple):
         sizes |= {"numbers": link.numbers.size, "series": fast.advance.numel_in(1), "dt": 1}
         return cls(*(ca.MX.sym(f"{name}_{k}", n) for name, n in sizes.items()))
 
-    def wide(self, steps: int) -> tuple[list[ca.MX], list[list[ca.MX]]]:
-        """Return symbols of many steps, polynomials for ``series``; and what each step takes."""
+    def wide(self, steps: int, count: int) -> tuple[list[ca.MX], list[list[ca.MX]]]:
+        """Return symbols of many steps, polynomials for ``series``; and what each step takes.
+
+        Args:
+            count: terms of the polynomials.
+        """
         each = [ca.MX.sym(s.name(), s.numel(), steps) for s in self[:3]]
-        terms = ca.MX.sym(f"terms_{self.series.name()}", self.series.numel(), TERMS)
-        basis = ca.MX.sym(f"basis_{self.series.name()}", TERMS, steps)
+        terms = ca.MX.sym(f"terms_{self.series.name()}", self.series.numel(), count)
+        basis = ca.MX.sym(f"basis_{self.series.name()}", count, steps)
         columns = zip(*(ca.horzsplit(s) for s in (*each, basis)), strict=True)
         return [*each, terms, basis, self.dt], [
             [*own, ca.mtimes(terms, by), self.dt] for *own, by in columns
@@ -124,11 +127,11 @@ def block_function(
     name: str,
     *,
     steps: int = BLOCK,
-    wide: bool = False,
+    terms: Sequence[int] = (),
 ) -> ca.Function:
     """Build the block: (carry, u, theta, [u_sg, theta_sg, numbers, series, dt]) -> (last, y, ...).
 
-    Where it is wide, polynomials and their terms in each step stand for ``series``
+    Where what is held changes, polynomials and their terms in each step stand for ``series``
     (:class:`apu_casadi.machine.course.Numbers`).
 
     ``carry`` holds N, z, and the states of governor and generators.  Outputs and the residual of
@@ -142,7 +145,7 @@ def block_function(
         link: gearbox and governor of any group; the numbers of each are inputs.
         name: of the function.
         steps: of the exchange in it.
-        wide: whether all that is held over a step comes in a column for each.
+        terms: of the polynomials of each group; none where all steps take the same.
     """
     law, (n_u, n_theta, n_z) = link.governor, (gas_step.numel_in(i) for i in (1, 2, 4))
     n_x = [len(m.ss.x) for m in machines]
@@ -180,8 +183,8 @@ def block_function(
     step = ca.Function("joint_step", [carry, *held], outs)
 
     given_to, each = held, [held] * steps
-    if wide:
-        own_of = [g.wide(steps) for g in given]
+    if terms:
+        own_of = [g.wide(steps, n) for g, n in zip(given, terms, strict=True)]
         unit = [ca.MX.sym(s.name(), s.numel(), steps) for s in (u, theta)]
         given_to = [*unit, *(s for symbols, _ in own_of for s in symbols)]
         columns = zip(*(ca.horzsplit(s) for s in unit), *(e for _, e in own_of), strict=True)
@@ -202,7 +205,7 @@ class JointBlock(Rebuilt):
         machines: what propagates each group; a ``Propagator`` must have constant coefficients.
         links: of each group.
         steps: of the exchange in a block.
-        wide: whether what is held over a step changes from step to step (:meth:`followed`).
+        terms: of polynomials of each group, where what is held changes from step to step.
     """
 
     apu: Apu
@@ -216,7 +219,7 @@ class JointBlock(Rebuilt):
         links: Sequence[Link],
         *,
         steps: int = BLOCK,
-        wide: bool = False,
+        terms: Sequence[int] = (),
     ) -> None:
         """Build or fetch the compiled block."""
         self.apu, self.machines, self.steps = apu, tuple(machines), steps
@@ -225,7 +228,7 @@ class JointBlock(Rebuilt):
         self._n_gov, self._n_x = len(apu.governor.X), n_x
         self._n_z = apu.gas_generator.family.step.numel_in(4)
         self._sampled = [m.advance.n_out() == 4 for m in machines]
-        self._call = _caller(apu.gas_generator.family, links[0], self.machines, steps, wide)
+        self._call = _caller(apu.gas_generator.family, links[0], self.machines, steps, tuple(terms))
 
     def __call__(
         self,
@@ -358,18 +361,23 @@ class JointBlock(Rebuilt):
 
 
 def _caller(
-    family: CycleFunctions, link: Link, machines: Sequence[Fast], steps: int, wide: bool
+    family: CycleFunctions,
+    link: Link,
+    machines: Sequence[Fast],
+    steps: int,
+    terms: tuple[int, ...],
 ) -> Together:
     """One compiled block for each structure of gas generator, link and machines, and layout."""
 
     def make() -> Together:
-        kind = "joint_course_" if wide else "joint_block_" if steps > 1 else "joint_one_"
+        kind = "joint_course_" if terms else "joint_block_" if steps > 1 else "joint_one_"
         name = kind + "_".join(f"{m.ss.name}_{m.n_out}" for m in machines)
-        function = block_function(machines, family.step, link, name, steps=steps, wide=wide)
+        function = block_function(machines, family.step, link, name, steps=steps, terms=terms)
         # single steps by tables are a tenth of a block
-        small = 1 if any(isinstance(m, Collocated) for m in machines) else max(1, BLOCK // steps)
-        one = Gradual(function, level=3, copy=False, by=points_in_lanes)
+        small = 1 if any(isinstance(m, Collocated) for m in machines) else BLOCK / steps
+        often = max(1, round(OFTEN * min(1, BLOCK / steps)))
+        one = Gradual(function, level=3, copy=False, by=points_in_lanes, often=often)
         return Together(function, function, one, small=small)
 
-    key = (link.structure, steps, wide, *(m.layout for m in machines), backend_in_use())
+    key = (link.structure, steps, terms, *(m.layout for m in machines), backend_in_use())
     return keep(family, JointBlock, key, make)

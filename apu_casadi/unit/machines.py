@@ -122,7 +122,7 @@ class Machines:
     def _forget(self) -> None:
         self._block: JointBlock | None = None
         self._no_block = ""
-        self._wide: dict[int, tuple[list[Any], JointBlock]] = {}  # by steps in a block
+        self._wide: dict[tuple[int, tuple[int, ...]], tuple[list[Any], JointBlock]] = {}
         self._one: tuple[list[Any], JointBlock] | None = None
 
     def samples(self, grid: np.ndarray) -> int:
@@ -266,7 +266,8 @@ class Machines:
         blocks = min(middles.size, *(now.basis.shape[1] for now in numbers)) // steps
         if not blocks:
             raise NotApplicable("numbers of fewer steps than a block has go together")
-        wide, n = self._wide_block(fast, steps), blocks * steps
+        sizes = tuple(now.terms.shape[1] for now in numbers)
+        wide, n = self._wide_block(fast, steps, sizes), blocks * steps
         links = [np.repeat(g.link.numbers[:, None], n, axis=1) for g in self.groups]
         terms = [wide.terms(k, now.terms) for k, now in enumerate(numbers)]
 
@@ -279,19 +280,25 @@ class Machines:
                     given += [*columns, own, now.basis[:, at], one.dt]
                 yield given
 
-        done = wide.followed(state, [g.x for g in self.groups], held())
+        try:
+            done = wide.followed(state, [g.x for g in self.groups], held())
+        except NotApplicable:
+            if not any([g.refine() for g in self.groups]):
+                raise
+            return self.follow(state, unit, grid, before, steps)
         n = done.y.shape[1]
         each = zip(self.groups, done.machines, numbers, strict=True)
         return done, [g.went_on(one, grid[: n + 1], now.severity[:, :n]) for g, one, now in each]
 
-    def _wide_block(self, fast: Sequence[Any], steps: int) -> JointBlock:
-        """Return the block of so many steps for what propagates the groups."""
+    def _wide_block(self, fast: Sequence[Any], steps: int, terms: tuple[int, ...]) -> JointBlock:
+        """Return the block of so many steps, and terms, for what propagates the groups."""
         layouts = [one.layout for one in fast]
-        if steps not in self._wide or self._wide[steps][0] != layouts:
-            how: dict[str, Any] = {"steps": steps, "wide": True}
+        key = steps, terms
+        if key not in self._wide or self._wide[key][0] != layouts:
+            how: dict[str, Any] = {"steps": steps, "terms": terms}
             links = [g.link for g in self.groups]
-            self._wide[steps] = layouts, JointBlock(self.apu, fast, links, **how)
-        block = self._wide[steps][1]
+            self._wide[key] = layouts, JointBlock(self.apu, fast, links, **how)
+        block = self._wide[key][1]
         block.machines = fast  # of the same layouts, with what is expected of them now
         return block
 

@@ -227,6 +227,10 @@ class MachineStep:
             self._same = fast, now
         return fast, now
 
+    def refine(self) -> bool:
+        """Take finer strides from now on, where a step was refused; whether there are any."""
+        return self._integrators[0].refine()
+
     def went_by_one(
         self, fast: MeanStep | Propagator | Collocated, done: MachineBlock, grid: np.ndarray
     ) -> MachineMade:

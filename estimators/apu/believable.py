@@ -43,6 +43,7 @@ from estimators.apu.electrical.smallchanges import OffsetStep, offset_steps, sev
 from estimators.apu.electrical.terminalsignals import MEASURED, PHASES_V
 from estimators.apu.gascauses import causes_of_alarms
 from estimators.apu.gaspathmodel import DT, engine_function
+from estimators.apu.healthjumps import Tracked, judged
 from estimators.apu.recorded_report import SURE, Z95
 from estimators.apu.trust import GAS, Doubt, part_of, severity
 from estimators.information.innovationtests import Finding, findings, least
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
     from apu_casadi.machine.machinedata import MachineParameters
     from estimators.apu.fitting import EngineFit
     from estimators.apu.gaspath import GasPathFilter
-    from estimators.apu.healthjumps import Tracked
     from estimators.apu.joint import ElectricalSide
     from estimators.apu.recordings.measured import Measurements
     from estimators.apu.sensors import SensorSet
@@ -412,12 +412,9 @@ def gas_doubts(
         sides: the generators' estimates, of which its shaft power is.
         drifts: of :func:`~estimators.apu.creeping.creep`, where that was asked already.
     """
-    r, quiet = tracked.result, quiet_of(tracked)
+    quiet, (judge, seen) = quiet_of(tracked), judged(filt, tracked)
+    r = seen.result
     z = r.innovation / np.sqrt(r.innovation_variance)
-    for k, n in enumerate(r.y.names):
-        if s := filt.considered(n):  # that offset is no news
-            usual = 3 * s / math.sqrt(float(np.median(r.innovation_variance[k])))
-            z[k] -= np.clip(np.nanmean(np.where(quiet, z[k], np.nan)), -usual, usual)
     each = {n: np.where(quiet, row, np.nan) for n, row in zip(r.y.names, z, strict=True)}
     found = findings(each, margin=MARGIN)
     if {"Wf", "PW"} & {
@@ -434,8 +431,9 @@ def gas_doubts(
             "innovations",
             f"{MOST_JUMPS} changes of health were reported, and further ones were not looked for",
         )
-    yield from _prior_doubts(filt, tracked)
+    yield from _prior_doubts(judge, seen)
     yield from _off(drifts)
+    r = tracked.result
     x = {n: float(r[n][0][-1]) for n in HEALTH}
     for n, v in x.items():
         if abs(v - 1) > STEEP:
@@ -489,7 +487,7 @@ def gas_causes(filt: GasPathFilter, tracked: Tracked) -> Iterator[tuple[Causes, 
     Args:
         filt, tracked: the filter and what it said.
     """
-    for found in causes_of_alarms(filt, tracked):
+    for found in causes_of_alarms(*judged(filt, tracked)):
         yield found, _rather(found, "gas path", f"the change reported at {found.t:g} s")
 
 

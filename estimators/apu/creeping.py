@@ -28,7 +28,7 @@ from apu_casadi.core.errors import EstimationError
 from apu_casadi.gaspath.health import HEALTH
 from estimators.apu.gascauses import SIZE, jumps_of
 from estimators.apu.gaspath import MODEL_ERROR, GasPathFilter
-from estimators.apu.healthjumps import Tracked
+from estimators.apu.healthjumps import Tracked, judged
 from estimators.apu.trust import GAS
 from estimators.detection.signatures import LinearFilter, linearised
 from estimators.filters.filtering import FilterResult, StepMaker
@@ -122,15 +122,18 @@ def creep(
     own = {n: how for n, how in of.items() if n != GAS}
     # of one without a stated error, which counts pulses, there is nothing to be beyond
     off = {n: how for n, how in own.items() if how[0][0] in filt.model.x}
-    f = linearised(filt.model, r, tracked.data, [j for j in jumps if j.name not in HEALTH])
+    jumps = [j for j in jumps if j.name not in HEALTH]
+    judge, seen = judged(filt, tracked)
+    f = linearised(judge.model, seen.result, tracked.data, jumps)
     at, at_off = (f.columns([of[0] for of, _ in some.values()]) for some in (own, off))
     both, columns = _beside(f.ramps(r.t), f), [*at, *(len(f.names) + c for c in at_off)]
-    warmer = _warmer(filt, tracked, step, backend)
-    g, error = (
-        np.concatenate([x[:, :, columns], of_day], axis=2)
-        for x, of_day in zip((both.signature(0), both.errors()), warmer, strict=True)
-    )
+    nu, moved = _warmer(judge, seen, step, backend)
+    g = np.concatenate([both.signature(0)[:, :, columns], nu], axis=2)
     size, sigma = both.evidence(quiet, g)
+    if judge is not filt:  # the states are those of the filter itself
+        f = linearised(filt.model, r, tracked.data, jumps)
+        both, (_, moved) = _beside(f.ramps(r.t), f), _warmer(filt, tracked, step, backend)
+    error = np.concatenate([both.errors()[:, :, columns], moved], axis=2)
     names = (*(n.removeprefix("sensor ") for n in (*own, *off)), TEMPERATURE)
     scale = np.array([s[0] for some in (own, off) for _, s in some.values()] + [KELVIN])
     # in ten minutes one by what the model is off is significant, and says nothing

@@ -19,6 +19,7 @@ says that it has.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -132,14 +133,18 @@ class GasPathFilter(Parametric):
         """Sensors whose gain error is a state."""
         return tuple(n[5:] for n in self.model.x.names if n.startswith("gain_"))
 
-    def considered(self, name: str) -> float:
-        """Return the standard deviation of what considered errors add to a reading, its unit.
+    @property
+    def deciding(self) -> GasPathFilter:
+        """The filter by whose innovations is judged: it estimates all errors of sensors.
 
-        It stays in the innovations of that sensor, as an offset.
+        One that is considered, a constant, stays in the innovations, which are then not white: an
+        offset as large as was stated adds up to an alarm in two seconds, and to an error beyond
+        what was stated.  Itself, where none of a sensor is considered; the inertia stays so.
         """
-        of = {n: self.sigma[n] for n in self.model.consider if n[5:] == name}
-        bias, gain = (of.get(f"{error}_{name}", 0.0) for error in ("bias", "gain"))
-        return math.hypot(bias, gain * self.model.y[name].nominal) if of else 0.0
+        left = tuple(n for n in self.model.consider if n[5:] not in self.sensors)
+        if left == self.model.consider:
+            return self
+        return dataclasses.replace(self, model=self.model.considering(left))
 
     def prior(self, spread: Mapping[str, float] | None = None, /, **mean: float) -> Belief:
         """Return the belief before the first sample: healthy, at governed speed.
@@ -330,7 +335,9 @@ class GasPathFilter(Parametric):
     ) -> Runs:
         """Return the filter for recordings that begin alike; arguments as of :meth:`run`."""
         of = ekf_step(self.model, ITERATIONS, ITERATED) if step is None else step(self.model)
-        return Runs(of, self.prior() if prior is None else prior, backend)
+        judge = self.deciding
+        deciding = None if judge is self else judge.runs(prior=prior, step=step, backend=backend)
+        return Runs(of, self.prior() if prior is None else prior, backend, deciding)
 
 
 def gas_path_filter(

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from apu_casadi.core.errors import EstimationError
-from estimators.apu.gaspath import JUMP
+from estimators.apu.gaspath import JUMP, GasPathFilter
 from estimators.apu.gaspathmodel import DT
 from estimators.filters.belief import Belief
 from estimators.filters.filtering import FilterResult, StepMaker
@@ -23,7 +23,7 @@ from estimators.information.consistency import exceeded
 from estimators.models.filtermodel import FilterModel
 from estimators.models.recording import Recording
 
-__all__ = ["JumpTest", "Tracked", "spliced", "track_jumps", "whitened"]
+__all__ = ["JumpTest", "Tracked", "judged", "spliced", "track_jumps", "whitened"]
 
 SAME_JUMP = 25  # samples between onsets of one jump, as two courses of the power show it
 
@@ -131,6 +131,7 @@ class Tracked:
             that jump.
         alarms, onsets: samples of the alarms, and the last samples before the jumps they report.
         data, prior: what the filter was run on, with the jumps, and began with; None: its own.
+        deciding: the same result of :attr:`GasPathFilter.deciding`, where that is another filter.
     """
 
     result: FilterResult
@@ -138,6 +139,14 @@ class Tracked:
     onsets: tuple[int, ...]
     data: Recording
     prior: Belief | None = None
+    deciding: FilterResult | None = None
+
+
+def judged(filt: GasPathFilter, tracked: Tracked) -> tuple[GasPathFilter, Tracked]:
+    """Return the filter by whose innovations is judged what a recording holds, and its result."""
+    if tracked.deciding is None:
+        return filt, tracked
+    return filt.deciding, dataclasses.replace(tracked, result=tracked.deciding, deciding=None)
 
 
 def track_jumps(
@@ -165,13 +174,14 @@ def track_jumps(
     """
     test = JumpTest() if test is None else test
     again = filt.runs(prior=prior, step=step, backend=backend) if runs is None else runs
-    result = again(data)
+    judge = again.deciding
+    result, seen = again(data), None if judge is None else judge(data)
     alarms: list[int] = []
     onsets: list[int] = []
     row = filt.model.u.index("jump")
     start = test.hold
     while len(alarms) < most:
-        found = test.first(result, start)
+        found = test.first(result if seen is None else seen, start)
         if found is None:
             break
         k, onset = found
@@ -182,8 +192,11 @@ def track_jumps(
         data = Recording(data.t, u, data.y, data.variance, data.p)
         late = again(data)
         result = dataclasses.replace(late, **joined(result, late, k))
+        if judge is not None and seen is not None:
+            late = judge(data)
+            seen = dataclasses.replace(late, **joined(seen, late, k))
         start = k + test.hold
-    return Tracked(result, tuple(alarms), tuple(onsets), data, prior)
+    return Tracked(result, tuple(alarms), tuple(onsets), data, prior, seen)
 
 
 def spliced(before: Tracked, after: Tracked, k: int) -> Tracked:
@@ -192,11 +205,13 @@ def spliced(before: Tracked, after: Tracked, k: int) -> Tracked:
     Alarms that were raised before k stay; of ``after`` count those of jumps that no alarm has
     reported, at k at the earliest.
     """
-    parts = joined(before.result, after.result, k)
-    result = dataclasses.replace(after.result, **parts)
+    result, seen = after.result, after.deciding
+    result = dataclasses.replace(result, **joined(before.result, result, k))
+    if before.deciding is not None and seen is not None:
+        seen = dataclasses.replace(seen, **joined(before.deciding, seen, k))
     pairs = [(a, o) for a, o in zip(before.alarms, before.onsets, strict=True) if a < k]
     for a, o in zip(after.alarms, after.onsets, strict=True):
         if a >= k or not any(abs(o - old) <= SAME_JUMP for _, old in pairs):
             pairs.append((max(a, k), o))
     alarms, onsets = (tuple(p[i] for p in pairs) for i in (0, 1))
-    return dataclasses.replace(after, result=result, alarms=alarms, onsets=onsets)
+    return Tracked(result, alarms, onsets, after.data, after.prior, seen)

@@ -28,14 +28,24 @@ class Runs:
 
     Args:
         step, prior, backend: as of :func:`estimators.filters.filtering.run`.
+        deciding: those of the filter by whose innovations is judged what happened, where this
+            one's are not white; None: its own.
     """
 
     step: FilterStep
     prior: Belief
     backend: str | None
+    deciding: Runs | None
 
-    def __init__(self, step: FilterStep, prior: Belief, backend: str | None = None) -> None:
+    def __init__(
+        self,
+        step: FilterStep,
+        prior: Belief,
+        backend: str | None = None,
+        deciding: Runs | None = None,
+    ) -> None:
         self.step, self.prior, self.backend = step, prior, backend
+        self.deciding = deciding
         self._done: list[tuple[Recording, FilterResult]] = []
 
     def __call__(self, data: Recording) -> FilterResult:

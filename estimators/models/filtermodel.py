@@ -291,6 +291,16 @@ class FilterModel(Parametric):
 
     @remade
     @of_family
+    def considering(self, names: Sequence[str]) -> FilterModel:
+        """Return the model that considers these states, and estimates all others.
+
+        Raises:
+            SignalError: unknown name, a state that walks.
+        """
+        return dataclasses.replace(self, consider=tuple(names))
+
+    @remade
+    @of_family
     def expanded(self) -> FilterModel:
         """Return the same model in scalar operations, faster, where that is possible.
 

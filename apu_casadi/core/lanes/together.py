@@ -139,13 +139,13 @@ class Together:
         of: ca.Function,
         one: Single | None = None,
         *,
-        small: int = 1,
+        small: float = 1,
     ) -> None:
         self.fun: ca.Function = fun
         self.of: ca.Function = of
         self._one = one  # a member's own is never made where all ask
         self._in_lanes: Caller | None = None
-        self._left = self._often = 0 if one is None else small * OFTEN
+        self._left = self._often = 0 if one is None else max(1, round(small * OFTEN))
         self._outputs = [of.size_out(j) for j in range(of.n_out())]
 
     def __call__(self, *given: Any) -> tuple[np.ndarray, ...]:
