@@ -102,11 +102,19 @@ def test_every_speed_of_the_range_and_other_lengths_of_step(fault):
         (SeriesLoad.from_power(10e3), Ttsc(0.05, 500.0)),
         (SeriesLoad.from_power(10e3, 0.85), Ttsc(0.05, 500.0)),
         (SeriesLoad.from_power(10e3), Ttsc(0.05, 49.0, 1.0)),
+        (KW100, Ttsc(0.05, 19.0)),
+        (SeriesLoad.from_power(10e3, 0.8), Ttsc(0.05, 49.0)),
     ],
-    ids=["R", "R-C", "R and a small fault", "R-L and a small fault", "R and a leaky fault"],
-)
+    ids=[
+        "R", "R-C", "R and a small fault", "R-L and a small fault", "R and a leaky fault",
+        "100 kW", "R-L and a fault",
+    ],
+)  # fmt: skip
 def test_a_new_speed_under_a_light_load(load, fault):
     """The voltage follows in microseconds, which no sample has: mean power and voltage to 4e-7.
+
+    At 100 kW, and in a fault's branch beside an inductive load, it takes about a stride: of that
+    strides make too much (1e-6 and 5e-6 of the voltage where it is not made good).
 
     Speed falls by 0.3 %, as in 20 ms after a load step.  Taken for a sample like any other, the
     first one would make the regulator err by 1e-6 (healthy) to 1e-5.  The branch of a fault beside
@@ -123,30 +131,32 @@ def test_a_new_speed_under_a_light_load(load, fault):
 
 @pytest.mark.parametrize(
     ("load", "mu", "h"),
-    [(KW100, 0.05, 0.03), (KW100, 0.2, 0.1), (SeriesLoad.from_power(10e3), 0.05, 0.01),
+    [(KW100, 0.05, 0.03), (KW100, 0.2, 0.1), (SeriesLoad.from_power(10e3), 0.2, 0.1),
      (LAGGING, 0.05, 0.01)],
     ids=["h = 0.03", "h = 0.1", "10 kW", "R-L"],
 )  # fmt: skip
 def test_severe_faults_take_finer_strides(load, mu, h):
-    """Mean powers and squares of voltages at a new speed to 2e-6, twice what rms values are.
+    """Mean powers and squares of voltages at a new speed to 1.6e-6, twice what rms values are.
 
-    By 28 strides a turn they were off by 5e-6 to 2e-4, or refused.
+    It starts where the ripple's sampling by 56 strides a turn made most: 1e-5 at 10 kW, h = 0.1.
     """
     fault, quad = Ttsc(mu, mu / h - 1 + mu), ("P_total", "P_e", "~v_a^2", "~v_b^2", "~v_c^2")
     point = GEN.steady_state(load, fault)
     ss, u, theta = point.ss, point.u.copy(), np.array(point.theta)
+    exact = simulation.stepper(ss, 1, quad=quad, rtol=1e-11, atol=1e-13)
+    x = exact(point.x, u, theta, 0.22 * 2 * math.pi / GEN.machine.w_rated).x_end.copy()
     u[ss.u.index("w_r")] *= 1 - 2e-4
     fast = MeanStep(GEN, ss, u, theta, dt=0.02, quad=quad)
-    _, means = fast(point.x, u)
-    theirs = simulation.stepper(ss, 1, quad=quad, rtol=1e-11, atol=1e-13)(point.x, u, theta, 0.02)
+    _, means = fast(x, u)
+    theirs = exact(x, u, theta, 0.02)
     largest = max(theirs.mean[q] for q in quad[2:])
     scale = [theirs.mean["P_total"], theirs.mean["P_e"], *[largest] * 3]
     assert_allclose(means / scale, [theirs.mean[q] / s for q, s in zip(quad, scale, strict=True)],
-                    rtol=0, atol=2e-6)  # fmt: skip
+                    rtol=0, atol=1.6e-6)  # fmt: skip
     mild = MeanStep(GEN, ss, u, GEN.fault_vector(load, Ttsc(0.05, 99.0)), dt=0.02, quad=quad)
     fits = [level.harmonics for level in meanstep.LEVELS]
     assert mild.harmonics in (*fits[0], *fits[1])
-    assert fast.harmonics in fits[2]
+    assert fast.harmonics in fits[3]
 
 
 @pytest.mark.parametrize(

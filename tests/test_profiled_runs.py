@@ -11,6 +11,7 @@ from apu_casadi.core.profiles.points import Points, Steps
 from apu_casadi.core.profiles.profile import varying
 from apu_casadi.core.profiles.shapes import Growth, OnOff, Ramp
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.capacitor import CapacitorLoad
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.unit.apu import Apu, trim
@@ -108,8 +109,81 @@ def test_waveforms_follow_as_cvodes_has_them():
     ours, theirs = run(**given), run(**given, **EXACT)
     for name in ("v_a", "i_a", "i_fault", "T_e", "P_inst"):
         peak = np.abs(theirs[name].values).max()
-        assert_allclose(ours[name], theirs[name], rtol=0, atol=2e-6 * peak, err_msg=name)
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-6 * peak, err_msg=name)
     assert ours["load_P_1"].values[-1] == pytest.approx(100e3 + 2.5e3 * 0.09, rel=1e-12)
+
+
+@pytest.mark.ci  # CVODES, 5 cases
+@pytest.mark.parametrize(
+    "second",
+    [
+        (varying(SeriesLoad.from_power, Ramp(10e3, 11e3, over=0.2)), Ttsc(0.05, 15.0)),
+        (SeriesLoad.from_power(10e3), varying(Ttsc, Ramp(0.03, 0.05, over=0.2), 60.0)),
+        (SeriesLoad.from_power(40e3), varying(Ttsc, 0.05, Ramp(200.0, 60.0, over=0.2), phase="b")),
+        (SeriesLoad.from_power(100e3, 0.8), varying(Ttsc, Ramp(0.03, 0.05, over=0.2), 60.0)),
+        (KW100, varying(Ttsc.of_h, 0.05, Growth(1e-2, 2e-2, over=0.2))),
+    ],
+    ids=["ramp at 10 kW", "mu at 10 kW", "k_rf at 40 kW", "R-L", "severe"],
+)
+def test_waveforms_of_steps_that_a_light_load_shows(second):
+    """To 2e-6 of peak, the field to 4e-6: new numbers move the voltage for microseconds.
+
+    Where the regulator took that for a sample, V_fd erred by 2e-4, v_a by 5e-5 at 10 kW.
+    """
+    load, fault = second
+    given = {"load": [KW100, load], "fault": {2: fault}, "duration": 0.2, "waveform_dt": 50e-6}
+    ours, theirs = run(**given), run(**given, **EXACT)
+    for name in ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e"):
+        peak = np.abs(theirs[name].values).max()
+        near = 4e-6 if name in ("V_fd", "i_fd") else 2e-6
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=near * peak, err_msg=name)
+
+
+@pytest.mark.ci  # CVODES, 4 cases
+@pytest.mark.filterwarnings("ignore::apu_casadi.core.errors.ApuWarning")  # torque beside eq. (8)
+@pytest.mark.parametrize(
+    ("load", "h", "step"),
+    [
+        (KW100, 0.1, 50e3),
+        (SeriesLoad.from_power(10e3), 0.1, 100e3),
+        (SeriesLoad.from_power(10e3, 0.85), 1e-3, 100e3),
+        (CapacitorLoad.from_power(40e3, 0.9), 3e-3, 100e3),
+    ],
+    ids=["h = 0.1", "h = 0.1, 10 kW", "R-L", "leading"],
+)
+def test_a_load_step_beside_a_fault_of_the_other(load, h, step):
+    """Means to 1e-6 of peak, as docs/limits.md has them: from 1.1e-6 to 4e-6 before.
+
+    The regulator has a ripple of more than ten harmonics, or a speed that steps, which a branch of
+    the fault follows in about a stride.
+    """
+    mu = max(0.05, 2 * h)
+    given = {
+        "load": [KW100, load], "fault": {2: Ttsc(mu, mu / h - 1 + mu)}, "duration": 0.6,
+        "start_from": "settled",
+        "events": [LoadChange(0.1, SeriesLoad.from_power(100e3 + step), generator=1)],
+    }  # fmt: skip
+    ours, theirs = run(**given), run(**given, **EXACT)
+    for name in (*SHOWN, "P_loss_fault", "V_c_rms", "I_c_rms"):
+        peak = np.abs(theirs[name].values).max()
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-6 * peak, err_msg=name)
+
+
+def test_an_ambient_that_changes_over_phases_of_constant_load():
+    """Rows of steps end with a phase, whose numbers are kept for a row of one length: both phases.
+
+    Against CVODES, means to 1e-7 of peak; two unequal phases, and whole blocks in both.
+    """
+    given = {
+        "duration": 0.66,
+        "ambient": varying(Ambient, altitude=Ramp(0.0, 20.0, over=0.66)),
+        "events": [LoadChange(0.24, SeriesLoad.from_power(105e3))],
+    }
+    ours, theirs = run(**given), run(**given, **EXACT)
+    assert propagated(ours) > 0.9
+    for name in SHOWN:
+        peak = np.abs(theirs[name].values).max()
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-7 * peak, err_msg=name)
 
 
 def test_a_ramp_is_a_staircase_of_events_at_mid_step():

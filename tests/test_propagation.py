@@ -17,7 +17,7 @@ from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.openphase import OpenPhase
 from apu_casadi.machine.loads.series import SeriesLoad
 from apu_casadi.machine.propagation import Propagator, hoisted, strides
-from apu_casadi.machine.weights import gregory, rippling
+from apu_casadi.machine.weights import gregory, rippling, unresolved
 
 GEN = Generator()
 ISOLATED = Generator(neutral="isolated")
@@ -148,6 +148,18 @@ def test_ripples_that_change_slowly_are_integrated_exactly():
                 weights = [np.polyval(row[::-1], x - 0.5) for row in partial]
                 exact = share @ f(x / 2 * (1 + node)) * x / 2
                 assert weights @ f(at) == pytest.approx(exact, abs=1e-12)
+
+
+@pytest.mark.parametrize("slope", [0.0, 1 / 12], ids=["Simpson's rule", "a cubic"])
+def test_what_sums_of_samples_leave_of_a_decay(slope):
+    """Against the integral of exp(-z t) itself, as fast as light loads have it: to 1e-3."""
+    weights = np.array([0.5, 1.0, 1.0]) if slope else np.array([1.0, 4.0, 2.0, 4.0]) / 3.0
+    n, *below = unresolved(weights, slope)
+    for z in (0.3, 1.0, 2.0, 5.0, 9.0):
+        samples = np.exp(-z * np.arange(200))
+        rule = np.append(weights[:-2], np.resize(weights[-2:], 200 - weights.size + 2))
+        left = 1 / z - rule @ samples + slope * z
+        assert -n * z**3 / np.polyval([*below[::-1], 1.0], z) == pytest.approx(left, abs=1e-3)
 
 
 def test_strides_cover_every_sample_once():

@@ -62,9 +62,15 @@ class Level(NamedTuple):
 
 
 #: No number of harmonics is of two levels.  The first reaches to h = 0.0016 beside a resistive load
-#: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.005 and 0.0015.  Up to there means err by
-#: 4e-7 at most where the speed moves by 1 % a second, by 1e-7 with the second's strides.
-LEVELS = (Level(20, (12,), 1e-3), Level(28, (14, 20, 30), 1e-2), Level(56, (32,), math.inf))
+#: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.002 and 0.001, the third to 0.02 and
+#: 0.005.  Means of steps err by 7e-7 at most where one of them changes the speed by 0.3 %, with the
+#: first's strides by 1.4e-6.
+LEVELS = (
+    Level(20, (12,), 1e-3),
+    Level(28, (14, 20, 30), 5e-3),
+    Level(56, (32,), 3.5e-2),
+    Level(112, (34,), math.inf),
+)
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}

@@ -40,7 +40,7 @@ from apu_casadi.machine.exciterstep import exciter_of
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import V_RATED
-from apu_casadi.machine.settling import settled
+from apu_casadi.machine.settling import UNEVEN, begun
 from apu_casadi.machine.transition import (
     EXTRA,
     NODES,
@@ -293,9 +293,9 @@ def _advance(
     columns = 1 if constant else plan.head + plan.many
     PP = [ca.MX.sym(k, n, columns) for k, n in zip("PQ", rows[plan.m], strict=False)]
     single, V_of = leap(ss, 1, constant)
-    # a fault's current beside an inductive load settles within microseconds of a new speed
-    first_x = settled(ss, False)(X0, U, TH, H / 4)[0] if "i_fault" in ss.linear else X0
-    V0 = seen_at_start(ss, V_of(first_x, U, TH), X0, U, TH)
+    light = not constant and plan.head and n_out > UNEVEN.size
+    first_x, seen = begun(ss, V_of, X0, (U, TH), H) if light else (X0, V_of(X0, U, TH))
+    V0 = seen_at_start(ss, seen, X0, U, TH)
     S, sizes = ca.vertcat(X0, V0, U, TH, H), (nx, V0.numel(), nu, nt)
     parts = []
     if plan.head:
@@ -309,7 +309,7 @@ def _advance(
         S, X = fold(S, *(p if constant else p[:, plan.head :] for p in PP))
         parts.append(X)
     X_all, miss = ca.horzcat(*parts), S[nx + 2]
-    Y, means = _observed(ss, outputs, quad, X0, X_all, ca.vertcat(U, TH))
+    Y, means = _observed(ss, outputs, quad, first_x, X_all, ca.vertcat(U, TH))
     return ca.Function(
         f"advance_{ss.name}_{n_out}" + ("" if plan.many else "_fine"),
         [X0, *PP, U, TH, H],

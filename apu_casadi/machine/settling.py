@@ -20,13 +20,16 @@ beside an inductive load, that current alone, with the stator among what is slow
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from apu_casadi.core.sharing import kept
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.transition import inverse
+from apu_casadi.machine.weights import end_weights, unresolved
 
 _STATOR = ("lam_sq", "lam_sd", "lam_s0")
 _ROTOR = ("lam_fd", "lam_kd", "lam_kq")
@@ -36,6 +39,9 @@ ORDER = {True: 2, False: 3}
 #: Fastest mode, over 1/T, up to which it is done.  Beside an open phase (3e4) what the ripple of
 #: the others leaves in the derivatives is not small, and a step that begins settled was 5e-6 off.
 STIFF = 300.0
+#: Longest time, in strides, in which something passes by of which strides miss a part: a third as
+#: long, they integrate it to 1e-4.
+SLOWEST = 1.2
 
 
 @kept
@@ -50,16 +56,11 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
         ss: model variant, linear in its windings.
         constant: whether the coefficients do not depend on the rotor angle.
     """
-    nx, nu, nt = len(ss.x), len(ss.u), len(ss.theta)
-    x, u, th, T = (ca.SX.sym(k, n) for k, n in zip("xuts", (nx, nu, nt, 1), strict=True))
-    stator = ss.x.indices([n for n in _STATOR if n in ss.linear])
-    f, rates = ss.f(x, u, th), ca.SX(nx, 1)
-    moving = [*ss.x.indices(ss.linear), ss.x.index("theta_e")]
-    rates[moving] = f[moving]  # the exciter does not move within microseconds
-    own = ca.densify(ca.jacobian(f[stator], x)[:, stator])
-    fastest = ca.mmax(ca.fabs(ca.diag(own))) * T
+    T = ca.SX.sym("T")
+    of_model, (x, u, th) = _Fast.of(ss, constant)
+    f, stator = of_model.f, ss.x.indices([n for n in _STATOR if n in ss.linear])
+    fastest = of_model.fastest(stator) * T
     light = ca.logic_and(ca.gt(fastest, 1.0), ca.lt(fastest, STIFF))
-    of_model = _Fast(ss, x, f, rates, ORDER[constant])
     if "i_fault" not in ss.linear:
         outputs = [ca.if_else(light, part, 0.0) for part in of_model.passing(stator, T)]
     else:
@@ -76,6 +77,59 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     return ca.Function("settled", [x, u, th, T], [x + outputs[0], outputs[1]], {"cse": True})
 
 
+@kept
+def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
+    """Function (x, x as it settles, u, theta, h) -> area that sums of samples h, s, apart miss.
+
+    What takes as long as a stride is too slow for :func:`settled`, and too fast for samples: of
+    exp(-t/T) they leave an area that depends on h/T alone.  Here it is that of states over time,
+    for periodic coefficients.  A ripple leaves some of it too, the same after half a turn.
+
+    Args:
+        left: n, a, b and c of :func:`apu_casadi.machine.weights.unresolved`.
+    """
+    of_model, (x, u, th) = _Fast.of(ss, False)
+    after, h, (n, *below) = ca.SX.sym("after", x.numel()), ca.SX.sym("h"), left
+    fast = ss.x.indices([k for k in (*_STATOR, "i_fault") if k in ss.linear])
+    units, eye = ss.x.nominals[fast], ca.SX.eye(len(fast))
+    passes = of_model.unsettled(fast, SLOWEST * h)[0] + (after - x)[fast] / units
+    Z = -h * of_model.jacobian(fast)
+    Z2 = ca.mtimes(Z, Z)
+    Z3 = ca.mtimes(Z2, Z)
+    divisor = eye + sum(k * power for k, power in zip(below, (Z, Z2, Z3), strict=True))
+    area = ca.SX.zeros(x.numel())
+    resolved = -n * h * units * ca.solve(divisor, ca.mtimes(Z3, passes))
+    area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
+    return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
+
+
+#: What single samples leave of a voltage that passes by: they take it as a cubic, by values and
+#: rates at both ends.
+_HERMITE = unresolved(np.array([0.5, 1.0, 1.0]), 1 / 12)
+UNEVEN = np.append(end_weights(10), [1.0, 1.0])  # of the first samples in means
+
+
+def begun(
+    ss: GeneratorModel, V_of: ca.Function, x: Any, held: tuple[Any, Any], h: Any
+) -> tuple[Any, tuple[Any, Any]]:
+    """What means, and what the exciter, take for the first sample of a step by single samples.
+
+    Behind the resistance of a light load, or of a fault beside an inductive one, what a new speed
+    or a new severity leaves settles within microseconds: it counts by its area.
+
+    Args:
+        x, held, h: state, inputs and theta, length of a sample.
+
+    Returns:
+        A state, and terminal voltage with its rate.
+    """
+    settles, area = settled(ss, False)(x, *held, h / 4)
+    late = [missed(ss, k)(x, settles, *held, h) for k in (unresolved(UNEVEN), _HERMITE)]
+    of_means = settles + (area + late[0]) / (float(UNEVEN[0]) * h)
+    V_seen = V_of(settles + (area + late[1]) * (2 / h), *held)[0]
+    return of_means, (V_seen, V_of(settles, *held)[1])
+
+
 class _Fast(NamedTuple):
     """A model's rates: f all of them, ``rates`` those of what moves within microseconds."""
 
@@ -85,20 +139,51 @@ class _Fast(NamedTuple):
     rates: Any
     order: int
 
-    def passing(self, fast: list[int], T: Any) -> list[Any]:
-        """Return the change of the state until some of its entries have settled, and the area."""
-        x, f, n = self.x, self.f, len(fast)
-        all_slow = self.ss.x.indices([n for n in (*_STATOR, *_ROTOR) if n in self.ss.linear])
-        slow = [i for i in all_slow if i not in fast]
-        J, coupled = (ca.densify(ca.jacobian(f[rows], x)[:, fast]) for rows in (fast, slow))
-        J_inv, d = inverse(n)(J), f[fast]
+    @classmethod
+    def of(cls, ss: GeneratorModel, constant: bool) -> tuple[_Fast, tuple[Any, Any, Any]]:
+        """Return it with its symbols: state, inputs and theta."""
+        x, u, th = (
+            ca.SX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True)
+        )
+        f, rates = ss.f(x, u, th), ca.SX(len(ss.x), 1)
+        moving = [*ss.x.indices(ss.linear), ss.x.index("theta_e")]
+        rates[moving] = f[moving]  # the exciter does not move within microseconds
+        return cls(ss, x, f, rates, ORDER[constant]), (x, u, th)
+
+    def jacobian(self, of: list[int]) -> Any:
+        """Return the rates' derivatives by some of the states themselves, nominal units, 1/s."""
+        units = self.ss.x.nominals[of]
+        return ca.densify(ca.jacobian(self.f[of], self.x)[:, of]) * (units / units[:, None])
+
+    def fastest(self, of: list[int]) -> Any:
+        """Return the rate of the fastest of some states, 1/s."""
+        return ca.mmax(ca.fabs(ca.diag(self.jacobian(of))))
+
+    def unsettled(self, fast: list[int], T: Any) -> tuple[Any, Any]:
+        """Return what of some entries of the state passes by within T, and its area.
+
+        Both are in nominal units.
+        """
+        n, d, J = len(fast), self.f[fast], self.jacobian(fast)
         for _ in range(self.order - 1):
-            d = ca.jtimes(d, x, self.rates)
-        G2 = ca.mtimes(J_inv, J_inv) / T**2
-        K = ca.mtimes(inverse(n)(ca.SX.eye(n) + ca.mtimes(G2, G2)), J_inv)
+            d = ca.jtimes(d, self.x, self.rates)
+        d = d / self.ss.x.nominals[fast]
+        # (1 + G^4)^-1 J^-1 by two quadratic factors, in nominal units: with fast and slow modes at
+        # once, the fourth power itself has too few digits for one of them
+        Y, eye = J * T, ca.SX.eye(n)
+        Y2, around = ca.mtimes(Y, Y), math.sqrt(2) * Y
+        K = T * ca.solve(Y2 + around + eye, ca.solve(Y2 - around + eye, ca.mtimes(Y2, Y)))
         for _ in range(self.order):
             d = ca.mtimes(K, d)
-        D = -ca.mtimes(K, d)
+        return d, -ca.solve(J, d)
+
+    def passing(self, fast: list[int], T: Any) -> list[Any]:
+        """Return the change of the state until some of its entries have settled, and the area."""
+        x, f = self.x, self.f
+        all_slow = self.ss.x.indices([n for n in (*_STATOR, *_ROTOR) if n in self.ss.linear])
+        slow = [i for i in all_slow if i not in fast]
+        coupled, units = ca.densify(ca.jacobian(f[slow], x)[:, fast]), self.ss.x.nominals[fast]
+        d, D = (units * part for part in self.unsettled(fast, T))
         change, area = ca.SX.zeros(x.numel()), ca.SX.zeros(x.numel())
         change[fast], area[fast] = -d, D
         # what passes by in the stator moves the rotor's flux linkages for good

@@ -24,10 +24,14 @@ from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.machine.exciterstep import Exciter, exciter_of, exciter_step
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import hoisted
-from apu_casadi.machine.settling import settled
+from apu_casadi.machine.settling import missed, settled
 from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
-from apu_casadi.machine.weights import rippling, through
+from apu_casadi.machine.weights import rippling, through, unresolved
 
+#: What steps of the exciter leave of a voltage that passes by, which they take by Simpson's rule.
+_RUNGE_KUTTA = unresolved(np.array([1.0, 4.0, 2.0, 4.0]) / 3.0)
+#: Strides in a turn up to which what they miss of a new speed is left: it would take 4 % of a step.
+MILD = 20
 PACE = 2  # strides in a step of the exciter; with 4, its high gain sees the sampling of the ripple
 #: Longest time, in strides and in turns, in which the stator may settle behind the load and not be
 #: sampled: longer strides do not make slower what a new speed leaves behind.
@@ -51,13 +55,14 @@ class Rule(NamedTuple):
     around: int
 
 
+_MANY = {0: 3, 1: 3, 2: 2, 3: 2} | dict.fromkeys(range(4, 8), 1) | dict.fromkeys(range(8, 14), 0)
 #: By the number of strides.
 _RULES = {
     20: Rule(21, 4, {0: 3, 1: 2, 2: 2, 3: 1, 4: 0}, 16),
     28: Rule(30, 5, {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}, 10),
-    56: Rule(60, 10, {0: 3, 1: 3, 2: 2, 3: 2, **dict.fromkeys(range(4, 8), 1),
-                      **dict.fromkeys(range(8, 14), 0)}, 10),
-}  # fmt: skip
+    56: Rule(60, 10, _MANY, 10),
+    112: Rule(120, 20, _MANY, 10),
+}
 
 
 def _powers(s: Any, count: int) -> Any:
@@ -141,6 +146,14 @@ class Turn(NamedTuple):
     def near(self) -> int:
         """Half of them."""
         return self.around // 2
+
+    @property
+    def mean_leaves(self) -> tuple[float, float, float, float]:
+        """What means leave of something that passes by, as :func:`unresolved` tells it."""
+        rule = _RULES[self.strides]
+        first, partial = rippling(rule.before, rule.after, self.half, rule.degrees)
+        whole = [np.polyval(row[::-1], 0.5) for row in partial]
+        return unresolved(np.append(first + np.cumsum(whole), [1.0, 1.0]))
 
     @property
     def pairs(self) -> int:
@@ -250,14 +263,28 @@ class _Seen:
             raise NotApplicable(f"{ss.name}: a mean of what the exciter's inner states decide")
         at_sample = ca.Function("terms", [x, u, th, weights], [values, y[ss.y.index("V_t")]])
         #: (x, u, theta, length of a stride, weight of a first sample in it, weights as of others)
-        #: -> (x as it settles, terms, terminal voltage), both with what passes by before
+        #: -> (x as it settles, terms, terminal voltage), both with what passes by, and what of it
+        #: the samples will miss
         h, weight = ca.SX.sym("h"), ca.SX.sym("weight")
         layer = min(LAYER[0], LAYER[1] * turn.strides)
         after, area = settled(ss, False)(x, u, th, layer * h)
-        first, _ = at_sample(after + area / (weight * h), u, th, weights)
-        _, V_seen = at_sample(after + area * (6 / (PACE * h)), u, th, weights)
-        made = [after, first, V_seen]
-        self.start = ca.Function("start", [x, u, th, h, weight, weights], made, {"cse": True})
+        late = [ca.SX.zeros(x.numel())] * 2
+        if turn.strides > MILD:
+            leaves = turn.mean_leaves, _RUNGE_KUTTA
+            late = [missed(ss, left)(x, after, u, th, h) for left in leaves]
+        by = 1 / (weight * h), 6 / (PACE * h)
+
+        def seen(x: Any, areas: Sequence[Any]) -> tuple[Any, Any]:
+            first, second = (x + k * area for k, area in zip(by, areas, strict=True))
+            return at_sample(first, u, th, weights)[0], at_sample(second, u, th, weights)[1]
+
+        given = [x, u, th, h, weight, weights]
+        made = [after, *seen(after, [area + own for own in late])]
+        self.start = ca.Function("start", given, made, {"cse": True})
+        #: the same -> what a ripple, of which nothing passes by, added to terms and voltage
+        ripples = missed(ss, _RUNGE_KUTTA)(x, x, u, th, h)  # nothing is so fast as to settle
+        more = [a - b for a, b in zip(seen(x, [ripples] * 2), seen(x, (0, 0)), strict=True)]
+        self.rippled = ca.Function("rippled", given, more, {"cse": True})
         sample, angle = ca.SX.sym("sample", n + 2), ca.SX.sym("angle")
         full = ca.SX(len(ss.x), 1)
         full[at.linear], full[at.drive], full[at.angle] = sample[:n], sample[n], angle
@@ -383,6 +410,28 @@ def _half_turn(ss: GeneratorModel, between: ca.Function, n_d: int, pairs: int) -
     return ca.Function("half_turn", [z, S, *P, *d], outputs)
 
 
+def _kicked(
+    ss: GeneratorModel, exciter: Exciter, z: Any, S: Any, by: tuple[Any, Any, Any, Any]
+) -> tuple[Any, Any]:
+    """Return z and S, as :func:`_between` has them, after an impulse of the terminal voltage.
+
+    Args:
+        by: the impulse, V s; terminal voltage, V_ref and theta.
+    """
+    at, n = split(ss), len(ss.linear)
+    slow, V, V_ref, th = (
+        ca.SX.sym(k, m) for k, m in zip("sVrt", (len(at.slow), 1, 1, len(ss.theta)), strict=True)
+    )
+    full = ca.SX.zeros(len(ss.x))
+    full[at.slow] = slow
+    moves = ca.jacobian(ss.exciter(full, V, V_ref, th), V)
+    impulse, *now = by
+    kick = ca.Function("kick", [slow, V, V_ref, th], [moves])(S[: len(at.slow)], *now)
+    after = S[: len(at.slow)] + kick * impulse
+    rates, drive, e = exciter.started(after, *now)
+    return ca.vertcat(z[:n], drive, 1), ca.vertcat(after, rates, e, S[-1])
+
+
 def _from_start(P: Sequence[Any], rows: Sequence[Any], h: Any) -> list[Any]:
     """Return matrices that lead from the start of each pair to (x, space vector) at its samples.
 
@@ -486,8 +535,8 @@ def periodic_step(
     plain = relative / length
     # beyond the end of the step the weight goes on as the polynomial that it is
     light = plain * window(ca.DM(np.arange(turn.samples)) / length)
-    first = ca.vertcat(plain[0], light[0])
-    x_now, terms, V_now = seen.start(X0, U, TH, h, relative[0], first)
+    how = U, TH, h, relative[0], ca.vertcat(plain[0], light[0])
+    x_now, terms, V_now = seen.start(X0, *how)
 
     exciter, voltage = exciter_of(ss), _Voltage(ss)
     between, before = _between(ss, exciter, voltage)
@@ -501,10 +550,19 @@ def periodic_step(
     rates, drive, e = exciter.started(x_now[at.slow], V_now, V_ref, TH)
     z, S = ca.vertcat(x_now[at.linear], drive, 1), ca.vertcat(x_now[at.slow], rates, e, 0)
     samples, starts = [], []
-    for _ in range(turn.halves):
+    for k in range(turn.halves):
         z, S, of_samples, of_starts = half_turn(z, S, *given)
         samples.append(ca.reshape(of_samples, n + 2, half))
         starts.append(of_starts)
+        if (
+            not k and turn.strides > MILD
+        ):  # what has passed by is no more; what ripples is as it was at the start
+            x_then = ca.MX(X0)
+            x_then[at.linear], x_then[at.slow] = z[:n], S[: len(at.slow)]
+            of_terms, of_V = seen.rippled(x_then, *how)
+            terms -= of_terms
+            of_start = -PACE / 6 * h * of_V, samples[0][n + 1, -1], V_ref, TH
+            z, S = _kicked(ss, exciter, z, S, of_start)
     chain = _Chain(samples, starts, S[-1])
     weights = tuple(ca.reshape(v[1:], half, turn.halves) for v in (plain, light))
     sums = seen.sums(samples, (weights[0], weights[1]), ca.vertcat(held, angles[1:]))
