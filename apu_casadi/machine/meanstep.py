@@ -63,14 +63,15 @@ class Level(NamedTuple):
 
 #: No number of harmonics is of two levels.  The first reaches to h = 0.0016 beside a resistive load
 #: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.002 and 0.001, the third to 0.02 and
-#: 0.005.  Means of steps err by 7e-7 at most where one of them changes the speed by 0.3 %, with the
-#: first's strides by 1.4e-6.
+#: 0.005.  Means of single steps err by some 7e-7 where one of them changes the speed by 0.3 %.
 LEVELS = (
     Level(20, (12,), 1e-3),
     Level(28, (14, 20, 30), 5e-3),
     Level(56, (32,), 3.5e-2),
     Level(112, (34,), math.inf),
 )
+#: Harmonics of what takes the second level at least: the first gains nothing in a short run.
+USUAL = LEVELS[1].harmonics[0]
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
@@ -412,7 +413,7 @@ class MeanStep(Rebuilt):
     def finer(self) -> int:
         """Harmonics with which steps that were refused may be taken; 0 where there are none."""
         mild = not self.constant and self._own is LEVELS[0]
-        return LEVELS[1].harmonics[0] if mild else 0
+        return USUAL if mild else 0
 
     #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
     spike: ClassVar[float] = 1e-4

@@ -30,8 +30,6 @@ from apu_casadi.machine.weights import rippling, through, unresolved
 
 #: What steps of the exciter leave of a voltage that passes by, which they take by Simpson's rule.
 _RUNGE_KUTTA = unresolved(np.array([1.0, 4.0, 2.0, 4.0]) / 3.0)
-#: Strides in a turn up to which what they miss of a new speed is left: it would take 4 % of a step.
-MILD = 20
 PACE = 2  # strides in a step of the exciter; with 4, its high gain sees the sampling of the ripple
 #: Longest time, in strides and in turns, in which the stator may settle behind the load and not be
 #: sampled: longer strides do not make slower what a new speed leaves behind.
@@ -268,10 +266,8 @@ class _Seen:
         h, weight = ca.SX.sym("h"), ca.SX.sym("weight")
         layer = min(LAYER[0], LAYER[1] * turn.strides)
         after, area = settled(ss, False)(x, u, th, layer * h)
-        late = [ca.SX.zeros(x.numel())] * 2
-        if turn.strides > MILD:
-            leaves = turn.mean_leaves, _RUNGE_KUTTA
-            late = [missed(ss, left)(x, after, u, th, h) for left in leaves]
+        leaves = turn.mean_leaves, _RUNGE_KUTTA
+        late = [missed(ss, left)(x, after, u, th, h) for left in leaves]
         by = 1 / (weight * h), 6 / (PACE * h)
 
         def seen(x: Any, areas: Sequence[Any]) -> tuple[Any, Any]:
@@ -554,9 +550,7 @@ def periodic_step(
         z, S, of_samples, of_starts = half_turn(z, S, *given)
         samples.append(ca.reshape(of_samples, n + 2, half))
         starts.append(of_starts)
-        if (
-            not k and turn.strides > MILD
-        ):  # what has passed by is no more; what ripples is as it was at the start
+        if not k:  # what has passed by is no more; what ripples is as it was at the start
             x_then = ca.MX(X0)
             x_then[at.linear], x_then[at.slow] = z[:n], S[: len(at.slow)]
             of_terms, of_V = seen.rippled(x_then, *how)

@@ -30,7 +30,7 @@ from apu_casadi.machine.collocated import Collocated
 from apu_casadi.machine.course import Course, Numbers
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.meanstep import MeanStep
+from apu_casadi.machine.meanstep import USUAL, MeanStep
 from apu_casadi.machine.propagation import Propagator
 from apu_casadi.machine.transition import SPEED_RANGE
 from apu_casadi.unit.exchange import PAPER, Exchange
@@ -299,7 +299,7 @@ class Means(_Exact[MeanStep]):
 
     otherwise = "samples are needed also for means"
 
-    def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = 0) -> MeanStep:
+    def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = USUAL) -> MeanStep:
         p, own = self.phase, {"dt": self.settings.dt, "quad": self.quad}
         return MeanStep(p.gen, p.ss, u, theta, **own, harmonics=harmonics)  # type: ignore[arg-type]
 
