@@ -327,7 +327,8 @@ def test_the_second_unit_compiles_nothing(tpe, monkeypatch):
         ds = simulate_joint(unit, duration=1.6, load=load, events=events, waveform_dt=None)
         return point, deck, ds
 
-    use(Apu())
+    for _ in range(6):  # single steps are compiled when they have been called 50 times
+        use(Apu())
     monkeypatch.setattr(backend, "_compile", None)
     point, deck, ds = use(tpe.unit)
     assert (deck["status"].values == 0).all()
