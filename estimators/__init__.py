@@ -3,6 +3,7 @@
 What they need:
 
 - :mod:`estimators.models.filtermodel`: f, g, names, where noise enters
+- :mod:`estimators.models.sensorerrors`: gain errors, biases and lags of sensors
 - :mod:`estimators.models.angles`: outputs that are read modulo a turn
 - :mod:`estimators.models.recording`: time-stamped samples of any rate, with gaps
 - :mod:`estimators.models.lifting`: models whose algebraic unknowns the optimiser finds

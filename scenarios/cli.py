@@ -45,6 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return streams.finish(_guarded(argv, g), own=g.own)
         finally:
             files.account(False)
+            if g.own:  # what is left goes with the process
+                gc.freeze()
 
 
 def _guarded(argv: Sequence[str] | None, g: guard.Guard) -> int:

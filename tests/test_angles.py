@@ -27,11 +27,11 @@ from estimators.models.filtermodel import (
     FilterModel,
     Unknown,
     augment,
-    biases,
     measure,
     noisy_inputs,
 )
 from estimators.models.recording import Recording
+from estimators.models.sensorerrors import biases
 
 RATE = 24.5  # rad/s
 DT, K, SIGMA = 0.05, 80, 0.05

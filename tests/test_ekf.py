@@ -32,8 +32,9 @@ from apu_casadi.core.signals import Signals
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import correct, ekf_step, extended_kalman_filter
 from estimators.filters.stepparts import projected
-from estimators.models.filtermodel import FilterModel, Unknown, augment, gains
+from estimators.models.filtermodel import FilterModel, Unknown, augment
 from estimators.models.recording import Recording
+from estimators.models.sensorerrors import gains
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 

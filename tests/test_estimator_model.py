@@ -25,13 +25,12 @@ from estimators.models.filtermodel import (
     FilterModel,
     Unknown,
     augment,
-    biases,
     discretise,
-    gains,
     measure,
     measured_inputs,
     noisy_inputs,
 )
+from estimators.models.sensorerrors import biases, gains
 
 
 def value(fun, *args):

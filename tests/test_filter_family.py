@@ -34,13 +34,12 @@ from estimators.models.filtermodel import (
     FilterModel,
     Unknown,
     augment,
-    biases,
     discretise,
-    gains,
     measure,
     noisy_inputs,
 )
 from estimators.models.recording import Recording, record
+from estimators.models.sensorerrors import biases, gains
 
 # what none of the filter's outputs depends on: surge margins, and a pressure beside the gas path
 IDLE = ["gas_generator.Ps3_P3", "compressor_map.k_SM", "compressor_map.a_SM"]

@@ -22,15 +22,14 @@ from estimators.filters.belief import Belief
 from estimators.models.filtermodel import (
     Unknown,
     augment,
-    biases,
     discretise,
-    gains,
     measure,
     measured_inputs,
     noisy_inputs,
 )
 from estimators.models.lifting import lift, plain
 from estimators.models.recording import Recording, record
+from estimators.models.sensorerrors import biases, gains
 
 
 def static(g, p, ny=1):

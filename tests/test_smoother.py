@@ -26,7 +26,8 @@ from estimators.batch.smoother import fixed_lag_smoother, rts_smoother
 from estimators.filters.belief import Belief
 from estimators.filters.ekf import extended_kalman_filter
 from estimators.filters.ukf import unscented_kalman_filter
-from estimators.models.filtermodel import Unknown, augment, gains
+from estimators.models.filtermodel import Unknown, augment
+from estimators.models.sensorerrors import gains
 
 EXACT = dict(rtol=1e-9, atol=1e-9)
 FILTERS = {

@@ -34,14 +34,12 @@ from estimators.batch.fitresult import FitResult
 from estimators.information.consistency import coverage as shares_covered
 from estimators.models.filtermodel import (
     FilterModel,
-    biases,
-    gains,
-    lagging,
     measure,
     measured_inputs,
 )
 from estimators.models.lifting import Lifted, lift
 from estimators.models.recording import Recording, plain_numbers, record
+from estimators.models.sensorerrors import biases, gains, lagging
 
 __all__ = [
     "AMBIENT",

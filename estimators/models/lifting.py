@@ -130,8 +130,8 @@ def lift(
         build: turns ``discretise(ss)`` into the model wanted, by
             :func:`~estimators.models.filtermodel.measure`,
             :func:`~estimators.models.filtermodel.noisy_inputs`,
-            :func:`~estimators.models.filtermodel.gains`,
-            :func:`~estimators.models.filtermodel.biases`,
+            :func:`~estimators.models.sensorerrors.gains`,
+            :func:`~estimators.models.sensorerrors.biases`,
             :func:`~estimators.models.filtermodel.augment`; applied to the eliminated and to the
             lifted form.  It must not depend on anything but its argument.
         equations: Function (x, z, u, theta) -> (ode, alg, y): ``ss.residual`` with the outputs.

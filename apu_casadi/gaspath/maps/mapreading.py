@@ -70,7 +70,7 @@ def table_of(
         raise MapError(f"{path}: {e}") from None
     found = table.implausible()
     if not found:
-        return dataclasses.replace(table, check=True)
+        return table.found_plausible()
     if check:
         f = found[0]
         raise MapError(f"{path}{where(f)}, {table.place(f)}: {found_text(table, f)}")

@@ -5,6 +5,7 @@ The files of such tables are read and written by :mod:`apu_casadi.gaspath.maps.m
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, fields
 from typing import Any
@@ -97,6 +98,13 @@ class MapTable(Parametric):
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
         self.__dict__.update(state)
+
+    def found_plausible(self) -> MapTable:
+        """Return the same with ``check``, where it is known that nothing is implausible."""
+        made = copy.copy(self)
+        made.__dict__.update(check=True)
+        made.__dict__.pop("_hash", None)
+        return made
 
     def implausible(self) -> list[Finding]:
         """Return the numbers that do not go with their neighbours, the worst first."""
