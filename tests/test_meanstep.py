@@ -156,7 +156,7 @@ def test_severe_faults_take_finer_strides(load, mu, h):
     mild = MeanStep(GEN, ss, u, GEN.fault_vector(load, Ttsc(0.05, 99.0)), dt=0.02, quad=quad)
     fits = [level.harmonics for level in meanstep.LEVELS]
     assert mild.harmonics in (*fits[0], *fits[1])
-    assert fast.harmonics in fits[3]
+    assert fast.harmonics in (*fits[2], *fits[3])
 
 
 @pytest.mark.parametrize(
