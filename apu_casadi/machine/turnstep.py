@@ -21,6 +21,7 @@ import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, harmonic, window
+from apu_casadi.core.sharing import once
 from apu_casadi.machine.exciterstep import Exciter, exciter_of, exciter_step
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import hoisted
@@ -148,9 +149,7 @@ class Turn(NamedTuple):
     @property
     def mean_leaves(self) -> tuple[float, float, float, float]:
         """What means leave of something that passes by, as :func:`unresolved` tells it."""
-        rule = _RULES[self.strides]
-        first, partial = rippling(rule.before, rule.after, self.half, rule.degrees)
-        whole = [np.polyval(row[::-1], 0.5) for row in partial]
+        first, _, whole = _end_of(self.strides)
         return unresolved(np.append(first + np.cumsum(whole), [1.0, 1.0]))
 
     @property
@@ -176,6 +175,14 @@ def turn_of(dt: float, w_rated: float, each: int) -> Turn:
     around = _RULES[each].around
     halves = math.ceil(((1 + SPEED_RANGE) * strides + around // 2) / (each // 2))
     return Turn(halves, math.floor((1 - SPEED_RANGE) * strides) - around, each)
+
+
+@once
+def _end_of(strides: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what :func:`rippling` says by the rule of so many strides, and of whole intervals."""
+    rule = _RULES[strides]
+    first, partial = rippling(rule.before, rule.after, strides // 2, rule.degrees)
+    return first, partial, np.array([np.polyval(row[::-1], 0.5) for row in partial])
 
 
 def _slice(values: Any, count: int, at: Any) -> ca.MX:
@@ -218,14 +225,13 @@ class _End:
 
     def means(self) -> Any:
         """Weights of the samples in a mean, relative to a stride, (samples,)."""
-        rule = _RULES[self.turn.strides]
-        first, partial = rippling(rule.before, rule.after, self.turn.half, rule.degrees)
-        count, whole = first.size, np.array([np.polyval(row[::-1], 0.5) for row in partial])
+        first, partial, whole = _end_of(self.turn.strides)
+        count, before = first.size, _RULES[self.turn.strides].before
         # less what the intervals from J on would give to a sample near it, and what the last does
         after = np.append(np.cumsum(whole[:0:-1])[::-1], 0.0) - 1.0
         last = ca.mtimes(ca.DM(partial), _powers(self._s - 0.5, partial.shape[1])) + ca.DM(after)
         n, earliest = self.turn.samples, self.turn.first + self.turn.around
-        begin = earliest + 1 - rule.before
+        begin = earliest + 1 - before
         beyond = n - begin - count
         ends = ca.vertcat(ca.DM.zeros(beyond), last, -ca.DM.ones(beyond))
         later = ca.fmin(ca.fmax(self.J - earliest, 0), beyond)

@@ -199,28 +199,26 @@ class JointRun:
         if self._by_blocks:
             free = int(np.searchsorted(grid, until + SAME_INSTANT, side="right")) - 1
             free = min(free, int(self._odd[np.searchsorted(self._odd, k)])) - k
-            waves, together = self.settings.waveform_dt is not None, asking()
-            tries = self._tries(free, waves=waves, together=together)
-            ways[:0] = [partial(self._once, i, way) for i, way in enumerate(tries)]
+            ways[:0] = [partial(self._once, i, way) for i, way in enumerate(self._tries(free))]
         return first_able(ways, k)
 
-    def _tries(self, free: int, *, waves: bool, together: bool) -> list[_Way]:
+    def _tries(self, free: int) -> list[_Way]:
         """Return how to go on by blocks over free steps, most of them first.
 
         In an ensemble each is a question, which nothing may come before.
         """
         tries: list[_Way] = []
+        waves, together, strict = self.settings.waveform_dt is not None, asking(), self.asked.strict
         if self._changing and not waves:
-            most = COURSE if together or self.asked.strict else ROW * COURSE
+            most = COURSE if together or strict else ROW * COURSE
             whole = min(free, most) // COURSE * COURSE
             if whole and not self._rough:
                 tries.append(partial(self._blocks, steps=whole, block=COURSE))
             few = 1 if together else min(max(1, free), self._rough or COURSE - 1)
             return [*tries, partial(self._blocks, steps=few, block=1)]
-        strictly = waves or self.asked.strict or (together and self._changing)
-        first = min(free, BLOCK if strictly else ROW * BLOCK) // BLOCK * BLOCK
+        first = min(free, BLOCK if waves or strict else ROW * BLOCK) // BLOCK * BLOCK
         sizes = [first] if together else dict.fromkeys((first, BLOCK))
-        tries = [partial(self._blocks, steps=n, block=BLOCK) for n in sizes if 0 < n <= free]
+        tries += [partial(self._blocks, steps=n, block=BLOCK) for n in sizes if 0 < n <= free]
         if not waves:
             tries.append(partial(self._one_by_one, steps=min(max(1, free), BLOCK - 1)))
         return tries
