@@ -180,7 +180,7 @@ class Course(Generic[F]):
         self.gen, self.ss, self.load, self.fault = gen, ss, load, fault
         self._prepare: Callable[[np.ndarray, np.ndarray, int], F] = prepare
         parts: list[Varying[Any]] = [x for x in (load, fault) if isinstance(x, Varying)]
-        profiles = [p for x in parts for p in x.profiles.values()]
+        self._profiles = profiles = [p for x in parts for p in x.profiles.values()]
         # the value of the only profile, where its course in time has many bends
         self._only: Profile | None = (
             profiles[0] if len(profiles) == 1 and profiles[0].by_value else None
@@ -207,6 +207,21 @@ class Course(Generic[F]):
         if self._only is None:
             return part.at(s)
         return part.with_values(dict.fromkeys(part.profiles, s))
+
+    def extremes(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return u and theta where a profile is least or largest, of the same model variant."""
+        at, found = np.array(self._ends), []
+        if self._only is None:
+            courses = [p(at) for p in self._profiles]
+            at = np.unique([at[k] for v in courses for k in (v.argmin(), v.argmax())])
+        for s in at.tolist():
+            try:
+                load, fault = self._made(self.load, s), self._made(self.fault, s)
+            except ApuError:  # it cannot be there, and will be refused there
+                continue
+            if self.gen.variant(load, fault) == self.ss:
+                found.append((self.gen.inputs(load), self.gen.fault_vector(load, fault)))
+        return found
 
     # -- numbers --------------------------------------------------------------------------------
 

@@ -31,12 +31,12 @@ from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import hoisted, leap, seen_at_start
 from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import (
-    EXTRA,
     NODES,
     Table,
     cached_table,
     nominal_entries,
     parity,
+    ripple,
     symmetry,
 )
 from apu_casadi.machine.turnstep import Turn, periodic_step, turn_of
@@ -289,24 +289,6 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
 # ------------------------------------------------------------------------------ both
 
 
-def _ripple(ss: GeneratorModel, table: Table) -> float:
-    """Harmonics of the transition matrices from the fourth on, nominal units, at rated speed.
-
-    Without those of a current of the fault that is a state of its own: beside an inductive load it
-    ripples by far more than what it acts on.
-    """
-    total, n, kinds = 0.0, len(ss.linear), parity(ss, 1)
-    own = np.array([name != "i_fault" for name in ss.linear] + [True] * EXTRA)
-    each = zip(
-        (table.even, table.odd), (kinds.even, kinds.odd), nominal_entries(ss, 1), strict=True
-    )
-    for part, at, units in each:
-        pairs = part[0].reshape(-1, 2, part.shape[2])[2:]  # from 4, and from 5 on
-        size = np.hypot(pairs[:, 0], pairs[:, 1]) * units * (own[at % n] & own[at // n])
-        total += float(size.max(axis=1, initial=0.0).sum())
-    return total
-
-
 @kept
 def _function(
     ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int
@@ -406,7 +388,7 @@ class MeanStep(Rebuilt):
             table = cached_table(ss, u, theta, w, angle=2 * math.pi / level.strides)
             found = max(harmonics, table.harmonics)
             fit = next((k for k in level.harmonics if k >= found), 0)
-            if fit and _ripple(ss, table) <= level.ripple:
+            if fit and ripple(ss, table) <= level.ripple:
                 return table, level, fit
         raise NotApplicable(
             f"{ss.name}: {found} harmonics of the rotor angle, {LEVELS[-1].harmonics[-1]} fit"

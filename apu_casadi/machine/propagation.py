@@ -50,6 +50,7 @@ from apu_casadi.machine.transition import (
     fastest,
     nominal_entries,
     parity,
+    ripple,
     split,
     symmetry,
 )
@@ -66,6 +67,12 @@ LAYER = 4.0
 #: no digits left: beside an open phase it is 9000, and a table right to 2e-9 errs in it by 2e-5
 #: of the voltage in each sample.
 LOST = 1e3
+#: Ripple of the transition matrices over a sample, nominal units, from which on two of half the
+#: length are needed: with one, what means, and what the exciter sees, errs by 5e-7.
+RIPPLE = 1e-2
+#: Rate of the fastest winding times a sample, from which on two, or four, are needed where a load
+#: or a fault changes in every step.
+LIGHT = {2: 4.0, 4: 12.0}
 
 
 class Strides(NamedTuple):
@@ -74,9 +81,8 @@ class Strides(NamedTuple):
     A new speed at the start of a step lets the terminal voltage jump and settle within a
     millisecond, which single samples resolve.  After that, where nothing ripples, the exciter can
     take five samples at once; under a fault its drive follows the ripple of the terminal voltage
-    and two are right.  ``fine`` is single samples throughout: while a regulator limit is met or
-    left, say (``DRIVE_TOL`` tells).  Single samples take the voltage's slope under a ripple: where
-    that has no digits, there are none.
+    and two are right, from the start, by Simpson's rule.  ``fine`` is single samples throughout:
+    while a regulator limit is met or left, say (``DRIVE_TOL`` tells).
     """
 
     head: int
@@ -88,12 +94,11 @@ class Strides(NamedTuple):
         return np.concatenate([np.arange(self.head), self.head + self.m * np.arange(self.many)])
 
 
-def strides(n_out: int, h: float, constant: bool, fine: bool, sloped: bool = True) -> Strides:
-    """Choose the strides for n_out samples of length h, s; ``sloped`` where slopes have digits."""
+def strides(n_out: int, h: float, constant: bool, fine: bool) -> Strides:
+    """Choose the strides for n_out samples of length h, s."""
     if fine:
         return Strides(n_out, 1, 0)
-    m = 5 if constant else 2
-    head = min(n_out, math.ceil(SETTLING / h)) if sloped else 0
+    m, head = (5, min(n_out, math.ceil(SETTLING / h))) if constant else (2, 0)
     head += (n_out - head) % m
     return Strides(head, m, (n_out - head) // m)
 
@@ -293,8 +298,9 @@ def _advance(
     columns = 1 if constant else plan.head + plan.many
     PP = [ca.MX.sym(k, n, columns) for k, n in zip("PQ", rows[plan.m], strict=False)]
     single, V_of = leap(ss, 1, constant)
-    light = not constant and plan.head and n_out > UNEVEN.size
-    first_x, seen = begun(ss, V_of, X0, (U, TH), H) if light else (X0, V_of(X0, U, TH))
+    first_x, seen = X0, V_of(X0, U, TH)
+    if not constant and n_out > UNEVEN.size:
+        first_x, seen = begun(ss, V_of, X0, (U, TH), H, rates=bool(plan.head))
     V0 = seen_at_start(ss, seen, X0, U, TH)
     S, sizes = ca.vertcat(X0, V0, U, TH, H), (nx, V0.numel(), nu, nt)
     parts = []
@@ -373,6 +379,25 @@ def _at_any_speed(function: ca.Function, at: int, n_out: int, entries: int) -> c
     return ca.Function(f"{function.name()}_series", [X0, series, U, TH, dt], list(out))
 
 
+def parts(
+    gen: Generator, ss: GeneratorModel, given: tuple[np.ndarray, np.ndarray], h: float, moves: bool
+) -> int:
+    """Return in how many samples one of the length h, s, is to be parted.
+
+    Args:
+        gen, ss: generator and its model variant.
+        given: u and theta.
+        moves: whether load or fault change from step to step.
+    """
+    u, theta, w = *given, gen.machine.w_rated
+    if not ss.linear or symmetry(ss, u, theta, w):
+        return 1
+    fast = h * fastest(ss, u, theta, w) if moves else 0.0
+    most = max((n for n, limit in LIGHT.items() if fast > limit), default=1)
+    table = cached_table(ss, u, theta, w, h=h, leaps=strides(0, h, False, False).m)
+    return max(most, 2) if ripple(ss, table) > RIPPLE else most
+
+
 class Propagator(Rebuilt):
     """Steps of one model variant with one load and fault; a fast stand-in for a ``Stepper``.
 
@@ -432,12 +457,10 @@ class Propagator(Rebuilt):
         given, w_rated = np.array(theta, dtype=float), gen.machine.w_rated
         self.theta = ss.full(given)
         self.constant = constant = symmetry(ss, u, given, w_rated)
-        stiff = not constant and self.h * fastest(ss, u, given, w_rated) > LOST
-        if fine and stiff:
+        if fine and not constant and self.h * fastest(ss, u, given, w_rated) > LOST:
             text = "single samples take the slope of a voltage whose digits an open phase takes"
             raise NotApplicable(f"{ss.name}: {text}")
-        # a fault's current that is a state, beside an inductive load, may be as stiff on its way
-        plan = strides(n_out, self.h, constant, fine, not stiff and "i_fault" not in ss.linear)
+        plan = strides(n_out, self.h, constant, fine)
         table = cached_table(ss, u, given, w_rated, h=self.h, leaps=plan.m)
         self.table = table.filled(max(harmonics, table.harmonics))
         # what ``function`` depends on

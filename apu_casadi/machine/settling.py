@@ -106,11 +106,19 @@ def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
 #: What single samples leave of a voltage that passes by: they take it as a cubic, by values and
 #: rates at both ends.
 _HERMITE = unresolved(np.array([0.5, 1.0, 1.0]), 1 / 12)
+#: The same of pairs of them, which take it by Simpson's rule.
+_SIMPSON = unresolved(np.array([1.0, 4.0, 2.0, 4.0]) / 3.0)
 UNEVEN = np.append(end_weights(10), [1.0, 1.0])  # of the first samples in means
 
 
 def begun(
-    ss: GeneratorModel, V_of: ca.Function, x: Any, held: tuple[Any, Any], h: Any
+    ss: GeneratorModel,
+    V_of: ca.Function,
+    x: Any,
+    held: tuple[Any, Any],
+    h: Any,
+    *,
+    rates: bool,
 ) -> tuple[Any, tuple[Any, Any]]:
     """What means, and what the exciter, take for the first sample of a step by single samples.
 
@@ -124,9 +132,10 @@ def begun(
         A state, and terminal voltage with its rate.
     """
     settles, area = settled(ss, False)(x, *held, h / 4)
-    late = [missed(ss, k)(x, settles, *held, h) for k in (unresolved(UNEVEN), _HERMITE)]
+    left, share = (_HERMITE, 2) if rates else (_SIMPSON, 3)
+    late = [missed(ss, k)(x, settles, *held, h) for k in (unresolved(UNEVEN), left)]
     of_means = settles + (area + late[0]) / (float(UNEVEN[0]) * h)
-    V_seen = V_of(settles + (area + late[1]) * (2 / h), *held)[0]
+    V_seen = V_of(settles + (area + late[1]) * (share / h), *held)[0]
     return of_means, (V_seen, V_of(settles, *held)[1])
 
 

@@ -403,6 +403,24 @@ def nominal_entries(ss: GeneratorModel, leaps: int) -> tuple[np.ndarray, np.ndar
     return scale[kinds.even], scale[kinds.odd]
 
 
+def ripple(ss: GeneratorModel, table: Table) -> float:
+    """Return the harmonics of the first transition matrix from the fourth on, nominal units.
+
+    At rated speed.  Without those of a current of the fault that is a state of its own: beside an
+    inductive load it ripples by far more than what it acts on.
+    """
+    total, n, kinds = 0.0, len(ss.linear), parity(ss, 1)
+    own = np.array([name != "i_fault" for name in ss.linear] + [True] * EXTRA)
+    each = zip(
+        (table.even, table.odd), (kinds.even, kinds.odd), nominal_entries(ss, 1), strict=True
+    )
+    for part, at, units in each:
+        pairs = part[0].reshape(-1, 2, part.shape[2])[2:, :, : at.size]  # from 4, and from 5 on
+        size = np.hypot(pairs[:, 0], pairs[:, 1]) * units * (own[at % n] & own[at // n])
+        total += float(size.max(axis=1, initial=0.0).sum())
+    return total
+
+
 def transition_table(
     ss: GeneratorModel,
     u: np.ndarray,

@@ -58,7 +58,7 @@ from apu_casadi.unit.events import (
     jumps,
 )
 from apu_casadi.unit.exchange import EXCHANGES
-from apu_casadi.unit.integrators import SOLVERS, WAVEFORMS, Settings, ramped
+from apu_casadi.unit.integrators import ATOL, RTOL, SOLVERS, WAVEFORMS, Settings, ramped
 from apu_casadi.unit.jointrun import Asked, JointRun
 from apu_casadi.unit.machines import kinds, means_of
 from apu_casadi.unit.noise import Noise
@@ -126,8 +126,8 @@ def simulate_joint(
     start_from: str = "balanced",
     strict: bool = False,
     limits: Limits | None = None,
-    rtol: float = 1e-8,
-    atol: float = 1e-10,
+    rtol: float = RTOL,
+    atol: float = ATOL,
     progress: Callable[[float, float], None] | None = None,
     attrs: Mapping[str, Any] | None = None,
     storage: str | os.PathLike[str] = "auto",
