@@ -48,6 +48,20 @@ def exciter_step(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
     return drive, ca.Function("exciter", [slow, V, V_ref, th, H], [end])
 
 
+@kept
+def kick(ss: GeneratorModel) -> ca.Function:
+    """By how much an impulse of the terminal voltage, 1 V s, moves the exciter's states.
+
+    Function (slow, V_t, V_ref, theta) -> change of slow.
+    """
+    at = split(ss).slow
+    slow, V, V_ref = ca.SX.sym("slow", len(at)), ca.SX.sym("V"), ca.SX.sym("V_ref")
+    th, full = ca.SX.sym("t", len(ss.theta)), ca.SX.zeros(len(ss.x))
+    full[at] = slow
+    moves = ca.densify(ca.jacobian(ss.exciter(full, V, V_ref, th), V))
+    return ca.Function("kick", [slow, V, V_ref, th], [moves])
+
+
 def _given_exps(f: ca.Function) -> tuple[ca.Function, ca.Function]:
     """Write an SX function of (slow, V_t, ...) with the values of its exponentials as an input.
 

@@ -36,11 +36,11 @@ from apu_casadi.core.instructions import applied, rewritten
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.core.simulation import StepResult
-from apu_casadi.machine.exciterstep import exciter_of
+from apu_casadi.machine.exciterstep import exciter_of, kick
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.loads.load import V_RATED
-from apu_casadi.machine.settling import UNEVEN, begun
+from apu_casadi.machine.settling import UNEVEN, Begun
 from apu_casadi.machine.transition import (
     EXTRA,
     NODES,
@@ -69,7 +69,7 @@ LAYER = 4.0
 LOST = 1e3
 #: Ripple of the transition matrices over a sample, nominal units, from which on two of half the
 #: length are needed: with one, what means, and what the exciter sees, errs by 5e-7.
-RIPPLE = 1e-2
+RIPPLE = 7e-3
 #: Rate of the fastest winding times a sample, from which on two, or four, are needed where a load
 #: or a fault changes in every step.
 LIGHT = {2: 4.0, 4: 12.0}
@@ -298,9 +298,10 @@ def _advance(
     columns = 1 if constant else plan.head + plan.many
     PP = [ca.MX.sym(k, n, columns) for k, n in zip("PQ", rows[plan.m], strict=False)]
     single, V_of = leap(ss, 1, constant)
-    first_x, seen = X0, V_of(X0, U, TH)
-    if not constant and n_out > UNEVEN.size:
-        first_x, seen = begun(ss, V_of, X0, (U, TH), H, rates=bool(plan.head))
+    first_x, seen, held = X0, V_of(X0, U, TH), (U, TH)
+    enough = n_out > UNEVEN.size
+    if enough:
+        first_x, seen = Begun(ss, constant, bool(plan.head)).start(V_of, X0, held, H)
     V0 = seen_at_start(ss, seen, X0, U, TH)
     S, sizes = ca.vertcat(X0, V0, U, TH, H), (nx, V0.numel(), nu, nt)
     parts = []
@@ -315,11 +316,18 @@ def _advance(
         S, X = fold(S, *(p if constant else p[:, plan.head :] for p in PP))
         parts.append(X)
     X_all, miss = ca.horzcat(*parts), S[nx + 2]
-    Y, means = _observed(ss, outputs, quad, first_x, X_all, ca.vertcat(U, TH))
+    end, beyond = X_all[:, n_out - 1], []
+    if enough and not constant:
+        last, impulse = Begun(ss, constant, not plan.many).end(V_of, end, held, H)
+        beyond, at = [end, last], split(ss).slow
+        moved = kick(ss)(end[at], S[nx], U[ss.u.index("V_ref")], TH) * impulse
+        end = ca.MX(end)
+        end[at] += moved
+    Y, means = _observed(ss, outputs, quad, (first_x, X_all, beyond), ca.vertcat(U, TH))
     return ca.Function(
         f"advance_{ss.name}_{n_out}" + ("" if plan.many else "_fine"),
         [X0, *PP, U, TH, H],
-        [X_all[:, n_out - 1], Y, means, miss],
+        [end, Y, means, miss],
         ["x0", *"PQ"[: len(PP)], "u", "theta", "h"],
         ["x", "y", "mean", "miss"],
     )
@@ -332,11 +340,15 @@ def _observed(
     ss: GeneratorModel,
     outputs: Sequence[str],
     quad: Sequence[str],
-    start: Any,
-    samples: Any,
+    states: tuple[Any, Any, Sequence[Any]],
     fixed: Any,
 ) -> tuple[Any, Any]:
-    """Return outputs at the samples, and means over the step by :func:`gregory`."""
+    """Return outputs at the samples, and means over the step by :func:`gregory`.
+
+    Args:
+        states: at the start, at the samples, and two of which the means get the difference.
+    """
+    start, samples, beyond = states
     x, u, th = (ca.SX.sym(k, len(s)) for k, s in zip("xut", (ss.x, ss.u, ss.theta), strict=True))
     y, weight = ss.g(x, u, th), ca.SX.sym("weight", 2)  # of plain means, and of weighted ones
     terms = [
@@ -350,6 +362,9 @@ def _observed(
     w, light = gregory(n), window(np.arange(n + 1) / n)
     weights = ca.DM(np.array([w, w * light]))
     means, Y = out(start, weights[:, 0], d)[1], []
+    if beyond:
+        of_end, of_more = (out(state, weights[:, n], d)[1] for state in beyond)
+        means = means + of_end - of_more
     sums = dict[int, Any]()
     for k in range(0, n, _TOGETHER):
         size = min(_TOGETHER, n - k)
@@ -390,10 +405,12 @@ def parts(
         moves: whether load or fault change from step to step.
     """
     u, theta, w = *given, gen.machine.w_rated
-    if not ss.linear or symmetry(ss, u, theta, w):
+    if not ss.linear:
         return 1
     fast = h * fastest(ss, u, theta, w) if moves else 0.0
     most = max((n for n, limit in LIGHT.items() if fast > limit), default=1)
+    if symmetry(ss, u, theta, w):
+        return most
     table = cached_table(ss, u, theta, w, h=h, leaps=strides(0, h, False, False).m)
     return max(most, 2) if ripple(ss, table) > RIPPLE else most
 

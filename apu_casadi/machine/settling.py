@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -34,7 +34,7 @@ from apu_casadi.machine.weights import end_weights, unresolved
 _STATOR = ("lam_sq", "lam_sd", "lam_s0")
 _ROTOR = ("lam_fd", "lam_kd", "lam_kq")
 #: By "coefficients are constant": elsewhere slow states ripple, and their second derivative does.
-ORDER = {True: 2, False: 3}
+ORDER = {True: 3, False: 3}
 
 #: Fastest mode, over 1/T, up to which it is done.  Beside an open phase (3e4) what the ripple of
 #: the others leaves in the derivatives is not small, and a step that begins settled was 5e-6 off.
@@ -78,17 +78,18 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
 
 
 @kept
-def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
+def missed(ss: GeneratorModel, constant: bool, left: Sequence[float]) -> ca.Function:
     """Function (x, x as it settles, u, theta, h) -> area that sums of samples h, s, apart miss.
 
     What takes as long as a stride is too slow for :func:`settled`, and too fast for samples: of
-    exp(-t/T) they leave an area that depends on h/T alone.  Here it is that of states over time,
-    for periodic coefficients.  A ripple leaves some of it too, the same after half a turn.
+    exp(-t/T) they leave an area that depends on h/T alone.  Here it is that of states over time.
+    A ripple leaves some of it too, the same after half a turn.
 
     Args:
+        ss, constant: as for :func:`settled`.
         left: n, a, b and c of :func:`apu_casadi.machine.weights.unresolved`.
     """
-    of_model, (x, u, th) = _Fast.of(ss, False)
+    of_model, (x, u, th) = _Fast.of(ss, constant)
     after, h, (n, *below) = ca.SX.sym("after", x.numel()), ca.SX.sym("h"), left
     fast = ss.x.indices([k for k in (*_STATOR, "i_fault") if k in ss.linear])
     units, eye = ss.x.nominals[fast], ca.SX.eye(len(fast))
@@ -100,43 +101,67 @@ def missed(ss: GeneratorModel, left: Sequence[float]) -> ca.Function:
     area = ca.SX.zeros(x.numel())
     resolved = -n * h * units * ca.solve(divisor, ca.mtimes(Z3, passes))
     area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
+    if constant:
+        area = ca.substitute(area, x[ss.x.index("theta_e")], ca.SX(0))
     return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
 
 
-#: What single samples leave of a voltage that passes by: they take it as a cubic, by values and
-#: rates at both ends.
+#: What the exciter's steps leave of a voltage that passes by: pairs of samples take it by Simpson's
+#: rule, single ones as a cubic, by values and rates at both ends.
+SIMPSON = unresolved(np.array([1.0, 4.0, 2.0, 4.0]) / 3.0)
 _HERMITE = unresolved(np.array([0.5, 1.0, 1.0]), 1 / 12)
-#: The same of pairs of them, which take it by Simpson's rule.
-_SIMPSON = unresolved(np.array([1.0, 4.0, 2.0, 4.0]) / 3.0)
 UNEVEN = np.append(end_weights(10), [1.0, 1.0])  # of the first samples in means
 
 
-def begun(
-    ss: GeneratorModel,
-    V_of: ca.Function,
-    x: Any,
-    held: tuple[Any, Any],
-    h: Any,
-    *,
-    rates: bool,
-) -> tuple[Any, tuple[Any, Any]]:
-    """What means, and what the exciter, take for the first sample of a step by single samples.
+_Start: TypeAlias = tuple[Any, tuple[Any, Any]]
+
+
+class Begun(NamedTuple):
+    """What is taken for the first sample of a step by samples.
 
     Behind the resistance of a light load, or of a fault beside an inductive one, what a new speed
-    or a new severity leaves settles within microseconds: it counts by its area.
+    or a new severity leaves settles within microseconds: it counts by its area, divided by the
+    weight of the sample.  So does what the samples miss of a ripple, until they end.
 
     Args:
-        x, held, h: state, inputs and theta, length of a sample.
-
-    Returns:
-        A state, and terminal voltage with its rate.
+        ss, constant: as for :func:`settled`.
+        single: whether the exciter takes single samples, or pairs.
     """
-    settles, area = settled(ss, False)(x, *held, h / 4)
-    left, share = (_HERMITE, 2) if rates else (_SIMPSON, 3)
-    late = [missed(ss, k)(x, settles, *held, h) for k in (unresolved(UNEVEN), left)]
-    of_means = settles + (area + late[0]) / (float(UNEVEN[0]) * h)
-    V_seen = V_of(settles + (area + late[1]) * (share / h), *held)[0]
-    return of_means, (V_seen, V_of(settles, *held)[1])
+
+    ss: GeneratorModel
+    constant: bool
+    single: bool
+
+    @property
+    def share(self) -> int:
+        """What part of a sample's length the exciter takes for the weight of the first."""
+        return 2 if self.single else 3
+
+    def _late(self, x: Any, after: Any, held: tuple[Any, Any], h: Any) -> list[Any]:
+        """Return areas that the means' samples, and the exciter's, miss."""
+        leaves = unresolved(UNEVEN), _HERMITE if self.single else SIMPSON
+        return [missed(self.ss, self.constant, k)(x, after, *held, h) for k in leaves]
+
+    def start(self, V_of: ca.Function, x: Any, held: tuple[Any, Any], h: Any) -> _Start:
+        """Return a state for the means, and terminal voltage with its rate for the exciter.
+
+        Args:
+            x, held, h: state, inputs and theta, length of a sample.
+        """
+        settles, area = settled(self.ss, self.constant)(x, *held, h / 4)
+        late = self._late(x, settles, held, h)
+        of_means = settles + (area + late[0]) / (float(UNEVEN[0]) * h)
+        V_seen = V_of(settles + (area + late[1]) * (self.share / h), *held)[0]
+        return of_means, (V_seen, V_of(settles, *held)[1])
+
+    def end(self, V_of: ca.Function, x: Any, held: tuple[Any, Any], h: Any) -> tuple[Any, Any]:
+        """Return a state that means take beyond the last one, and an impulse of the voltage, V s.
+
+        What the first sample has been given for a ripple is given back.
+        """
+        late = self._late(x, x, held, h)  # nothing is so fast as to settle
+        beyond = V_of(x + late[1] * (self.share / h), *held)[0] - V_of(x, *held)[0]
+        return x + late[0] / (float(UNEVEN[0]) * h), -h / self.share * beyond
 
 
 class _Fast(NamedTuple):

@@ -22,15 +22,13 @@ import numpy as np
 from apu_casadi.core.errors import NotApplicable
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.core.sharing import once
-from apu_casadi.machine.exciterstep import Exciter, exciter_of, exciter_step
+from apu_casadi.machine.exciterstep import Exciter, exciter_of, exciter_step, kick
 from apu_casadi.machine.generatormodel import GeneratorModel
 from apu_casadi.machine.propagation import hoisted
-from apu_casadi.machine.settling import missed, settled
+from apu_casadi.machine.settling import SIMPSON, missed, settled
 from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through, unresolved
 
-#: What steps of the exciter leave of a voltage that passes by, which they take by Simpson's rule.
-_RUNGE_KUTTA = unresolved(np.array([1.0, 4.0, 2.0, 4.0]) / 3.0)
 PACE = 2  # strides in a step of the exciter; with 4, its high gain sees the sampling of the ripple
 #: Longest time, in strides and in turns, in which the stator may settle behind the load and not be
 #: sampled: longer strides do not make slower what a new speed leaves behind.
@@ -272,8 +270,8 @@ class _Seen:
         h, weight = ca.SX.sym("h"), ca.SX.sym("weight")
         layer = min(LAYER[0], LAYER[1] * turn.strides)
         after, area = settled(ss, False)(x, u, th, layer * h)
-        leaves = turn.mean_leaves, _RUNGE_KUTTA
-        late = [missed(ss, left)(x, after, u, th, h) for left in leaves]
+        leaves = turn.mean_leaves, SIMPSON
+        late = [missed(ss, False, left)(x, after, u, th, h) for left in leaves]
         by = 1 / (weight * h), 6 / (PACE * h)
 
         def seen(x: Any, areas: Sequence[Any]) -> tuple[Any, Any]:
@@ -284,7 +282,7 @@ class _Seen:
         made = [after, *seen(after, [area + own for own in late])]
         self.start = ca.Function("start", given, made, {"cse": True})
         #: the same -> what a ripple, of which nothing passes by, added to terms and voltage
-        ripples = missed(ss, _RUNGE_KUTTA)(x, x, u, th, h)  # nothing is so fast as to settle
+        ripples = missed(ss, False, SIMPSON)(x, x, u, th, h)  # nothing is so fast as to settle
         more = [a - b for a, b in zip(seen(x, [ripples] * 2), seen(x, (0, 0)), strict=True)]
         self.rippled = ca.Function("rippled", given, more, {"cse": True})
         sample, angle = ca.SX.sym("sample", n + 2), ca.SX.sym("angle")
@@ -420,16 +418,9 @@ def _kicked(
     Args:
         by: the impulse, V s; terminal voltage, V_ref and theta.
     """
-    at, n = split(ss), len(ss.linear)
-    slow, V, V_ref, th = (
-        ca.SX.sym(k, m) for k, m in zip("sVrt", (len(at.slow), 1, 1, len(ss.theta)), strict=True)
-    )
-    full = ca.SX.zeros(len(ss.x))
-    full[at.slow] = slow
-    moves = ca.jacobian(ss.exciter(full, V, V_ref, th), V)
+    n, slow = len(ss.linear), S[: len(split(ss).slow)]
     impulse, *now = by
-    kick = ca.Function("kick", [slow, V, V_ref, th], [moves])(S[: len(at.slow)], *now)
-    after = S[: len(at.slow)] + kick * impulse
+    after = slow + kick(ss)(slow, *now) * impulse
     rates, drive, e = exciter.started(after, *now)
     return ca.vertcat(z[:n], drive, 1), ca.vertcat(after, rates, e, S[-1])
 
