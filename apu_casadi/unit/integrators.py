@@ -14,7 +14,6 @@ import dataclasses
 import logging
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import casadi as ca
@@ -331,11 +330,13 @@ class Samples(_Exact[Propagator]):
         fine: bool = False,
     ) -> None:
         super().__init__(phase, settings, means, way)
-        self.fine = fine
+        self.fine, self._every = fine, 0
 
-    @cached_property
+    @property
     def every(self) -> int:
         """Samples to one that is stored: few where nothing ripples much, nor changes fast."""
+        if self._every:
+            return self._every
         p, s = self.phase, self.settings
         least, wanted = SUMMARY_SAMPLES[p.fault is None], s.n_out(s.dt)
         if s.waveform_dt is not None:
@@ -343,7 +344,8 @@ class Samples(_Exact[Propagator]):
         every = -(-least // wanted)
         h, moves = s.dt / (every * wanted), self._way is not None
         given = self._on_its_way().extremes() if moves else [(p.u, p.theta)]
-        return every * max((parts(p.gen, p.ss, g, h, moves) for g in given), default=1)
+        self._every = every * max((parts(p.gen, p.ss, g, h, moves) for g in given), default=1)
+        return self._every
 
     @property
     def n(self) -> int:
