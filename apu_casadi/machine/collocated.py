@@ -35,6 +35,7 @@ from apu_casadi.machine.transition import SPEED_RANGE, coefficients, inverse, ra
 STAGES = 4
 #: Strides in a turn of the rotor, by "is symmetric": what ripples under a fault needs more.
 STRIDES = {True: 16, False: 20}
+REFINED = 1  # times that the stages are corrected by the residual that they leave
 DOUBLED = 20  # strides at the start, each as long as all before it: from 0.2 ns on
 MOST = 500  # strides; in longer steps an adaptive integrator is as fast
 #: Largest error of E_fd, per unit, that the windings see at the end of a stride: a limit of the
@@ -77,25 +78,42 @@ def _quadratic(c: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _stages(x: Any, h: Any, A: list[Any], F: Any) -> list[Any]:
-    """Solve for the stages; A and F of each, the latter side by side."""
+    """Solve for the stages; A and F of each, the latter side by side.
+
+    A short circuit's loop makes entries of A so large that elimination without pivots loses half
+    of the digits: the residual that is left, solved for once more, gives them back.
+    """
     s, n, (_, a) = len(A), x.numel(), radau(len(A))
-    rhs = ca.repmat(x, 1, s) + h * ca.mtimes(F, ca.DM(a.T))
-    rows = [
-        [*(ca.DM(np.eye(n) * (i == j)) - (h * float(a[i, j])) * A[j] for j in range(s)), rhs[:, i]]
-        for i in range(s)
-    ]
-    solved = []
+    ha = [[h * float(a[i, j]) for j in range(s)] for i in range(s)]
+    D = [[ca.DM(np.eye(n) * (i == j)) - ha[i][j] * A[j] for j in range(s)] for i in range(s)]
+    inverted = []
     for k in range(s):
-        row = ca.mtimes(inverse(n)(rows[k][k]), ca.horzcat(*rows[k][k + 1 :]))
-        for i in range(k + 1, s):
-            left = ca.horzcat(*rows[i][k + 1 :]) - ca.mtimes(rows[i][k], row)
-            ends = [*range(0, left.shape[1], n), left.shape[1]]
-            rows[i][k + 1 :] = ca.horzsplit(left, ends)
-        solved.append(row)
-    X = [solved[-1]]
-    for row in solved[-2::-1]:
-        X.insert(0, row[:, -1] - ca.mtimes(row[:, :-1], ca.vertcat(*X)))
-    return X
+        inverted.append(inverse(n)(D[k][k]))
+        for j in range(k + 1, s):
+            D[k][j] = ca.mtimes(inverted[k], D[k][j])
+            for i in range(k + 1, s):
+                D[i][j] = D[i][j] - ca.mtimes(D[i][k], D[k][j])
+
+    def solved(rhs: list[Any]) -> list[Any]:
+        X: list[Any] = []
+        for k in range(s):
+            left = sum((ca.mtimes(D[k][j], X[j]) for j in range(k)), start=ca.MX(n, 1))
+            X.append(ca.mtimes(inverted[k], rhs[k] - left))
+        for k in range(s - 2, -1, -1):
+            X[k] = X[k] - sum(ca.mtimes(D[k][j], X[j]) for j in range(k + 1, s))
+        return X
+
+    def over(rates: list[Any]) -> list[Any]:
+        return [sum(ha[i][j] * rates[j] for j in range(s)) for i in range(s)]
+
+    F = ca.horzsplit(F)
+    by = solved(over([ca.mtimes(A_j, x) + F_j for A_j, F_j in zip(A, F, strict=True)]))
+    for _ in range(REFINED):
+        X = [x + Z for Z in by]
+        left = over([ca.mtimes(A_j, X_j) + F_j for A_j, X_j, F_j in zip(A, X, F, strict=True)])
+        more = solved([own - Z for own, Z in zip(left, by, strict=True)])
+        by = [Z + d for Z, d in zip(by, more, strict=True)]
+    return [x + Z for Z in by]
 
 
 class _Parts(NamedTuple):

@@ -55,21 +55,24 @@ class Level(NamedTuple):
         strides: in a turn.
         harmonics: of the rotor angle that a function takes; the first that fits.
         ripple: largest harmonics of a transition matrix from the fourth on, nominal units.
+        depth: the same of all of them, which a fault makes large whose loop has little resistance;
+            half of it where the fault's current is a state of its own, and not among them.
     """
 
     strides: int
     harmonics: tuple[int, ...]
     ripple: float
+    depth: float
 
 
 #: No number of harmonics is of two levels.  The first reaches to h = 0.0016 beside a resistive load
 #: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.002 and 0.001, the third to 0.02 and
 #: 0.005.  Means of single steps err by some 7e-7 where one of them changes the speed by 0.3 %.
 LEVELS = (
-    Level(20, (12,), 1e-3),
-    Level(28, (14, 20, 30), 4e-3),
-    Level(56, (32,), 3.5e-2),
-    Level(112, (34,), math.inf),
+    Level(20, (12,), 1e-3, 0.2),
+    Level(28, (14, 20, 30), 4e-3, 0.29),
+    Level(56, (32,), 3.5e-2, math.inf),
+    Level(112, (34,), math.inf, math.inf),
 )
 #: Harmonics of what takes the second level at least: the first gains nothing in a short run.
 USUAL = LEVELS[1].harmonics[0]
@@ -388,7 +391,9 @@ class MeanStep(Rebuilt):
             table = cached_table(ss, u, theta, w, angle=2 * math.pi / level.strides)
             found = max(harmonics, table.harmonics)
             fit = next((k for k in level.harmonics if k >= found), 0)
-            if fit and ripple(ss, table) <= level.ripple:
+            deep = level.depth / (1 + ("i_fault" in ss.linear))
+            fit *= ripple(ss, table, 4) <= level.ripple and ripple(ss, table, 1) <= deep
+            if fit:
                 return table, level, fit
         raise NotApplicable(
             f"{ss.name}: {found} harmonics of the rotor angle, {LEVELS[-1].harmonics[-1]} fit"

@@ -67,9 +67,10 @@ LAYER = 4.0
 #: no digits left: beside an open phase it is 9000, and a table right to 2e-9 errs in it by 2e-5
 #: of the voltage in each sample.
 LOST = 1e3
-#: Ripple of the transition matrices over a sample, nominal units, from which on two of half the
-#: length are needed: with one, what means, and what the exciter sees, errs by 5e-7.
-RIPPLE = 7e-3
+#: Harmonics of the transition matrices over a sample from the third on, nominal units, from which
+#: on two of half the length are needed: with one, what means, and what the exciter sees, errs by
+#: 5e-7.
+RIPPLE = 2.2e-2
 #: Rate of the fastest winding times a sample, from which on two, or four, are needed where a load
 #: or a fault changes in every step.
 LIGHT = {2: 4.0, 4: 12.0}
@@ -412,7 +413,7 @@ def parts(
     if symmetry(ss, u, theta, w):
         return most
     table = cached_table(ss, u, theta, w, h=h, leaps=strides(0, h, False, False).m)
-    return max(most, 2) if ripple(ss, table) > RIPPLE else most
+    return max(most, 2) if ripple(ss, table, 3) > RIPPLE else most
 
 
 class Propagator(Rebuilt):

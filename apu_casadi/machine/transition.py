@@ -403,8 +403,8 @@ def nominal_entries(ss: GeneratorModel, leaps: int) -> tuple[np.ndarray, np.ndar
     return scale[kinds.even], scale[kinds.odd]
 
 
-def ripple(ss: GeneratorModel, table: Table) -> float:
-    """Return the harmonics of the first transition matrix from the fourth on, nominal units.
+def ripple(ss: GeneratorModel, table: Table, lowest: int) -> float:
+    """Return the harmonics of the first transition matrix from one on, nominal units.
 
     At rated speed.  Without those of a current of the fault that is a state of its own: beside an
     inductive load it ripples by far more than what it acts on.
@@ -414,8 +414,8 @@ def ripple(ss: GeneratorModel, table: Table) -> float:
     each = zip(
         (table.even, table.odd), (kinds.even, kinds.odd), nominal_entries(ss, 1), strict=True
     )
-    for part, at, units in each:
-        pairs = part[0].reshape(-1, 2, part.shape[2])[2:, :, : at.size]  # from 4, and from 5 on
+    for odd, (part, at, units) in enumerate(each):
+        pairs = part[0].reshape(-1, 2, part.shape[2])[(lowest + 1 - odd) // 2 :, :, : at.size]
         size = np.hypot(pairs[:, 0], pairs[:, 1]) * units * (own[at % n] & own[at // n])
         total += float(size.max(axis=1, initial=0.0).sum())
     return total
