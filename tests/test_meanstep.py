@@ -234,6 +234,6 @@ def test_what_does_not_hold_is_refused(monkeypatch):
         moved[ss.x.index("V_R")] = np.nan
         with pytest.raises(SimulationError, match="not finite"):
             fast(moved, u)
-    monkeypatch.setattr(meanstep, "LEVELS", (meanstep.Level(20, (4,), 1.0),))
+    monkeypatch.setattr(meanstep, "LEVELS", (meanstep.Level(20, (4,), 1.0, 1.0),))
     with pytest.raises(SimulationError, match="harmonics of the rotor angle, 4 fit"):
         MeanStep(GEN, ss, u, theta, dt=0.02, quad=QUAD)

@@ -113,7 +113,17 @@ def test_waveforms_follow_as_cvodes_has_them():
     assert ours["load_P_1"].values[-1] == pytest.approx(100e3 + 2.5e3 * 0.09, rel=1e-12)
 
 
-@pytest.mark.ci  # CVODES, 5 cases
+WAVES = ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e", "P_inst")
+
+
+def to_1e_6(ours, theirs, names):
+    for name in names:
+        if name in theirs:  # of a fault only where there is one
+            peak = np.abs(theirs[name].values).max()
+            assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-6 * peak, err_msg=name)
+
+
+@pytest.mark.ci  # CVODES, 9 cases
 @pytest.mark.parametrize(
     "second",
     [
@@ -121,22 +131,58 @@ def test_waveforms_follow_as_cvodes_has_them():
         (SeriesLoad.from_power(10e3), varying(Ttsc, Ramp(0.03, 0.05, over=0.2), 60.0)),
         (SeriesLoad.from_power(40e3), varying(Ttsc, 0.05, Ramp(200.0, 60.0, over=0.2), phase="b")),
         (SeriesLoad.from_power(100e3, 0.8), varying(Ttsc, Ramp(0.03, 0.05, over=0.2), 60.0)),
+        (SeriesLoad.from_power(80e3, 0.85), varying(Ttsc, OnOff(0.05, 0.01, 5.0, duty=0.4), 20.0)),
         (KW100, varying(Ttsc.of_h, 0.05, Growth(1e-2, 2e-2, over=0.2))),
+        (SeriesLoad.from_power(10e3), varying(Ttsc.of_h, 0.05, Growth(1e-2, 2e-2, over=0.2))),
+        (varying(SeriesLoad.from_power, Ramp(10e3, 11e3, over=0.2)), None),
+        (varying(SeriesLoad.from_power, Ramp(25e3, 28e3, over=0.2)), None),
     ],
-    ids=["ramp at 10 kW", "mu at 10 kW", "k_rf at 40 kW", "R-L", "severe"],
-)
+    ids=[
+        "ramp at 10 kW", "mu at 10 kW", "k_rf at 40 kW", "R-L", "R-L on and off", "severe",
+        "severe at 10 kW", "healthy at 10 kW", "healthy at 25 kW",
+    ],
+)  # fmt: skip
 def test_waveforms_of_steps_that_a_light_load_shows(second):
-    """To 2e-6 of peak, the field to 4e-6: new numbers move the voltage for microseconds.
+    """To 1e-6 of peak: new numbers move the voltage for microseconds, which count by their area.
 
-    Where the regulator took that for a sample, V_fd erred by 2e-4, v_a by 5e-5 at 10 kW.
+    Where the regulator took that for a sample, V_fd erred by 2e-4, of a healthy machine by 5e-5.
     """
     load, fault = second
-    given = {"load": [KW100, load], "fault": {2: fault}, "duration": 0.2, "waveform_dt": 50e-6}
-    ours, theirs = run(**given), run(**given, **EXACT)
-    for name in ("v_a", "v_b", "v_c", "i_a", "i_b", "i_c", "i_fault", "V_fd", "i_fd", "T_e"):
-        peak = np.abs(theirs[name].values).max()
-        near = 4e-6 if name in ("V_fd", "i_fd") else 2e-6
-        assert_allclose(ours[name], theirs[name], rtol=0, atol=near * peak, err_msg=name)
+    given = {"load": [KW100, load], "duration": 0.2, "waveform_dt": 50e-6}
+    given |= {"fault": {2: fault}} if fault else {}
+    to_1e_6(run(**given), run(**given, **EXACT), WAVES)
+
+
+@pytest.mark.ci  # CVODES, 4 cases
+@pytest.mark.filterwarnings("ignore::apu_casadi.core.errors.ApuWarning")  # torque beside eq. (8)
+@pytest.mark.parametrize(
+    ("load", "h", "kappa"),
+    [
+        (KW100, 0.1, None),
+        (SeriesLoad.from_power(50e3), 0.03, 0.3),
+        (SeriesLoad.from_power(100e3, 0.85), 0.1, None),
+        (CapacitorLoad.from_power(40e3, 0.9), 0.03, None),
+    ],
+    ids=["h = 0.1", "kappa = 0.3", "R-L", "leading"],
+)
+def test_waveforms_beside_a_severe_fault(load, h, kappa):
+    """To 1e-6 of peak, by samples of half the length; of 50 us it was 8e-6."""
+    mu = max(0.05, 2 * h)
+    given = {
+        "load": [KW100, load], "fault": {2: Ttsc(mu, mu / h - 1 + mu, kappa)}, "duration": 0.14,
+        "start_from": "settled", "waveform_dt": 50e-6,
+        "events": [LoadChange(0.05, SeriesLoad.from_power(150e3), generator=1)],
+    }  # fmt: skip
+    to_1e_6(run(**given), run(**given, **EXACT), (*WAVES, *SHOWN))
+
+
+@pytest.mark.ci  # CVODES
+def test_both_agree_as_they_are_by_default():
+    """Waveforms to 1e-6 of peak with the tolerances that nobody asked for, and half the samples."""
+    fault = {2: varying(Ttsc, Ramp(0.01, 0.05, over=0.3), 20.0, phase="b")}
+    given = {"load": SeriesLoad.from_power(80e3, 0.85), "fault": fault, "duration": 0.4}
+    given |= {"waveform_dt": 1e-4}
+    to_1e_6(run(**given), run(**given, solver="cvodes"), (*WAVES, *SHOWN))
 
 
 @pytest.mark.ci  # CVODES, 4 cases
@@ -152,7 +198,7 @@ def test_waveforms_of_steps_that_a_light_load_shows(second):
     ids=["h = 0.1", "h = 0.1, 10 kW", "R-L", "leading"],
 )
 def test_a_load_step_beside_a_fault_of_the_other(load, h, step):
-    """Means to 1e-6 of peak, as docs/limits.md has them: from 1.1e-6 to 4e-6 before.
+    """Means as docs/limits.md has them: from 1.1e-6 to 4e-6 before.
 
     The regulator has a ripple of more than ten harmonics, or a speed that steps, which a branch of
     the fault follows in about a stride.
@@ -163,10 +209,7 @@ def test_a_load_step_beside_a_fault_of_the_other(load, h, step):
         "start_from": "settled",
         "events": [LoadChange(0.1, SeriesLoad.from_power(100e3 + step), generator=1)],
     }  # fmt: skip
-    ours, theirs = run(**given), run(**given, **EXACT)
-    for name in (*SHOWN, "P_loss_fault", "V_c_rms", "I_c_rms"):
-        peak = np.abs(theirs[name].values).max()
-        assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-6 * peak, err_msg=name)
+    to_1e_6(run(**given), run(**given, **EXACT), (*SHOWN, "P_loss_fault", "V_c_rms", "I_c_rms"))
 
 
 @pytest.mark.long

@@ -66,7 +66,9 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     else:
         loop = ss.x.index("i_fault")
         fast = ca.fabs(ca.jacobian(f[loop], x)[loop]) * T
-        on = ca.logic_and(ca.logic_and(ca.gt(fast, 1.0), ca.lt(fast, STIFF)), ca.lt(fastest, 1.0))
+        few = ca.lt(fast, STIFF)
+        on = ca.logic_and(ca.logic_and(ca.gt(fast, 1.0), few), ca.lt(fastest, 1.0))
+        light = ca.logic_and(light, few)
         # what is slower ripples in a loop's direction
         alone, both = of_model.passing([loop], T / 2), of_model.passing([*stator, loop], T)
         outputs = [
