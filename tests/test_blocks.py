@@ -1,12 +1,19 @@
 """Rows of blocks of exchange steps: as far as each is right, and as if one by one."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
+from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.unit.apu import Apu
+from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
 from apu_casadi.unit.jointstep import BLOCK, JointBlock, UnitState
+from apu_casadi.unit.multirate import simulate_joint
 
 LIMIT = 1e-5
 
@@ -55,3 +62,35 @@ def test_a_row_whose_first_block_is_wrong_is_refused():
     with pytest.raises(NotApplicable, match="stub: a step of the block is not right"):
         followed(block, 5)
     assert calls == [0]
+
+
+UNIT = Apu()
+KINDS = {
+    "load": LoadChange(0.3, SeriesLoad.from_power(120e3, 0.9)),
+    "load of one": LoadChange(0.313, SeriesLoad.from_power(60e3), generator=2),
+    "constant power": LoadChange(0.3, ConstantPowerLoad(90e3)),
+    "fault": FaultChange(0.3, Ttsc(0.05, 24.0)),
+    "health": HealthChange(0.3, {"f_eta_c": 0.98, "f_W_t": 1.02}),
+    "speed": SpeedChange(0.305, 0.99 * UNIT.N_ref),
+}
+
+
+@pytest.mark.ci  # CVODES, 12 runs
+@pytest.mark.parametrize("waveform_dt", [None, 1e-3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_blocks_take_every_kind_of_event_off_the_units_own_speed(kind, waveform_dt):
+    """Another governed speed from the start, and from an event on; means to 1e-6 of peak.
+
+    Blocks governed by the unit's own speed: N was wrong by 2 % without anybody knowing.
+    """
+    given = {
+        "duration": 0.5, "load": [SeriesLoad.from_power(p, 0.85) for p in (100e3, 60e3)],
+        "N_ref": 0.985 * UNIT.N_ref, "ambient": Ambient(altitude=500.0), "waveform_dt": waveform_dt,
+        "events": [SpeedChange(0.1, 0.99 * UNIT.N_ref), KINDS[kind]],
+    }  # fmt: skip
+    ours = simulate_joint(UNIT, **given)
+    theirs = simulate_joint(UNIT, **given, solver="cvodes", rtol=1e-10, atol=1e-12)
+    assert json.loads(ours.attrs["solver"])["steps_propagated"] > 20
+    for name in ("N", "Wf", "PW", "P_e", "T4", "V_a_rms", "I_b_rms"):
+        peak = np.abs(theirs[name].values).max()
+        assert np.abs(ours[name].values - theirs[name].values).max() < 1e-6 * peak, name

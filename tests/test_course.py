@@ -193,7 +193,7 @@ def test_a_steep_piece_gives_its_own_polynomials():
 @pytest.mark.long
 def test_strides_become_finer_once_where_a_step_was_refused():
     """Beside a mild fault; and a course that is over soon takes the usual ones from the start."""
-    mild, usual = (k.harmonics for k in meanstep.LEVELS[:2])
+    mild, usual = (k.harmonics for k in (meanstep.LEVELS[0], meanstep.LEVELS[len(meanstep.MILD)]))
     slow = varying(Ttsc.of_h, 0.05, Growth(1e-5, 1e-4, over=200.0))
     course, t = course_of(KW100, slow, end=200.0), np.array([100.0])
     assert course.numbers(t)[0].harmonics in mild

@@ -129,6 +129,11 @@ def test_a_new_speed_under_a_light_load(load, fault):
     assert_allclose(means, [theirs[q] for q in quad], rtol=8e-7)  # squares: twice as much
 
 
+def fits(strides):
+    """Harmonics of the levels of so many strides a turn."""
+    return [k for level in meanstep.LEVELS if level.strides in strides for k in level.harmonics]
+
+
 @pytest.mark.parametrize(
     ("load", "mu", "h"),
     [(KW100, 0.05, 0.03), (KW100, 0.2, 0.1), (SeriesLoad.from_power(10e3), 0.2, 0.1),
@@ -154,27 +159,28 @@ def test_severe_faults_take_finer_strides(load, mu, h):
     assert_allclose(means / scale, [theirs.mean[q] / s for q, s in zip(quad, scale, strict=True)],
                     rtol=0, atol=1.6e-6)  # fmt: skip
     mild = MeanStep(GEN, ss, u, GEN.fault_vector(load, Ttsc(0.05, 99.0)), dt=0.02, quad=quad)
-    fits = [level.harmonics for level in meanstep.LEVELS]
-    assert mild.harmonics in (*fits[0], *fits[1])
-    assert fast.harmonics in (*fits[2], *fits[3])
+    assert mild.harmonics in fits(strides=(16, 20, 28))
+    assert fast.harmonics in fits(strides=(56, 112))
 
 
 @pytest.mark.parametrize(
-    ("load", "h"),
-    [(KW100, 1e-5), (KW100, 1.6e-3), (SeriesLoad.from_power(10e3), 5e-4),
-     (SeriesLoad.from_power(225e3), 2.2e-3), (LAGGING, 5e-4)],
-    ids=["tiny", "100 kW", "10 kW", "225 kW", "R-L"],
+    ("load", "h", "strides"),
+    [(KW100, 1e-5, 16), (KW100, 6e-4, 16), (SeriesLoad.from_power(10e3), 3e-4, 16),
+     (CapacitorLoad.from_power(40e3, 0.9), 4e-4, 16),
+     (KW100, 1.6e-3, 20), (SeriesLoad.from_power(10e3), 5e-4, 20),
+     (SeriesLoad.from_power(225e3), 2.2e-3, 20), (LAGGING, 5e-4, 20)],
+    ids=["tiny", "100 kW", "10 kW", "leading", "100 kW, 20", "10 kW, 20", "225 kW, 20", "R-L"],
 )  # fmt: skip
-def test_mild_faults_take_longer_strides(load, h):
+def test_mild_faults_take_longer_strides(load, h, strides):
     """Mean powers and rms voltages over three steps of falling speed to 5e-7 of the largest.
 
-    These are the largest faults that 20 strides a turn are taken for, and a tiny one.
+    These are the largest faults that 16 and 20 strides a turn are taken for, and a tiny one.
     """
     fault, quad = Ttsc(0.05, 0.05 / h - 0.95), ("P_total", "P_e", "~v_a^2", "~v_b^2", "~v_c^2")
     point = GEN.steady_state(load, fault)
     ss, u, theta = point.ss, point.u.copy(), np.array(point.theta)
     fast = MeanStep(GEN, ss, u, theta, dt=0.02, quad=quad)
-    assert fast.harmonics in meanstep.LEVELS[0].harmonics
+    assert fast.harmonics in fits(strides=(strides,))
     exact = simulation.stepper(ss, 1, quad=quad, rtol=1e-12, atol=1e-14)
     x = ours = np.array(point.x)
     for _ in range(3):
@@ -185,6 +191,24 @@ def test_mild_faults_take_longer_strides(load, h):
         power, voltage = theirs.mean["P_total"], max(theirs.mean[q] for q in quad[2:])
         off = np.abs(means - [theirs.mean[q] for q in quad])
         assert (off / [power, power, *[2 * voltage] * 3]).max() < 5e-7
+
+
+@pytest.mark.parametrize("h", [5e-6, 7e-6, 1e-5, 1.3e-5, 2e-5, 3e-5, 8e-5])
+@pytest.mark.parametrize("harmonics", [0, meanstep.USUAL])
+def test_a_loop_that_follows_within_nanoseconds_is_left_as_it_is(h, harmonics):
+    """Beside 10 kW R-L a small fault's loop has no digits to be settled by: means to 1.1e-6.
+
+    A loop just slow enough for what was done then made P_total wrong by 2.6e-3.
+    """
+    load, quad = SeriesLoad.from_power(10e3, 0.85), ("P_total", "~v_a^2", "~v_b^2", "~v_c^2")
+    point = GEN.steady_state(load, Ttsc(0.05, 0.05 / h - 0.95))
+    ss, u, theta = point.ss, point.u.copy(), np.array(point.theta)
+    fast = MeanStep(GEN, ss, u, theta, dt=0.02, quad=quad, harmonics=harmonics)
+    u[ss.u.index("w_r")] *= 1 - 2e-4
+    _, means = fast(np.array(point.x), u)
+    theirs = simulation.stepper(ss, 1, quad=quad, rtol=1e-12, atol=1e-14)(point.x, u, theta, 0.02)
+    # squares of voltages: twice what rms values are
+    assert_allclose(means, [theirs.mean[q] for q in quad], rtol=2.2e-6)
 
 
 def test_phasors_are_those_of_the_samples():
@@ -234,6 +258,6 @@ def test_what_does_not_hold_is_refused(monkeypatch):
         moved[ss.x.index("V_R")] = np.nan
         with pytest.raises(SimulationError, match="not finite"):
             fast(moved, u)
-    monkeypatch.setattr(meanstep, "LEVELS", (meanstep.Level(20, (4,), 1.0, 1.0),))
+    monkeypatch.setattr(meanstep, "LEVELS", (meanstep.Level(20, (4,), 1.0, (1.0, 1.0)),))
     with pytest.raises(SimulationError, match="harmonics of the rotor angle, 4 fit"):
         MeanStep(GEN, ss, u, theta, dt=0.02, quad=QUAD)

@@ -56,26 +56,29 @@ class Level(NamedTuple):
         harmonics: of the rotor angle that a function takes; the first that fits.
         ripple: largest harmonics of a transition matrix from the fourth on, nominal units.
         depth: the same of all of them, which a fault makes large whose loop has little resistance;
-            half of it where the fault's current is a state of its own, and not among them.
+            then where the fault's current is a state of its own, and not among them.
     """
 
     strides: int
     harmonics: tuple[int, ...]
     ripple: float
-    depth: float
+    depth: tuple[float, float]
 
 
-#: No number of harmonics is of two levels.  The first reaches to h = 0.0016 beside a resistive load
-#: of 100 kW, 0.0005 beside one of 10 kW; the second to 0.002 and 0.001, the third to 0.02 and
-#: 0.005.  Means of single steps err by some 7e-7 where one of them changes the speed by 0.3 %.
+#: No number of harmonics is of two levels.  Beside resistive loads of 100 and 10 kW the first
+#: reaches to h = 0.0007 and 0.0003, the second to 0.0016 and 0.0005, the third to 0.002 and 0.001,
+#: the fourth to 0.02 and 0.005.  Means of single steps err by some 7e-7 where one of them changes
+#: the speed by 0.3 %, those of the first two where it does by 0.02 %.
 LEVELS = (
-    Level(20, (12,), 1e-3, 0.2),
-    Level(28, (14, 20, 30), 4e-3, 0.29),
-    Level(56, (32,), 3.5e-2, math.inf),
-    Level(112, (34,), math.inf, math.inf),
+    Level(16, (10,), 3.5e-4, (0.042, 0.0)),
+    Level(20, (12,), 1e-3, (0.2, 0.1)),
+    Level(28, (14, 20, 30), 4e-3, (0.29, 0.145)),
+    Level(56, (32,), 3.5e-2, (math.inf, math.inf)),
+    Level(112, (34,), math.inf, (math.inf, math.inf)),
 )
-#: Harmonics of what takes the second level at least: the first gains nothing in a short run.
-USUAL = LEVELS[1].harmonics[0]
+MILD = LEVELS[:2]  # which gain nothing in a short run
+#: Harmonics of what takes the next level at least.
+USUAL = LEVELS[len(MILD)].harmonics[0]
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
 DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
@@ -391,7 +394,7 @@ class MeanStep(Rebuilt):
             table = cached_table(ss, u, theta, w, angle=2 * math.pi / level.strides)
             found = max(harmonics, table.harmonics)
             fit = next((k for k in level.harmonics if k >= found), 0)
-            deep = level.depth / (1 + ("i_fault" in ss.linear))
+            deep = level.depth["i_fault" in ss.linear]
             fit *= ripple(ss, table, 4) <= level.ripple and ripple(ss, table, 1) <= deep
             if fit:
                 return table, level, fit
@@ -409,7 +412,7 @@ class MeanStep(Rebuilt):
     @property
     def finer(self) -> int:
         """Harmonics with which steps that were refused may be taken; 0 where there are none."""
-        mild = not self.constant and self._own is LEVELS[0]
+        mild = not self.constant and self._own in MILD
         return USUAL if mild else 0
 
     #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.

@@ -36,9 +36,10 @@ _ROTOR = ("lam_fd", "lam_kd", "lam_kq")
 #: By "coefficients are constant": elsewhere slow states ripple, and their second derivative does.
 ORDER = {True: 3, False: 3}
 
-#: Fastest mode, over 1/T, up to which it is done.  Beside an open phase (3e4) what the ripple of
-#: the others leaves in the derivatives is not small, and a step that begins settled was 5e-6 off.
-STIFF = 300.0
+#: Fastest mode, over 1/T, up to which it is done: beyond, third derivatives have no digits left (of
+#: a loop three times as fast, that of h = 1e-5 beside 10 kW, means erred by 2e-4), and what strides
+#: miss is 7e-7.  Beside an open phase it is 3e4.
+STIFF = 100.0
 #: Longest time, in strides, in which something passes by of which strides miss a part: a third as
 #: long, they integrate it to 1e-4.
 SLOWEST = 1.2

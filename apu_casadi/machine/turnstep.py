@@ -55,6 +55,7 @@ class Rule(NamedTuple):
 _MANY = {0: 3, 1: 3, 2: 2, 3: 2} | dict.fromkeys(range(4, 8), 1) | dict.fromkeys(range(8, 14), 0)
 #: By the number of strides.
 _RULES = {
+    16: Rule(17, 3, {0: 3, 1: 2, 2: 2, 3: 0}, 14),
     20: Rule(21, 4, {0: 3, 1: 2, 2: 2, 3: 1, 4: 0}, 16),
     28: Rule(30, 5, {0: 3, 1: 2, 2: 2, 3: 1, 4: 1, 5: 1, 6: 0}, 10),
     56: Rule(60, 10, _MANY, 10),

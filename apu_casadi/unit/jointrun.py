@@ -239,7 +239,8 @@ class JointRun:
         """Go on by steps of one length, each a function of its own; by one right after a switch."""
         steps = steps if all(g.settled for g in self.machines.groups) else 1
         grid, state = self.asked.grid[k : k + steps + 1], UnitState(self.x, self.z, self.governor)
-        done, made = self.machines.one_by_one(state, self.u, self.theta, grid)
+        given = self.u, self.theta, float(self.shaft.N_ref)
+        done, made = self.machines.one_by_one(state, *given, grid)
         return self._went_by(done, made, self.here.factors)
 
     def _blocks(self, k: int, steps: int, block: int) -> tuple[int, Row]:
@@ -258,7 +259,8 @@ class JointRun:
             if steps < middles.size:
                 factors = {n: v[:steps] if np.ndim(v) else v for n, v in factors.items()}
         else:
-            done, made = self.machines.block(state, self.u, self.theta, grid)
+            given = self.u, self.theta, float(self.shaft.N_ref)
+            done, made = self.machines.block(state, *given, grid)
         return self._went_by(done, made, factors)
 
     def _went_by(

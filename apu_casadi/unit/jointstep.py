@@ -237,15 +237,18 @@ class JointBlock(Rebuilt):
         theta: np.ndarray,
         x_sg: Sequence[np.ndarray],
         u_sg: Sequence[np.ndarray],
+        N_ref: float,
         blocks: int = 1,
     ) -> BlockResult:
         """Advance up to so many blocks with what :meth:`followed` takes, the same in each.
 
         Args:
             u_sg: inputs of each group.
+            N_ref: governed speed, rad/s, which need not be the unit's.
         """
         full = self.apu.gas_generator.full(theta)
-        each = zip(u_sg, self.machines, self._links, strict=True)
+        links = [np.append(N_ref, link[1:]) for link in self._links]
+        each = zip(u_sg, self.machines, links, strict=True)
         held = [a for u, m, link in each for a in (u, m.theta, link, m.parameters, m.dt)]
         if asking():
             carry = np.concatenate([*state, *x_sg])

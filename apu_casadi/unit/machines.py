@@ -196,9 +196,12 @@ class Machines:
             group.accept(one, h)
 
     def block(
-        self, state: UnitState, u: np.ndarray, theta: np.ndarray, grid: np.ndarray
+        self, state: UnitState, u: np.ndarray, theta: np.ndarray, N_ref: float, grid: np.ndarray
     ) -> tuple[BlockResult, list[MachineMade]]:
         """Advance the whole unit over the exchange steps of blocks, as far as they go.
+
+        Args:
+            N_ref: governed speed, rad/s, which need not be the unit's.
 
         Raises:
             NotApplicable: that is not possible here.
@@ -215,15 +218,18 @@ class Machines:
                 raise
         states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
         blocks = (grid.size - 1) // BLOCK
-        done = self._block(state, u, theta, states, inputs, blocks)
+        done = self._block(state, u, theta, states, inputs, N_ref, blocks)
         grid = grid[: done.y.shape[1] + 1]
         pairs = zip(self.groups, done.machines, strict=True)
         return done, [g.went_on(one, grid) for g, one in pairs]
 
     def one_by_one(
-        self, state: UnitState, u: np.ndarray, theta: np.ndarray, grid: np.ndarray
+        self, state: UnitState, u: np.ndarray, theta: np.ndarray, N_ref: float, grid: np.ndarray
     ) -> tuple[BlockResult, list[MachineMade]]:
         """Advance the whole unit over steps of one length, each a call of its own.
+
+        Args:
+            N_ref: governed speed, rad/s, which need not be the unit's.
 
         Raises:
             NotApplicable: that is not possible here.
@@ -237,7 +243,7 @@ class Machines:
         block = self._one[1]
         block.machines = fast  # of the same layouts, for this length
         states, inputs = [g.x for g in self.groups], [g.u for g in self.groups]
-        done = block(state, u, theta, states, inputs, grid.size - 1)
+        done = block(state, u, theta, states, inputs, N_ref, grid.size - 1)
         grid = grid[: done.y.shape[1] + 1]
         each = zip(self.groups, fast, done.machines, strict=True)
         return done, [g.went_by_one(one, made, grid) for g, one, made in each]

@@ -239,7 +239,8 @@ class MachineStep:
             self.nsteps += (grid.size - 1) * fast.strides
         else:
             self.propagated += grid.size - 1
-        self.w_r, self.x, h = float(done.w_r[-1]), done.x, fast.dt
+        self.w_r = self.u[self._at] = float(done.w_r[-1])
+        self.x, h = done.x, fast.dt
         self._since += float(grid[-1] - grid[0])
         means = RawMeans.of(fast.quad, self.phase.symmetric, done.means, h, done.w_r, grid[1:])
         return MachineMade(done.x, means, NO_TIMES, NO_WAVES)
@@ -253,7 +254,7 @@ class MachineStep:
         fast = self._integrators[0]
         t, w = fast.waves(done.waves, grid)
         self.propagated += grid.size - 1
-        self.w_r = float(done.w_r[-1])
+        self.w_r = self.u[self._at] = float(done.w_r[-1])
         h, symmetric = self.settings.dt, self.phase.symmetric
         means = RawMeans.of(fast.quad, symmetric, done.means, h, done.w_r, grid[1:])
         self.x = done.x

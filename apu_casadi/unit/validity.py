@@ -26,7 +26,6 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import mul
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -411,12 +410,12 @@ class FollowedRotor:
     def _unlimited(self, step: float, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States after steps without limits, (steps, states), and the demand at their ends."""
         move, m = self._move(step), self.state.size
-        rows, state, states = move[:, :m].tolist(), self.state.tolist(), list[list[float]]()
-        for given in (d[:, None] * move[:, m] + move[:, m + 1]).tolist():
-            # so few numbers are quicker without arrays
-            state = [g + sum(map(mul, row, state)) for g, row in zip(given, rows, strict=True)]
-            states.append(state)
-        made = np.array(states)
+        made = d[:, None] * move[:, m] + move[:, m + 1]
+        power, apart = move[:, :m], 1
+        made[0] += power @ self.state
+        while apart < d.size:  # what each has of all before it, twice as many at a time
+            made[apart:] += made[:-apart] @ power.T
+            power, apart = power @ power, 2 * apart
         demand = made @ self._demand[:m] + d * self._demand[m] + self._demand[m + 1]
         return made, np.asarray(demand)
 
