@@ -43,7 +43,8 @@ def course_of(load, fault, *, end=60.0, waves=False):
             return Propagator(GEN, ss, u, theta, dt=DT, harmonics=harmonics, **more)
         return MeanStep(GEN, ss, u, theta, dt=DT, quad=QUAD, harmonics=harmonics)
 
-    return Course(GEN, ss, load, fault, prepare, end)
+    usual = 0 if waves else meanstep.USUAL
+    return Course(GEN, ss, load, fault, prepare, end, usual=usual)
 
 
 def settled_at(ss, load, fault, V_ref):

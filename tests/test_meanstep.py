@@ -159,7 +159,7 @@ def test_severe_faults_take_finer_strides(load, mu, h):
     assert_allclose(means / scale, [theirs.mean[q] / s for q, s in zip(quad, scale, strict=True)],
                     rtol=0, atol=1.6e-6)  # fmt: skip
     mild = MeanStep(GEN, ss, u, GEN.fault_vector(load, Ttsc(0.05, 99.0)), dt=0.02, quad=quad)
-    assert mild.harmonics in fits(strides=(16, 20, 28))
+    assert mild.harmonics in fits(strides=(28,))
     assert fast.harmonics in fits(strides=(56, 112))
 
 
@@ -179,7 +179,7 @@ def test_mild_faults_take_longer_strides(load, h, strides):
     fault, quad = Ttsc(0.05, 0.05 / h - 0.95), ("P_total", "P_e", "~v_a^2", "~v_b^2", "~v_c^2")
     point = GEN.steady_state(load, fault)
     ss, u, theta = point.ss, point.u.copy(), np.array(point.theta)
-    fast = MeanStep(GEN, ss, u, theta, dt=0.02, quad=quad)
+    fast = MeanStep(GEN, ss, u, theta, dt=0.02, quad=quad, harmonics=0)
     assert fast.harmonics in fits(strides=(strides,))
     exact = simulation.stepper(ss, 1, quad=quad, rtol=1e-12, atol=1e-14)
     x = ours = np.array(point.x)
@@ -260,4 +260,4 @@ def test_what_does_not_hold_is_refused(monkeypatch):
             fast(moved, u)
     monkeypatch.setattr(meanstep, "LEVELS", (meanstep.Level(20, (4,), 1.0, (1.0, 1.0)),))
     with pytest.raises(SimulationError, match="harmonics of the rotor angle, 4 fit"):
-        MeanStep(GEN, ss, u, theta, dt=0.02, quad=QUAD)
+        MeanStep(GEN, ss, u, theta, dt=0.02, quad=QUAD, harmonics=0)

@@ -160,6 +160,7 @@ class Course(Generic[F]):
         load, fault: at least one of them changes in time.
         prepare: (u, theta, harmonics at least) -> what propagates with these numbers.
         end, begin: of what is asked for, s.
+        usual: harmonics where the course is over soon.
     """
 
     gen: Generator
@@ -176,6 +177,7 @@ class Course(Generic[F]):
         prepare: Callable[[np.ndarray, np.ndarray, int], F],
         end: float,
         begin: float = 0.0,
+        usual: int = 0,
     ) -> None:
         self.gen, self.ss, self.load, self.fault = gen, ss, load, fault
         self._prepare: Callable[[np.ndarray, np.ndarray, int], F] = prepare
@@ -192,8 +194,8 @@ class Course(Generic[F]):
             bends: set[float] = {t for x in parts for t in x.corners(end)}
             self._ends = [begin, *sorted(t for t in bends if t > begin), end]
         self._pieces: dict[tuple[float, float], Piece[F] | str | None] = {}
-        self._least = 0  # harmonics of the rotor angle, which decide on strides
-        self._long = end - begin > LONG
+        # harmonics of the rotor angle, which decide on strides
+        self._least = 0 if end - begin > LONG else usual
         self._likely = 1 << 20  # steps that one polynomial may well fit
 
     # -- the coordinate -------------------------------------------------------------------------
@@ -348,24 +350,23 @@ class Course(Generic[F]):
         """
         middle, half = (a + b) / 2, (b - a) / 2
         reach, made = half * (1 - _INSIDE), dict[float, tuple[F, np.ndarray]]()
-        if not self._long:
-            self._least = max(self._least, self._table(middle, {}, 0.0)[0].finer)
+        least = self._least
         for degree in DEGREES:
             nodes: np.ndarray = _lobatto(degree)
             between: np.ndarray = _lobatto(2 * degree)[1::2]
             if degree >= 8:  # two of them tell enough: one has the largest error of its kind
                 between = between[[0, degree // 2]]
             wanted = [float(x) for x in (*nodes, *between)]
-            least: dict[str, int] = {"harmonics": self._least}
-            tables = [self._table(middle + reach * x, made, x, **least) for x in wanted]
-            harmonics = max(t[0].harmonics for t in tables)
-            if any(t[0].harmonics != harmonics for t in tables):
-                if self._only is None and b - a > 2 * LONG:
-                    return None
-                made.clear()
-                tables = [
-                    self._table(middle + reach * x, made, x, harmonics=harmonics) for x in wanted
-                ]
+            ends = (wanted[0], wanted[degree])  # which tell most of what the others need
+            for some in (ends, wanted):
+                tables = [self._table(middle + reach * x, made, x, least) for x in some]
+                needed = max(t[0].harmonics for t in tables)
+                if any(t[0].harmonics != needed for t in tables):
+                    if self._only is None and b - a > 2 * LONG:
+                        return None
+                    made.clear()
+                    least = needed
+                    tables = [self._table(middle + reach * x, made, x, least) for x in some]
             fast = tables[0][0]
             if any(t[0].layout != fast.layout for t in tables):
                 raise NotApplicable(f"{self.ss.name}: its symmetry changes on the way")
@@ -383,7 +384,7 @@ class Course(Generic[F]):
         return None
 
     def _table(
-        self, s: float, made: dict[float, tuple[F, np.ndarray]], x: float, *, harmonics: int = 0
+        self, s: float, made: dict[float, tuple[F, np.ndarray]], x: float, harmonics: int
     ) -> tuple[F, np.ndarray]:
         """Return what propagates at a value of the coordinate, and all of its numbers."""
         if x in made:

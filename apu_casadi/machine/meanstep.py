@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -41,9 +41,12 @@ from apu_casadi.machine.transition import (
 )
 from apu_casadi.machine.turnstep import Turn, periodic_step, turn_of
 
+Panels: TypeAlias = tuple[tuple[int, float], ...]
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
 #: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
-PANELS = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
+PANELS: Panels = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
+#: The same of long courses, in which next to nothing jumps.
+FEW_PANELS: Panels = ((5, 1 / 5),)
 #: Longest time, first intervals, in which the stator may settle behind the load and not be sampled.
 LAYER = 0.5
 
@@ -81,7 +84,7 @@ MILD = LEVELS[:2]  # which gain nothing in a short run
 USUAL = LEVELS[len(MILD)].harmonics[0]
 #: Largest error of E_fd, per unit, that the windings may see at the end of an exciter's step; where
 #: coefficients are periodic it changes its sign with the ripple, and next to nothing of it acts.
-DRIVE_TOL = {"constant": 1e-5, "periodic": 4e-5}
+DRIVE_TOL = {"constant": 1e-5, "few": 3e-7, "periodic": 4e-5}
 #: Largest change of transition matrices from step to step, nominal units, of loads and faults that
 #: change in time: what follows such a jump falls between the samples, and means err by 1e-6 of it.
 SMOOTH = {"constant": 3e-4, "periodic": 2e-3}
@@ -123,15 +126,15 @@ def _filon(w: Any, h: float, k: int) -> tuple[list[Any], list[Any]]:
     return c, s
 
 
-def _constant_weights(dt: Any, w: Any, theta0: Any, highest: int) -> Any:
+def _constant_weights(panels: Panels, dt: Any, w: Any, theta0: Any, highest: int) -> Any:
     """Weights of c0, c1, s1, ... in the mean over a step, the start included.
 
     Shape (2 highest + 1, samples).
     """
-    intervals = [n * 4 for n, _ in PANELS]
+    intervals = [n * 4 for n, _ in panels]
     weights = [[ca.SX(0)] * (1 + sum(intervals)) for _ in range(2 * highest + 1)]
     t, first = 0.0, 0
-    for number, share in PANELS:
+    for number, share in panels:
         h = share / 4
         local = [_filon(w * dt, h, k) for k in range(highest + 1)]
         for _ in range(number):
@@ -149,9 +152,9 @@ def _constant_weights(dt: Any, w: Any, theta0: Any, highest: int) -> Any:
     return ca.vertcat(*(ca.horzcat(*row) for row in weights))
 
 
-def _shares() -> np.ndarray:
+def _shares(panels: Panels) -> np.ndarray:
     """Share of the step that has passed at each sample of a step with constant coefficients."""
-    ends = np.cumsum([0.0, *(share for n, share in PANELS for _ in range(n))])
+    ends = np.cumsum([0.0, *(share for n, share in panels for _ in range(n))])
     inside = ends[:-1, None] + np.diff(ends)[:, None] * np.arange(1, 5) / 4
     return np.append(0.0, inside.ravel())
 
@@ -241,18 +244,18 @@ def _parts(ss: GeneratorModel, x: Any, u: Any, th: Any, terms: ca.Function) -> l
     return found
 
 
-def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
+def _constant_step(ss: GeneratorModel, quad: tuple[str, ...], panels: Panels) -> ca.Function:
     nx, nu, nt, n_P = len(ss.x), len(ss.u), len(ss.theta), parity(ss, 1).even.size
     X0, U, TH = ca.MX.sym("x0", nx), ca.MX.sym("u", nu), ca.MX.sym("th", nt)
     dt = ca.MX.sym("dt")
-    series = ca.MX.sym("series", len(PANELS) * NODES * n_P)
+    series = ca.MX.sym("series", len(panels) * NODES * n_P)
     ranges = ca.MX.sym("range", 2)  # of the speed
     w, at = U[ss.u.index("w_r")], ss.x.index("theta_e")
     s = (w - ranges[0]) / ranges[1]
     powers = ca.vertcat(1, *(s**k for k in range(1, NODES)))
     step, V_of = leap(ss, 1, True)
     # the first samples lie so far apart; so much of it is the first one's weight
-    h_first, weight = dt * PANELS[0][1] / 4, 14 / 45
+    h_first, weight = dt * panels[0][1] / 4, 14 / 45
     x_k, area = settled(ss, True)(X0, U, TH, LAYER * h_first)
     seen = V_of(x_k + area * (2 / h_first), U, TH)[0]
     V_k = seen_at_start(ss, (seen, V_of(x_k, U, TH)[1]), x_k, U, TH)
@@ -266,7 +269,7 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
         states.append(xk)
     outputs = [ca.horzcat(*states), Vk]
     panel, before = hoisted("panel", [x, V, P], ca.vertcat(u, th, h), outputs)
-    for k, (number, share) in enumerate(PANELS):
+    for k, (number, share) in enumerate(panels):
         own = series[k * NODES * n_P : (k + 1) * NODES * n_P]
         P_k = ca.mtimes(ca.reshape(own, n_P, NODES), powers)
         d = before(ca.vertcat(U, TH, dt * share / 4))
@@ -278,11 +281,11 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
     w_, d_, t_ = ca.SX.sym("w"), ca.SX.sym("dt"), ca.SX.sym("theta0")
     share = ca.SX.sym("share")
     terms, W = _harmonics(ss, (x, u, th), quad, share)
-    rows = _constant_weights(d_, w_, t_, W.numel() // 2)
+    rows = _constant_weights(panels, d_, w_, t_, W.numel() // 2)
     weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
     means, before = hoisted("harmonics", [x, W, share], ca.vertcat(u, th), [terms])
     each = means.map("each", "serial", X.shape[1], [3], [])
-    sampled = each(X, weights(dt, w, X0[at]), ca.DM(_shares()).T, before(ca.vertcat(U, TH)))
+    sampled = each(X, weights(dt, w, X0[at]), ca.DM(_shares(panels)).T, before(ca.vertcat(U, TH)))
     return ca.Function(
         f"means_{ss.name}",
         [X0, ca.vertcat(series, ranges), U, TH, dt],
@@ -297,20 +300,24 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...]) -> ca.Function:
 
 @kept
 def _function(
-    ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int
+    ss: GeneratorModel, quad: tuple[str, ...], division: Turn | Panels, harmonics: int
 ) -> ca.Function:
-    """Function (x0, series, u, theta, dt) -> (x, mean, miss); without a turn for constant ones."""
-    if turn is None:
-        return _constant_step(ss, quad)
-    return periodic_step(ss, quad, turn, harmonics)
+    """Function (x0, series, u, theta, dt) -> (x, mean, miss); by panels for constant ones."""
+    if isinstance(division, Turn):
+        return periodic_step(ss, quad, division, harmonics)
+    return _constant_step(ss, quad, division)
 
 
 @kept
 def _caller(
-    ss: GeneratorModel, quad: tuple[str, ...], turn: Turn | None, harmonics: int, _in_use: str
+    ss: GeneratorModel,
+    quad: tuple[str, ...],
+    division: Turn | Panels,
+    harmonics: int,
+    _in_use: str,
 ) -> Gradual:
     """The same in the backend in use, one for each layout."""
-    return Gradual(_function(ss, quad, turn, harmonics), level=3, by=points_in_lanes)
+    return Gradual(_function(ss, quad, division, harmonics), level=3, by=points_in_lanes)
 
 
 class MeanStep(Rebuilt):
@@ -322,6 +329,7 @@ class MeanStep(Rebuilt):
         dt: length of every step, s.
         quad: what is averaged over the step, see :mod:`apu_casadi.core.means`.
         harmonics: of the rotor angle, at least so many; what has equal ones has equal layouts.
+            Fewer than ``USUAL`` are for long courses, also where the angle does not matter.
 
     Raises:
         NotApplicable: the model is not linear in its windings, a series does not converge or has
@@ -339,6 +347,7 @@ class MeanStep(Rebuilt):
     advance: Any
     limits: np.ndarray
     _own: Level
+    _few: bool
 
     outputs: tuple[str, ...] = ()
     n_out = 0
@@ -352,7 +361,7 @@ class MeanStep(Rebuilt):
         *,
         dt: float,
         quad: Sequence[str],
-        harmonics: int = 0,
+        harmonics: int = USUAL,
     ) -> None:
         """Compute or fetch the tables, build or fetch the function."""
         if not ss.linear:
@@ -364,21 +373,25 @@ class MeanStep(Rebuilt):
         if dt * w_rated < 4 * math.pi:
             raise NotApplicable(f"{ss.name}: a step of {dt:g} s has less than two turns")
         self.constant = symmetry(ss, u, given, w_rated)
+        division: Turn | Panels
         if self.constant:
-            tables = [cached_table(ss, u, given, w_rated, h=dt * share / 4) for _, share in PANELS]
+            self._few = harmonics < USUAL
+            division = FEW_PANELS if self._few else PANELS
+            tables = [cached_table(ss, u, given, w_rated, h=dt * k / 4) for _, k in division]
             series, self.harmonics = [t.even.ravel() for t in tables], 0
-            turn = None  # panels are shares of the step
         else:
             table, self._own, self.harmonics = self._level(gen, u, given, harmonics)
-            turn = turn_of(dt, w_rated, self._own.strides)
+            self._few = self._own in MILD
+            division = turn_of(dt, w_rated, self._own.strides)
             tables, table = [table], table.filled(self.harmonics)
             # entries, then terms, then powers
             series = [part.ravel() for part in (table.even, table.odd)]
         self._range = tables[0].centre, tables[0].half
         self.parameters = np.concatenate([*series, self._range])
-        self.layout = (ss.shared, self.quad, turn, self.harmonics)
+        self.layout = (ss.shared, self.quad, division, self.harmonics)
         self.advance = _function(*self.layout)
-        drive = DRIVE_TOL["constant" if self.constant else "periodic"]
+        kind = "few" if self._few and self.constant else "constant" if self.constant else "periodic"
+        drive = DRIVE_TOL[kind]
         self.limits = np.array([drive] if self.constant else [drive, END_TOL, math.inf])
         self._iw = ss.u.index("w_r")
         self._compiled: Gradual | None = None
@@ -412,8 +425,7 @@ class MeanStep(Rebuilt):
     @property
     def finer(self) -> int:
         """Harmonics with which steps that were refused may be taken; 0 where there are none."""
-        mild = not self.constant and self._own in MILD
-        return USUAL if mild else 0
+        return USUAL if self._few else 0
 
     #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
     spike: ClassVar[float] = 1e-4
@@ -428,7 +440,7 @@ class MeanStep(Rebuilt):
         """Factors that turn it to nominal units; zero for what is no transition matrix."""
         even, odd = nominal_entries(self.ss, 1)
         if self.constant:
-            parts = [np.tile(even, len(PANELS) * NODES)]
+            parts = [np.tile(even, len(self.layout[2]) * NODES)]
         else:
             terms = self.harmonics + 2, self.harmonics
             parts = [np.tile(e, NODES * n) for e, n in zip((even, odd), terms, strict=True)]

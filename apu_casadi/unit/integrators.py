@@ -227,6 +227,7 @@ class _Exact(Integrator, Generic[F]):
     quad: tuple[str, ...]
 
     otherwise: ClassVar[str]
+    usual: ClassVar[int] = 0  # harmonics of steps that belong to no long course
 
     def __init__(
         self, phase: Phase, settings: Settings, means: StepMeans, way: Way | None = None
@@ -246,7 +247,9 @@ class _Exact(Integrator, Generic[F]):
         assert self._way is not None
         if self._course is None:
             p, (load, fault, begin, end) = self.phase, self._way
-            self._course = Course(p.gen, p.ss, load, fault, self._prepare, end, begin)
+            self._course = Course(
+                p.gen, p.ss, load, fault, self._prepare, end, begin, usual=self.usual
+            )
         return self._course
 
     def numbers(self, t: np.ndarray, before: float) -> tuple[F, Numbers]:
@@ -301,6 +304,7 @@ class Means(_Exact[MeanStep]):
     """Steps of which only means are wanted."""
 
     otherwise = "samples are needed also for means"
+    usual = USUAL
 
     def _prepare(self, u: np.ndarray, theta: np.ndarray, harmonics: int = USUAL) -> MeanStep:
         p, own = self.phase, {"dt": self.settings.dt, "quad": self.quad}

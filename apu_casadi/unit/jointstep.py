@@ -210,6 +210,7 @@ class JointBlock(Rebuilt):
 
     apu: Apu
     machines: Sequence[Fast]
+    at_fault: int | None = None  # the group whose step was not right when a block was last refused
     _likely = ROW  # blocks in a row that may well be right
 
     def __init__(
@@ -347,9 +348,10 @@ class JointBlock(Rebuilt):
         self, last: np.ndarray, _y: np.ndarray, residual: np.ndarray, *rest: np.ndarray
     ) -> str:
         """Return why a block cannot be taken; "" if it can."""
+        self.at_fault = None
         if not (residual.max() <= RESIDUAL_TOL and math.isfinite(last.sum())):
             return "a step of the block is not right: the cycle's residual"
-        for m, sampled in zip(self.machines, self._sampled, strict=True):
+        for k, (m, sampled) in enumerate(zip(self.machines, self._sampled, strict=True)):
             (means, checks), rest = rest[:2], rest[2 + sampled :]
             w_r = checks[-1]
             good = (
@@ -359,6 +361,7 @@ class JointBlock(Rebuilt):
                 and m.valid(float(w_r.max()))
             )
             if not good:
+                self.at_fault = k
                 return f"{m.ss.name}: a step of the block is not right"
         return ""
 

@@ -289,7 +289,7 @@ class Machines:
         try:
             done = wide.followed(state, [g.x for g in self.groups], held())
         except NotApplicable:
-            if not any([g.refine() for g in self.groups]):
+            if wide.at_fault is None or not self.groups[wide.at_fault].refine():
                 raise
             return self.follow(state, unit, grid, before, steps)
         n = done.y.shape[1]
