@@ -10,7 +10,7 @@ to ``TOL``; it is never laid across a jump or a bend of a profile.
 A run holds all numbers over an exchange step.  The windings see a small jump at its beginning, and
 what follows it within microseconds falls between the samples of propagation; ``smooth`` of what
 propagates bounds the jump; beyond it steps are left to an adaptive integrator, as after a switch.
-``spike`` bounds what the terminal voltage shows for a moment and the regulator takes for true.
+``spike`` bounds what the terminal voltage shows for a moment, which counts by its area.
 """
 
 from __future__ import annotations

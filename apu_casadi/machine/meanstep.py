@@ -73,7 +73,7 @@ class Level(NamedTuple):
 #: the fourth to 0.02 and 0.005.  Means of single steps err by some 7e-7 where one of them changes
 #: the speed by 0.3 %, those of the first two where it does by 0.02 %.
 LEVELS = (
-    Level(16, (10,), 3.5e-4, (0.042, 0.0)),
+    Level(16, (10,), 3.5e-4, (0.042, 0.025)),
     Level(20, (12,), 1e-3, (0.2, 0.1)),
     Level(28, (14, 20, 30), 4e-3, (0.29, 0.145)),
     Level(56, (32,), 3.5e-2, (math.inf, math.inf)),

@@ -510,8 +510,8 @@ class Propagator(Rebuilt):
     #: Largest change of transition matrices from step to step, nominal units; samples resolve it.
     smooth: ClassVar[float] = 1e-2
     finer: ClassVar[int] = 0  # harmonics with which steps that were refused may be taken
-    #: Largest jump of a fault loop's voltage, of the phase's: the field moves by twice as much.
-    spike: ClassVar[float] = 4e-7
+    #: Largest jump of a fault loop's voltage, of the phase's; it counts by its area.
+    spike: ClassVar[float] = 1e-4
 
     @property
     def harmonics(self) -> int:

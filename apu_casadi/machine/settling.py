@@ -36,10 +36,12 @@ _ROTOR = ("lam_fd", "lam_kd", "lam_kq")
 #: By "coefficients are constant": elsewhere slow states ripple, and their second derivative does.
 ORDER = {True: 3, False: 3}
 
-#: Fastest mode, over 1/T, up to which it is done: beyond, third derivatives have no digits left (of
-#: a loop three times as fast, that of h = 1e-5 beside 10 kW, means erred by 2e-4), and what strides
-#: miss is 7e-7.  Beside an open phase it is 3e4.
+#: Fastest of several modes, over 1/T, up to which it is done: beyond, the slow ones have no digits
+#: left in third derivatives.  Beside an open phase it is 3e4.
 STIFF = 100.0
+#: The same for what samples miss, over the rate of samples.  Beside a loop of 1000, that of
+#: h = 7e-6 at 10 kW, means erred by 3e-3; what is faster than this has settled, and leaves nothing.
+SEEN = 30.0
 #: Longest time, in strides, in which something passes by of which strides miss a part: a third as
 #: long, they integrate it to 1e-4.
 SLOWEST = 1.2
@@ -50,8 +52,8 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     """Function (x, u, theta, T) -> (x as it settles, area of what passes by).
 
     Both are the state itself and zero, to the last bit, where nothing is faster than T, s, or
-    something by more than ``STIFF`` times.  The area is that of states over time, above what they
-    settle to.
+    something beside the loop of a fault by more than ``STIFF`` times.  The area is that of states
+    over time, above what they settle to.
 
     Args:
         ss: model variant, linear in its windings.
@@ -67,9 +69,8 @@ def settled(ss: GeneratorModel, constant: bool) -> ca.Function:
     else:
         loop = ss.x.index("i_fault")
         fast = ca.fabs(ca.jacobian(f[loop], x)[loop]) * T
-        few = ca.lt(fast, STIFF)
-        on = ca.logic_and(ca.logic_and(ca.gt(fast, 1.0), few), ca.lt(fastest, 1.0))
-        light = ca.logic_and(light, few)
+        on = ca.logic_and(ca.gt(fast, 1.0), ca.lt(fastest, 1.0))  # alone it has all its digits
+        light = ca.logic_and(light, ca.lt(fast, STIFF))
         # what is slower ripples in a loop's direction
         alone, both = of_model.passing([loop], T / 2), of_model.passing([*stator, loop], T)
         outputs = [
@@ -103,7 +104,7 @@ def missed(ss: GeneratorModel, constant: bool, left: Sequence[float]) -> ca.Func
     divisor = eye + sum(k * power for k, power in zip(below, (Z, Z2, Z3), strict=True))
     area = ca.SX.zeros(x.numel())
     resolved = -n * h * units * ca.solve(divisor, ca.mtimes(Z3, passes))
-    area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, 4 * STIFF), resolved, 0.0)
+    area[fast] = ca.if_else(ca.lt(of_model.fastest(fast) * h, SEEN), resolved, 0.0)
     if constant:
         area = ca.substitute(area, x[ss.x.index("theta_e")], ca.SX(0))
     return ca.Function("missed", [x, after, u, th, h], [area], {"cse": True})
