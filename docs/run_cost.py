@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from apu_casadi.core.backend import OFTEN
 from apu_casadi.core.profiles.profile import varying
 from apu_casadi.core.profiles.shapes import Growth
 from apu_casadi.machine.faults.ttsc import Ttsc
@@ -39,6 +40,9 @@ PAIRS: dict[str, tuple[Case, Case]] = {
     "with waveforms over without": (("joint", {}), JOINT),
 }
 
+WARM = (
+    OFTEN // 2 + 1
+)  # runs before; a run has a step after a switch or two, compiled when asked often
 HALF = [SeriesLoad.from_power(112.5e3), SeriesLoad.from_power(50e3)]
 
 
@@ -60,7 +64,8 @@ def least(calls: list[Callable[[], Any]], repeats: int) -> list[float]:
     """Return the least processor's time of each of some calls, s, which take turns."""
     times = [list[float]() for _ in calls]
     for call in calls:
-        call()
+        for _ in range(WARM):
+            call()
     for _ in range(repeats):
         for call, own in zip(calls, times, strict=True):
             began = time.process_time()

@@ -5,11 +5,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from apu_casadi.core.backend import find_compiler, use_backend
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.profiles.profile import varying
+from apu_casadi.core.profiles.shapes import Growth, Ramp
 from apu_casadi.machine.faults.ttsc import Ttsc
+from apu_casadi.machine.loads.capacitor import CapacitorLoad
 from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.series import SeriesLoad
+from apu_casadi.unit import jointstep
 from apu_casadi.unit.apu import Apu
 from apu_casadi.unit.events import Ambient, FaultChange, HealthChange, LoadChange, SpeedChange
 from apu_casadi.unit.jointstep import BLOCK, JointBlock, UnitState
@@ -94,3 +100,38 @@ def test_blocks_take_every_kind_of_event_off_the_units_own_speed(kind, waveform_
     for name in ("N", "Wf", "PW", "P_e", "T4", "V_a_rms", "I_b_rms"):
         peak = np.abs(theirs[name].values).max()
         assert np.abs(ours[name].values - theirs[name].values).max() < 1e-6 * peak, name
+
+
+GROWN = varying(Ttsc.of_h, 0.05, Growth(1e-4, 2e-3, over=5.0), phase="c")
+RAMP, KW80 = varying(SeriesLoad.from_power, Ramp(60e3, 61e3, over=1.0)), SeriesLoad.from_power(80e3)
+PAIRS = {
+    "healthy": ([CapacitorLoad.from_power(40e3, 0.9), RAMP], {}),
+    "faults of other strides": ([RAMP, KW80], {1: Ttsc(0.05, 40.0), 2: Ttsc(0.05, 4.0)}),
+    "faults of other loads": (
+        [RAMP, SeriesLoad.from_power(80e3, 0.85)],
+        {k: Ttsc(0.05, 40.0, phase="b") for k in (1, 2)},
+    ),
+    "one of them growing": ([RAMP, KW80], {1: Ttsc(0.05, 40.0, 0.3), 2: GROWN}),
+}
+
+
+@pytest.mark.compiled
+@pytest.mark.ci
+@pytest.mark.parametrize("pair", PAIRS)
+def test_compiled_blocks_of_two_different_machines_are_those_of_the_virtual_machine(
+    pair, monkeypatch
+):
+    """To rounding: once compiled, a machine had the means of the other, 1e13 of its power."""
+    if find_compiler() is None:
+        pytest.skip("no compiler")
+    monkeypatch.setattr(jointstep, "keep", lambda *given: given[-1]())  # anew for each run
+    load, fault = PAIRS[pair]
+    given = {"duration": 0.4, "load": load, "fault": fault, "waveform_dt": None}
+    with use_backend("vm"):
+        theirs = simulate_joint(UNIT, **given)
+    monkeypatch.setattr(jointstep, "OFTEN", 1)
+    with use_backend("c"):
+        ours = simulate_joint(UNIT, **given)
+    assert json.loads(ours.attrs["solver"])["steps_propagated"] > 25  # of 40
+    for name in ("N", "PW", "P_e", "V_a_rms", "V_b_rms", "I_c_rms", "T4"):
+        assert_allclose(ours[name], theirs[name], rtol=1e-9, err_msg=name)

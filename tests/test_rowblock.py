@@ -139,3 +139,19 @@ def test_products_of_matrices_and_limits_have_the_bits_of_the_loop():
         values = [a, b, *(rng.normal(size=f.size_in(i)) for i in range(2, f.n_in()))]
         for own, other in zip(usual(*values), fast(*values), strict=True):
             assert_array_equal(own, other)
+
+
+@pytest.mark.compiled
+def test_maps_of_one_name_keep_their_own_functions():
+    """Two that differ are called in one function: of each the points are its own."""
+    x = ca.SX.sym("x")
+    twice, thrice = (
+        ca.Function("times", [x], [k * x]).map("points", "serial", 9, [], []) for k in (2, 3)
+    )
+    a, b = ca.MX.sym("a", 1, 9), ca.MX.sym("b", 1, 9)
+    inner = [ca.Function(n, [a], [f(a)]) for n, f in (("first", twice), ("second", thrice))]
+    f = ca.Function("both", [a, b], [inner[0](a), inner[1](b)])
+    given = np.arange(9.0)
+    first, second = Caller(points_in_lanes(f))(given[None], given[None])
+    assert_array_equal(first.ravel(), 2 * given)
+    assert_array_equal(second.ravel(), 3 * given)

@@ -284,7 +284,7 @@ def _constant_step(ss: GeneratorModel, quad: tuple[str, ...], panels: Panels) ->
     rows = _constant_weights(panels, d_, w_, t_, W.numel() // 2)
     weights = ca.Function("weights", [d_, w_, t_], [rows], {"cse": True})
     means, before = hoisted("harmonics", [x, W, share], ca.vertcat(u, th), [terms])
-    each = means.map("each", "serial", X.shape[1], [3], [])
+    each = means.map(f"each_{ss.name}_{len(panels)}", "serial", X.shape[1], [3], [])
     sampled = each(X, weights(dt, w, X0[at]), ca.DM(_shares(panels)).T, before(ca.vertcat(U, TH)))
     return ca.Function(
         f"means_{ss.name}",

@@ -370,7 +370,9 @@ def _observed(
     for k in range(0, n, _TOGETHER):
         size = min(_TOGETHER, n - k)
         at = weights[:, k + 1 : k + 1 + size]
-        of_some, some = out.map("outs", "serial", size, [2], [])(samples[:, k : k + size], at, d)
+        of_some, some = out.map(f"outs_{ss.name}_{n}_{size}", "serial", size, [2], [])(
+            samples[:, k : k + size], at, d
+        )
         sums[size] = sums[size] + some if size in sums else some
         Y.append(of_some)
     for some in sums.values():

@@ -249,6 +249,7 @@ class _Seen:
 
     def __init__(self, ss: GeneratorModel, quad: Sequence[str], turn: Turn) -> None:
         halves, self._half = turn.halves, turn.half
+        tag = f"{ss.name}_{turn.strides}"  # what a block maps must have a name of its own
         self._asked = [Term.of(q) for q in quad]
         #: values and whether they are weighted; harmonics apart
         self._own = list(dict.fromkeys((q.base, q.power, q.weighted) for q in self._asked))
@@ -290,7 +291,9 @@ class _Seen:
         full = ca.SX(len(ss.x), 1)
         full[at.linear], full[at.drive], full[at.angle] = sample[:n], sample[n], angle
         own = at_sample(full, u, th, weights)[0]
-        one, self.before = hoisted("seen", [sample, weights], ca.vertcat(u, th, angle), [own])
+        one, self.before = hoisted(
+            f"seen_{tag}", [sample, weights], ca.vertcat(u, th, angle), [own]
+        )
         d = ca.SX.sym("d", self.before.numel_out(0))
         samples = [ca.SX.sym("sample", n + 2) for _ in range(halves)]
         plain, light = ca.SX.sym("plain", halves), ca.SX.sym("light", halves)
@@ -298,7 +301,7 @@ class _Seen:
         total = sum(one(v, ca.vertcat(*w), d) for v, *w in each)
         #: (sample of each half turn, weights plain and of weighted means in each, d) -> sums of
         #: terms by their weights, at one angle; and (u, theta, angle) -> d
-        self.over = ca.Function("over", [*samples, plain, light, d], [total], {"cse": True})
+        self.over = ca.Function(f"over_{tag}", [*samples, plain, light, d], [total], {"cse": True})
 
     def sums(self, samples: Sequence[Any], weights: tuple[Any, Any], fixed: Any) -> Any:
         """Sums over the half turns at each angle of one, (terms, half).
@@ -346,7 +349,7 @@ class _Voltage:
             raise NotApplicable(f"{ss.name}: the terminal voltage is not linear in the windings")
         whole = ca.vertcat(ca.horzcat(ca.SX.eye(n), ca.SX.zeros(n, 2)), ca.horzcat(rows, offset))
         #: (u, theta, angle) -> matrix that makes (x, vector) of (x, E, 1)
-        self.rows = ca.Function("rows", given, [ca.densify(whole)], {"cse": True})
+        self.rows = ca.Function(f"rows_{ss.name}", given, [ca.densify(whole)], {"cse": True})
         #: (u, theta, angle) -> square of the voltage without that of the vector
         self.rest = ca.Function("rest", given, [V0**2 - ca.sumsqr(offset)], {"cse": True})
 
@@ -387,7 +390,7 @@ def _between(
         ca.vertcat(*samples),
     ]
     given = [*rows, z, ca.vertcat(slow, k1, e, miss)]
-    return hoisted("between", given, ca.vertcat(u, th, h, angle), outputs)
+    return hoisted(f"between_{ss.name}", given, ca.vertcat(u, th, h, angle), outputs)
 
 
 def _half_turn(ss: GeneratorModel, between: ca.Function, n_d: int, pairs: int) -> ca.Function:
@@ -568,7 +571,7 @@ def periodic_step(
     doubt = ca.mmax(ca.fabs(windings - by_fewer) / ss.x.nominals[at.linear])
     jump = _seen_of_a_jump(V_now, [v[n + 1, :] for v in samples[:3]], length)
     return ca.Function(
-        f"means_{ss.name}",
+        f"means_{ss.name}_{turn.strides}",
         [X0, parameters, U, TH, DT],
         [ca.densify(x_end), mean, ca.vertcat(chain.miss, doubt, jump)],
         ["x0", "series", "u", "theta", "dt"],

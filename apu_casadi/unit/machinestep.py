@@ -258,7 +258,8 @@ class MachineStep:
         h, symmetric = self.settings.dt, self.phase.symmetric
         means = RawMeans.of(fast.quad, symmetric, done.means, h, done.w_r, grid[1:])
         self.x = done.x
-        fault = self.phase.fault
-        changing = self._way is not None and fault is not None and len(severity)
-        names = [s.name for s in fault.severities] if changing and fault is not None else []
-        return MachineMade(done.x, means, t, w, dict(zip(names, severity, strict=True)) or None)
+        own: dict[str, np.ndarray] | None = None
+        if self._way is not None and self.phase.fault is not None and len(severity):
+            names = [s.name for s in self.phase.fault.severities]
+            own = dict(zip(names, severity, strict=True))
+        return MachineMade(done.x, means, t, w, own)

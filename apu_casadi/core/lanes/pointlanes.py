@@ -130,12 +130,14 @@ def _source(fun: ca.Function, maps: dict[str, ca.Function], lanes: int) -> str:
     text: str = generator.dump()
     writer, own = Writer(lanes), []
     for k, (name, mapped) in enumerate(maps.items()):
-        own.append(_points(writer, mapped, f"points_{k}"))
         body = rf"(/\* {re.escape(name)}:.*?\*/\nstatic int \w+\([^)]*\) \{{\n).*?\n\}}\n"
         call = rf"\g<1>  (void)iw;(void)w;(void)mem;return points_{k}(arg,res);\n}}\n"
-        text, n = re.subn(body, call, text, count=1, flags=re.S)
-        if n != 1:
+        replaced, n = re.subn(body, call, text, flags=re.S)
+        if not n:
             raise NoForm(f"{fun.name()}: CasADi's code for the map {name} is not what is expected")
+        if n == 1:  # of several with one name nothing tells which is which: they stay as they are
+            own.append(_points(writer, mapped, f"points_{k}"))
+            text = replaced
     text = re.sub(r"(\nvoid casadi_mtimes_dense\([^{]*\{\n)", rf"\g<1>{_BY_ROWS}", text, count=1)
     # as the C library has them; a call of it would empty all registers
     for name, sign in (("fmin", "<"), ("fmax", ">")):
