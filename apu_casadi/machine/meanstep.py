@@ -43,8 +43,9 @@ from apu_casadi.machine.turnstep import Turn, periodic_step, turn_of
 
 Panels: TypeAlias = tuple[tuple[int, float], ...]
 #: Panels of a step with constant coefficients: number of panels and share of the step of each.
-#: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more.
-PANELS: Panels = ((1, 1 / 160), (1, 1 / 40), (8, (1 - 1 / 160 - 1 / 40) / 8))
+#: Four intervals in a panel.  The first resolve what follows the jump of the speed, 20 us and more;
+#: with eight of the others powers err by 3e-6 while the exciter follows a large drop of the load.
+PANELS: Panels = ((1, 1 / 160), (1, 1 / 40), (12, (1 - 1 / 160 - 1 / 40) / 12))
 #: The same of long courses, in which next to nothing jumps.
 FEW_PANELS: Panels = ((5, 1 / 5),)
 #: Longest time, first intervals, in which the stator may settle behind the load and not be sampled.
