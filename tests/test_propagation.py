@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from apu_casadi.core import simulation
 from apu_casadi.core.errors import NotApplicable, SimulationError
+from apu_casadi.core.hoisting import hoisted
 from apu_casadi.machine import transition
 from apu_casadi.machine.faults.ttsc import Ttsc
 from apu_casadi.machine.generator import Generator
@@ -16,7 +17,7 @@ from apu_casadi.machine.loads.constantpower import ConstantPowerLoad
 from apu_casadi.machine.loads.open import OpenLoad
 from apu_casadi.machine.loads.openphase import OpenPhase
 from apu_casadi.machine.loads.series import SeriesLoad
-from apu_casadi.machine.propagation import Propagator, hoisted, strides
+from apu_casadi.machine.propagation import Propagator, strides
 from apu_casadi.machine.weights import gregory, rippling, unresolved
 
 GEN = Generator()

@@ -25,11 +25,11 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.hoisting import hoisted
 from apu_casadi.core.means import Term
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.exciterstep import exciter_step
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import hoisted
 from apu_casadi.machine.transition import SPEED_RANGE, coefficients, inverse, radau, split
 
 STAGES = 4

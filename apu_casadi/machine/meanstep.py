@@ -23,12 +23,13 @@ import numpy as np
 
 from apu_casadi.core.backend import Gradual, backend_in_use
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.hoisting import hoisted
 from apu_casadi.core.lanes.pointlanes import points_in_lanes
 from apu_casadi.core.means import Term, window
 from apu_casadi.core.sharing import Rebuilt, kept
 from apu_casadi.machine.generator import Generator
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import hoisted, leap, seen_at_start
+from apu_casadi.machine.propagation import leap, seen_at_start
 from apu_casadi.machine.settling import settled
 from apu_casadi.machine.transition import (
     NODES,

@@ -20,11 +20,11 @@ import casadi as ca
 import numpy as np
 
 from apu_casadi.core.errors import NotApplicable
+from apu_casadi.core.hoisting import hoisted
 from apu_casadi.core.means import Term, harmonic, window
 from apu_casadi.core.sharing import once
 from apu_casadi.machine.exciterstep import Exciter, exciter_of, exciter_step, kick
 from apu_casadi.machine.generatormodel import GeneratorModel
-from apu_casadi.machine.propagation import hoisted
 from apu_casadi.machine.settling import SIMPSON, missed, settled
 from apu_casadi.machine.transition import EXTRA, NODES, SPEED_RANGE, Parity, parity, split
 from apu_casadi.machine.weights import rippling, through, unresolved
