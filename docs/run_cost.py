@@ -40,9 +40,8 @@ PAIRS: dict[str, tuple[Case, Case]] = {
     "with waveforms over without": (("joint", {}), JOINT),
 }
 
-WARM = (
-    OFTEN // 2 + 1
-)  # runs before; a run has a step after a switch or two, compiled when asked often
+#: Runs before: each has a step or two right after a switch, which are compiled when asked often.
+WARM = OFTEN // 2 + 1
 HALF = [SeriesLoad.from_power(112.5e3), SeriesLoad.from_power(50e3)]
 
 

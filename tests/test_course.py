@@ -223,7 +223,7 @@ def test_tables_are_made_once_for_all_runs(monkeypatch):
 
 def test_steps_end_with_the_piece_that_their_tables_are_of(monkeypatch):
     """Two pieces of one layout whose tables have more or fewer harmonics: no steps of both."""
-    fast = SimpleNamespace(layout=("same",), smooth=1.0, spike=1.0, vector=np.zeros(3))
+    fast = SimpleNamespace(layout=("same",), smooth=1.0, vector=np.zeros(3))
     fast.expect, fast.theta = lambda _: None, np.zeros(0)
     pieces = {k: Piece(fast, k + 0.5, 0.5, np.zeros((2, 5 + k)), *np.zeros((3, 2))) for k in (0, 1)}
     pieces = {k: replace(p, weights=np.zeros(5 + k)) for k, p in pieces.items()}

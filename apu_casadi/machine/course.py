@@ -10,7 +10,7 @@ to ``TOL``; it is never laid across a jump or a bend of a profile.
 A run holds all numbers over an exchange step.  The windings see a small jump at its beginning, and
 what follows it within microseconds falls between the samples of propagation; ``smooth`` of what
 propagates bounds the jump; beyond it steps are left to an adaptive integrator, as after a switch.
-``spike`` bounds what the terminal voltage shows for a moment, which counts by its area.
+``SPIKE`` bounds what the terminal voltage shows for a moment, which counts by its area.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from apu_casadi.machine.propagation import Propagator
 DEGREES = (2, 4, 8, 16)  # of polynomials that are tried, each checked at nodes of the next
 TOL = 1e-8  # largest error of transition matrices between nodes, nominal units; of others relative
 DEEPEST = 16  # times that an interval may be halved
+#: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
+SPIKE = 1e-4
 #: s, from which on mild faults take longer strides, and a growing fault is parted where it becomes
 #: severe: their tables take as long as a minute of steps gains.
 LONG = 100.0
@@ -285,7 +287,7 @@ class Course(Generic[F]):
             except NotApplicable:  # a model of its own, or none
                 own = piece
         jumps, spikes = self._jumps(own, piece, s, first), self._spikes(own, piece, s, first)
-        rough = np.flatnonzero((jumps > fast.smooth) | (spikes > fast.spike))
+        rough = np.flatnonzero((jumps > fast.smooth) | (spikes > SPIKE))
         count = int(rough[0]) if rough.size else s.size
         if not count and jumps[0] > fast.smooth:
             raise NotApplicable(
@@ -295,7 +297,7 @@ class Course(Generic[F]):
         if not count:
             raise NotApplicable(
                 f"{self.ss.name}: the fault's resistance changes by a voltage of {spikes[0]:.1e} "
-                f"of the phase's in a step, {fast.spike:g} at most"
+                f"of the phase's in a step, {SPIKE:g} at most"
             )
         fast.expect(float(jumps[:count].max()))
         return count

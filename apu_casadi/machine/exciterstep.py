@@ -19,6 +19,13 @@ from apu_casadi.machine.transition import EXTRA, split
 _NEARBY = 0.02  # argument with which six terms of the exponential's series err by 1e-13
 
 
+def _rates(ss: GeneratorModel, slow: Any, V_t: Any, V_ref: Any, th: Any) -> Any:
+    """Rates of the exciter's states, in which no other state has a part."""
+    x = ca.SX.zeros(len(ss.x))
+    x[split(ss).slow] = slow
+    return ss.exciter(x, V_t, V_ref, th)
+
+
 @kept
 def exciter_step(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
     """The exciter's drive and its step, of the states that are neither windings nor angle.
@@ -29,21 +36,15 @@ def exciter_step(ss: GeneratorModel) -> tuple[ca.Function, ca.Function]:
     at = split(ss).slow
     slow, V = ca.SX.sym("slow", len(at)), ca.SX.sym("V", 3)
     V_ref, H, th = ca.SX.sym("V_ref"), ca.SX.sym("H"), ca.SX.sym("t", len(ss.theta))
-
-    def rates(slow: Any, V_t: Any) -> Any:
-        x = ca.SX.zeros(len(ss.x))
-        x[at] = slow
-        return ss.exciter(x, V_t, V_ref, th)
-
-    k1 = rates(slow, V[0])
+    k1 = _rates(ss, slow, V[0], V_ref, th)
     E = at.index(ss.x.index("E_fd"))
     derivatives = [slow[E]]
     for _ in range(EXTRA - 2):
         derivatives.append(ca.jtimes(derivatives[-1], slow, k1))
     drive = ca.Function("drive", [slow, V[0], V_ref, th], [ca.vertcat(*derivatives)])
-    k2 = rates(slow + H / 2 * k1, V[1])
-    k3 = rates(slow + H / 2 * k2, V[1])
-    k4 = rates(slow + H * k3, V[2])
+    k2 = _rates(ss, slow + H / 2 * k1, V[1], V_ref, th)
+    k3 = _rates(ss, slow + H / 2 * k2, V[1], V_ref, th)
+    k4 = _rates(ss, slow + H * k3, V[2], V_ref, th)
     end = slow + H / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     return drive, ca.Function("exciter", [slow, V, V_ref, th, H], [end])
 
@@ -54,12 +55,10 @@ def kick(ss: GeneratorModel) -> ca.Function:
 
     Function (slow, V_t, V_ref, theta) -> change of slow.
     """
-    at = split(ss).slow
-    slow, V, V_ref = ca.SX.sym("slow", len(at)), ca.SX.sym("V"), ca.SX.sym("V_ref")
-    th, full = ca.SX.sym("t", len(ss.theta)), ca.SX.zeros(len(ss.x))
-    full[at] = slow
-    moves = ca.densify(ca.jacobian(ss.exciter(full, V, V_ref, th), V))
-    return ca.Function("kick", [slow, V, V_ref, th], [moves])
+    sizes = {"slow": len(split(ss).slow), "V": 1, "V_ref": 1, "t": len(ss.theta)}
+    slow, V, V_ref, th = given = [ca.SX.sym(k, n) for k, n in sizes.items()]
+    moves = ca.densify(ca.jacobian(_rates(ss, slow, V, V_ref, th), V))
+    return ca.Function("kick", given, [moves])
 
 
 def _given_exps(f: ca.Function) -> tuple[ca.Function, ca.Function]:
@@ -108,10 +107,9 @@ class Exciter:
         at = split(ss)
         self._drive = at.slow.index(at.drive)
         slow, V, V_ref = ca.SX.sym("slow", len(at.slow)), ca.SX.sym("V"), ca.SX.sym("V_ref")
-        th, full = ca.SX.sym("t", len(ss.theta)), ca.SX.zeros(len(ss.x))
-        full[at.slow] = slow
+        th = ca.SX.sym("t", len(ss.theta))
         given = [slow, V, V_ref, th]
-        both = [ss.exciter(full, V, V_ref, th), exciter_step(ss)[0](*given)]
+        both = [_rates(ss, *given), exciter_step(ss)[0](*given)]
         whole = ca.Function("both", given, both, {"cse": True})
         self._of, arguments = _given_exps(whole)
         e = ca.SX.sym("e", self._of.numel_in(len(given)))

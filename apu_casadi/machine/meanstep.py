@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -428,9 +428,6 @@ class MeanStep(Rebuilt):
     def finer(self) -> int:
         """Harmonics with which steps that were refused may be taken; 0 where there are none."""
         return USUAL if self._few else 0
-
-    #: Largest jump of a fault loop's voltage, of the phase's: means move by a hundredth of it.
-    spike: ClassVar[float] = 1e-4
 
     @property
     def vector(self) -> np.ndarray:

@@ -471,8 +471,6 @@ class Propagator(Rebuilt):
     #: Largest change of transition matrices from step to step, nominal units; samples resolve it.
     smooth: ClassVar[float] = 1e-2
     finer: ClassVar[int] = 0  # harmonics with which steps that were refused may be taken
-    #: Largest jump of a fault loop's voltage, of the phase's; it counts by its area.
-    spike: ClassVar[float] = 1e-4
 
     @property
     def harmonics(self) -> int:
@@ -494,7 +492,7 @@ class Propagator(Rebuilt):
         return np.append(rows[0], [0.0, 0.0]) if self.constant else np.concatenate(rows)
 
     def expect(self, jump: float) -> None:
-        """Expect transition matrices that change so from step to step: ``spike`` bounds it."""
+        """Expect transition matrices that change so from step to step; nothing depends on it."""
 
     def put(self, vector: np.ndarray, theta: np.ndarray) -> None:
         """Go on with other numbers: those of :attr:`vector`, and theta in full."""
